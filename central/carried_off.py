@@ -17,15 +17,16 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
+from team import core
 from team.config import UNNAMED
-from team.estimation import dense, elementary
+from team.estimation import dense
 from team.estimation.contribution import Contribution, moment
 from team.estimation.gaussian import NotACovarianceError, information
-from team.estimation.geometry import compose, wrapped
 from team.estimation.map_joining.alignment import Alignment, aligned
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.landmark_view import known
 from team.estimation.map_joining.marginals import landmark_blocks
+from team.estimation.se2 import compose, wrapped
 from team.estimation.submap import LocalMap
 
 LEAST_SHARED = 3
@@ -195,7 +196,7 @@ def _from_end(
 
     ∂/∂l = Rᵀ, ∂/∂e = −Rᵀ, and ∂/∂θ = (y, −x) of the result.
     """
-    s, c = elementary.sin_and_cos(float(local.end_pose[2]))
+    s, c = core.sin_and_cos(float(local.end_pose[2]))
     back = np.array([[c, s], [-s, c]])
     points = dense.product(local.landmarks[own] - local.end_pose[:2], back.T)
     n = len(own)
@@ -218,7 +219,7 @@ def _seam(chain: Sequence[Contribution], one: _Placed, two: _Placed) -> _Seam:
     pose, covariance = one.end.a_from_b, one.end.covariance
     for each in chain[one.at + 1 : two.at]:
         step = each.local.end_pose
-        s, c = elementary.sin_and_cos(float(pose[2]))
+        s, c = core.sin_and_cos(float(pose[2]))
         turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         after = compose(pose, step)
         lever = np.eye(3)

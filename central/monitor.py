@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from team import core
 from team.config import Bias
-from team.estimation import elementary
 from team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from team.estimation.map_joining.condensed_factor import SubmapCost
 from team.estimation.map_joining.marginals import Agreement, BiasEstimate
@@ -153,7 +153,7 @@ def _misscale(scale: Scale, limit: float) -> str:
     value = scale.value
     if value <= 0.0:
         return ""
-    if abs(elementary.log(value)) <= max(elementary.log(limit), SCALE_SIGMAS * scale.log_sigma):
+    if abs(core.log(value)) <= max(core.log(limit), SCALE_SIGMAS * scale.log_sigma):
         return ""
     wrong = f"{TOO_SMALL} {value:.1f}" if value > 1.0 else f"{TOO_LARGE} {1.0 / value:.1f}"
     return (

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.estimation import elementary
+from team import core
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.marginals import LandmarkBlocks, landmark_blocks, last_pose
@@ -140,4 +140,4 @@ def _has_changed(old: _Sent, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"
         for each in (now.covariances[needed], old.blocks.covariances[before])
     )
     share = 2.0 * (moved * moved).sum(axis=1) / variances
-    return bool(share.mean() > elementary.squared(MOVED) or (variances < SURER * were).any())
+    return bool(share.mean() > core.squared(MOVED) or (variances < SURER * were).any())

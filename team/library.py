@@ -19,7 +19,6 @@ from jaxtyping import Float, UInt32
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
-from team.estimation.geometry import compose, inverse
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.fastslam import (
     Particles,
@@ -33,6 +32,7 @@ from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.marginals import LandmarkMap, Trajectory
 from team.estimation.models import Increment, increment_of, located, scanned
 from team.estimation.models import predicted as measurement_of
+from team.estimation.se2 import compose, inverse
 from team.estimation.submap import LocalMap
 from team.recording.reader import Log, LogError, open_log
 from team.registry import loaded

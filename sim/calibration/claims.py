@@ -16,8 +16,8 @@ from sim.calibration.data import Reference, poses_at, sensor_poses
 from sim.calibration.figures import huber
 from team.config import Sensor
 from team.estimation.consistency import chi2_quantile
-from team.estimation.geometry import between, logarithm
 from team.estimation.models import Increment, corrected
+from team.estimation.se2 import between, logarithm
 
 SPAN_NS = 10_000_000_000
 LEAST = 30

@@ -22,7 +22,6 @@ from sim.world.streams import (
     WorldStreams,
 )
 from team.config import RobotConfig
-from team.estimation.geometry import compose
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.hybrid_slam.window import Window
@@ -37,6 +36,7 @@ from team.estimation.map_joining.joining import (
     folded,
     started,
 )
+from team.estimation.se2 import compose
 
 LONGEST_NS = 250_000_000
 """Longest merged arc interval, since windows close at interval ends."""

@@ -3,6 +3,7 @@ The numerical core: the state of a window, and functions with defined bits.
 """
 
 from collections.abc import Sequence
+from typing import Annotated, overload
 
 import numpy
 from numpy.typing import NDArray
@@ -22,31 +23,116 @@ class NotFiniteError(ValueError):
 class MotionError(ValueError):
     pass
 
-def sin_and_cos(angles: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """Sine and cosine of each angle [rad]; NaN of what is not finite."""
-
-def exp(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """E to the power of each x; 0 below -745.2, infinite above 709.8."""
-
-def log(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The natural logarithm of each x."""
-
-def log1p(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The logarithm of each 1 + x."""
-
-def expm1(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """E to the power of each x, less 1."""
-
-def normal_below(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+@overload
+def sin_and_cos(angle: float) -> tuple[float, float]:
     """
-    The probability that a standard normal variable stays below each x, to 1e-15.
+    Sine and cosine of an angle [rad], or of each of an array; NaN of what is not finite.
     """
 
-def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The direction of each (x, y) in [-pi, pi]."""
+@overload
+def sin_and_cos(angle: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]: ...
 
-def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The length of each (x, y)."""
+@overload
+def exp(x: float) -> float:
+    """
+    E to the power of x, or of each of an array; 0 below -745.2, infinite above 709.8.
+    """
+
+@overload
+def exp(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def sin(angle: float) -> float:
+    """The sine of an angle [rad], or of each of an array."""
+
+@overload
+def sin(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def cos(angle: float) -> float:
+    """The cosine of an angle [rad], or of each of an array."""
+
+@overload
+def cos(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def tan(angle: float) -> float:
+    """The tangent of an angle [rad], or of each of an array."""
+
+@overload
+def tan(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def log(x: float) -> float:
+    """The natural logarithm of x, or of each of an array."""
+
+@overload
+def log(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def log1p(x: float) -> float:
+    """The logarithm of 1 + x, or of that of each of an array."""
+
+@overload
+def log1p(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def expm1(x: float) -> float:
+    """E to the power of x, less 1; x may be an array."""
+
+@overload
+def expm1(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def squared(x: float) -> float:
+    """
+    The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.
+    """
+
+@overload
+def squared(x: NDArray[numpy.float64]) -> object: ...
+
+@overload
+def normal_below(x: float) -> float:
+    """
+    The probability that a standard normal variable stays below x, to 1e-15; x may be an array.
+    """
+
+@overload
+def normal_below(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def wrapped(angle: float) -> float:
+    """The same direction in (-pi, pi]; angle may be an array."""
+
+@overload
+def wrapped(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def atan2(y: float, x: float) -> float:
+    """The direction of (x, y) in [-pi, pi]; both may be arrays."""
+
+@overload
+def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def atan2(y: NDArray[numpy.float64], x: float) -> NDArray[numpy.float64]: ...
+
+@overload
+def atan2(y: float, x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def hypot(x: float, y: float) -> float:
+    """The length of (x, y); both may be arrays."""
+
+@overload
+def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
+
+@overload
+def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
+
+@overload
+def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 class WholeMap:
     """
@@ -141,6 +227,86 @@ class ChainSolution:
     @property
     def at(self) -> int:
         """The map without covariance; 0 is the prior."""
+
+def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
+
+    Raises ValueError where A has not as many columns as B has rows.
+    """
+
+def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+
+    Raises LinAlgError where A is singular.
+    """
+
+def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
+    """
+
+def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the lower L with L L^T = A from the lower triangle of A.
+
+    Raises LinAlgError where A is not positive definite.
+    """
+
+def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
+
+def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
+
+def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
+    """
+
+def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
+    """
+    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
+    """
+
+def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    """
+
+def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
+    """
+
+def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
+
+def inverse(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_a."""
+
+def between(a_from_b: NDArray[numpy.float64], a_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b."""
+
+def transformed(a_from_b: NDArray[numpy.float64], point_in_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The point's coordinates in frame a."""
+
+def exponential(xi: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Exp: R^3 -> SE(2), the motion at the constant twist xi = (forward, left, turn) for unit time.
+    """
+
+def logarithm(pose: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Log: SE(2) -> R^3, the inverse of `exponential` for |heading| < pi."""
+
+def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Ad with T o Exp(xi) = Exp(Ad_T xi) o T: carries a perturbation from the right to the left.
+    """
+
+def tangent(heading: float) -> NDArray[numpy.float64]:
+    """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
 
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""

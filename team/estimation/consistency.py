@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.estimation import dense
-from team.estimation.chi2_kernel import chi2_quantiles
 from team.estimation.gaussian import cholesky_factor
 
 MEDIAN_PRICE = 1.3
@@ -46,10 +46,10 @@ def chi2_limit(dof: int, tail: float) -> float:
     """Compute the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
     Rounded to twelve digits. For few degrees of freedom by bisection of the finite sum (Abramowitz
-    & Stegun 26.4.4 and 26.4.5), for more by `chi2_kernel`.
+    & Stegun 26.4.4 and 26.4.5), for more by the core.
     """
     if dof > FEW:
-        return float(f"{chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
+        return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
     low, high = 0.0, float(max(dof, 1))
     while _chi2_tail(high, dof) > tail:
         high *= 2.0
@@ -77,7 +77,9 @@ def chi2_quantile(
 
     NaN for less than one degree of freedom. Rounded to 36 bits.
     """
-    exact = chi2_quantiles(probability, 1.0 - probability, np.atleast_1d(np.asarray(dof, float)))
+    exact = core.chi2_quantiles(
+        probability, 1.0 - probability, np.atleast_1d(np.asarray(dof, float))
+    )
     mantissa, exponent = np.frexp(exact)
     quantile = np.ldexp(np.rint(mantissa * 2.0**36) * 2.0**-36, exponent)
     return quantile if np.ndim(dof) else float(quantile[0])

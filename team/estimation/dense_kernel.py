@@ -383,3 +383,46 @@ def inverse_from_factor(L: Matrix) -> Matrix:
 def _add_row(result: Matrix, i: int, factor: float, row: Vector, begin: int, end: int) -> None:
     for j in range(begin, end):
         result[i, j] += factor * row[j]
+
+
+EPSILON = float(np.finfo(np.float64).eps)
+NOT_FINITE, NOT_POSITIVE, NOT_SYMMETRIC = 1, 2, 3
+
+
+@compiled
+def fault_of(P: Matrix) -> tuple[int, Float[np.ndarray, " n"]]:
+    """The index in FAULTS of what is seen of a matrix without factoring it; and the roots of its
+    diagonal.
+    """
+    n = len(P)
+    sigmas = np.empty(n)
+    for i in range(n):
+        for j in range(n):
+            if not math.isfinite(P[i, j]):
+                return NOT_FINITE, sigmas
+    for i in range(n):
+        if not P[i, i] > 0.0:
+            return NOT_POSITIVE, sigmas
+        sigmas[i] = math.sqrt(P[i, i])
+    for i in range(n):
+        for j in range(i):
+            if abs(P[i, j] - P[j, i]) > 1e-9 * sigmas[i] * sigmas[j]:
+                return NOT_SYMMETRIC, sigmas
+    return 0, sigmas
+
+
+@compiled
+def factor_or_fault(P: Matrix) -> tuple[Matrix, int]:
+    """The factor of `cholesky_factor`, and the index in FAULTS of why there is none."""
+    n = len(P)
+    fault, sigmas = fault_of(P)
+    if fault:
+        return P, fault
+    factor, definite = factored(P.T.copy())
+    if not definite:
+        return P, NOT_POSITIVE
+    for i in range(n):
+        pivot = factor[i, i] / sigmas[i]
+        if pivot * pivot <= n * EPSILON:
+            return P, NOT_POSITIVE
+    return factor, 0

@@ -7,10 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team import core
 from team.estimation import dense
-from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import factored, matrix_product
-from team.estimation.geometry import tangent
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
@@ -37,9 +35,6 @@ class LandmarkGaussian(NamedTuple):
 NO_LANDMARKS = LandmarkGaussian(np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 0)))
 
 
-EPSILON = float(np.finfo(np.float64).eps)
-
-
 class NotACovarianceError(ValueError):
     """A matrix used as a covariance is not finite, not symmetric or not positive definite."""
 
@@ -55,53 +50,13 @@ def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
     Symmetry is judged by the diagonal's scale, and so is rank: a pivot that is no more than n ε of
     its diagonal entry is what rounding leaves of a singular matrix.
     """
-    factor, fault = factor_or_fault(np.array(covariance, np.float64, order="C"))
+    factor, fault = core.factor_or_fault(covariance)
     if fault:
         raise NotACovarianceError(what, FAULTS[fault])
     return factor
 
 
 FAULTS = ("", "not finite", "not positive definite", "not symmetric")
-NOT_FINITE, NOT_POSITIVE, NOT_SYMMETRIC = 1, 2, 3
-
-
-@compiled
-def fault_of(P: Matrix) -> tuple[int, Float[np.ndarray, " n"]]:
-    """The index in FAULTS of what is seen of a matrix without factoring it; and the roots of its
-    diagonal.
-    """
-    n = len(P)
-    sigmas = np.empty(n)
-    for i in range(n):
-        for j in range(n):
-            if not math.isfinite(P[i, j]):
-                return NOT_FINITE, sigmas
-    for i in range(n):
-        if not P[i, i] > 0.0:
-            return NOT_POSITIVE, sigmas
-        sigmas[i] = math.sqrt(P[i, i])
-    for i in range(n):
-        for j in range(i):
-            if abs(P[i, j] - P[j, i]) > 1e-9 * sigmas[i] * sigmas[j]:
-                return NOT_SYMMETRIC, sigmas
-    return 0, sigmas
-
-
-@compiled
-def factor_or_fault(P: Matrix) -> tuple[Matrix, int]:
-    """The factor of `cholesky_factor`, and the index in FAULTS of why there is none."""
-    n = len(P)
-    fault, sigmas = fault_of(P)
-    if fault:
-        return P, fault
-    factor, definite = factored(P.T.copy())
-    if not definite:
-        return P, NOT_POSITIVE
-    for i in range(n):
-        pivot = factor[i, i] / sigmas[i]
-        if pivot * pivot <= n * EPSILON:
-            return P, NOT_POSITIVE
-    return factor, 0
 
 
 def whitened(L: Matrix, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -186,22 +141,6 @@ def curved(pose: PoseGaussian) -> PoseGaussian:
     f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
     exceeds σ_f². The mean stays the most likely pose.
     """
-    return PoseGaussian(pose.mean, _curved(float(pose.mean[2]), np.array(pose.covariance)))
-
-
-@compiled
-def _curved(heading: float, covariance: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    T = tangent(heading)
-    S = matrix_product(matrix_product(T.T.copy(), covariance), T)
-    of_squares = np.empty((2, 2))
-    for i in range(2):
-        for j in range(2):
-            of_squares[i, j] = S[2, 2] * S[i, j] + 2.0 * (S[i, 2] * S[j, 2])
-    ff, fl, ll = 0.25 * of_squares[0, 0], 0.25 * of_squares[0, 1], 0.25 * of_squares[1, 1]
-    turn = T[:2, :2].copy()
-    added = matrix_product(matrix_product(turn, np.array([[ll, -fl], [-fl, ff]])), turn.T.copy())
-    result = covariance.copy()
-    for i in range(2):
-        for j in range(2):
-            result[i, j] += added[i, j]
-    return result
+    return PoseGaussian(
+        pose.mean, core.curved_covariance(float(pose.mean[2]), np.asarray(pose.covariance))
+    )

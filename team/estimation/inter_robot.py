@@ -13,12 +13,13 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.config import Sensor
-from team.estimation import dense, elementary
+from team.estimation import dense
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import information
-from team.estimation.geometry import Pose, inverse, transformed, wrapped
 from team.estimation.models import NEAREST_M, Increment, noise
+from team.estimation.se2 import Pose, inverse, transformed, wrapped
 
 SightingKey: TypeAlias = tuple[int, str, int, str]
 """(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""
@@ -73,9 +74,9 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     marker's position on the teammate (marker_sigma) and that of the drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
-    own = elementary.squared(sensor.marker_sigma) + drift * drift
+    own = core.squared(sensor.marker_sigma) + drift * drift
     turn = _turn(bearing)
-    spread = np.diag([range_variance + own, bearing_variance * elementary.squared(distance) + own])
+    spread = np.diag([range_variance + own, bearing_variance * core.squared(distance) + own])
     return CarriedPoint(distance * turn[:, 0], dense.product(dense.product(turn, spread), turn.T))
 
 
@@ -113,7 +114,7 @@ def carried_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
 
 
 def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
-    s, c = elementary.sin_and_cos(angle)
+    s, c = core.sin_and_cos(angle)
     return np.array([[c, -s], [s, c]])
 
 
@@ -126,8 +127,8 @@ def reduced(
     The median of each, bearings relative to the first one; the covariance is the mean of theirs, as
     for one measurement: a camera repeats its error on a marker from one moment to the next.
     """
-    ranges = [max(elementary.hypot(*each.point), NEAREST_M) for each in carried]
-    bearings = [elementary.atan2(each.point[1], each.point[0]) for each in carried]
+    ranges = [max(core.hypot(*each.point), NEAREST_M) for each in carried]
+    bearings = [core.atan2(each.point[1], each.point[0]) for each in carried]
     offsets = [wrapped(bearing - bearings[0]) for bearing in bearings]
     total = np.zeros((2, 2))
     for each, distance in zip(carried, ranges, strict=True):

@@ -9,10 +9,11 @@ the base's is m ∘ S ∘ m⁻¹, and a point p in the frame of the sensor's sta
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation import dense, elementary, elementwise
+from team import core
+from team.estimation import dense
 from team.estimation.gaussian import PoseGaussian
-from team.estimation.geometry import Pose, adjoint, compose, inverse
 from team.estimation.models import Increment
+from team.estimation.se2 import Pose, adjoint, compose, inverse
 
 
 def of_sensor(step: Increment, mount: Pose) -> Increment:
@@ -39,7 +40,7 @@ def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
 def base_poses(poses: Float[np.ndarray, "*n 3"], mount: Pose) -> Float[np.ndarray, "*n 3"]:
     """Convert each sensor pose S to the base's, m ∘ S ∘ m⁻¹."""
     away = inverse(mount)
-    s, c = elementwise.sin_and_cos(poses[..., 2])
+    s, c = core.sin_and_cos(poses[..., 2])
     x = poses[..., 0] + c * away[0] - s * away[1]
     y = poses[..., 1] + s * away[0] + c * away[1]
     found: Float[np.ndarray, "*n 3"] = np.stack([*_turned(x, y, mount), poses[..., 2]], axis=-1)
@@ -61,7 +62,7 @@ def base_shifts(
 ) -> Float[np.ndarray, "*b n 3"]:
     """Convert shifts (dx, dy, dθ) of the sensor's poses to those of the base's."""
     away = inverse(mount)
-    s, c = elementwise.sin_and_cos(poses[:, 2])
+    s, c = core.sin_and_cos(poses[:, 2])
     x = shifts[..., 0] - (s * away[0] + c * away[1]) * shifts[..., 2]
     y = shifts[..., 1] + (c * away[0] - s * away[1]) * shifts[..., 2]
     return np.stack([*_turned(x, y, mount), shifts[..., 2]], axis=-1)
@@ -70,5 +71,5 @@ def base_shifts(
 def _turned(
     x: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"], mount: Pose
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    s, c = elementary.sin_and_cos(mount[2])
+    s, c = core.sin_and_cos(mount[2])
     return c * x - s * y, s * x + c * y

@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from team import core
 from team.config import Bounds
-from team.estimation import dense, elementary
+from team.estimation import dense
 from team.estimation.contribution import InitialPoseFactor
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.submap import LocalMap
@@ -45,7 +46,7 @@ def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
     try:
         dense.cholesky(local.covariance / sigmas / sigmas[:, None] - np.eye(len(sigmas)))
     except np.linalg.LinAlgError:
-        return replace(local, covariance=local.covariance + np.diag(elementary.squared(sigmas)))
+        return replace(local, covariance=local.covariance + np.diag(core.squared(sigmas)))
     return local
 
 
@@ -124,7 +125,7 @@ def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | Non
         factor = dense.cholesky(covariance / sigmas / sigmas[:, None])
     except np.linalg.LinAlgError:
         return "a covariance that is not positive definite"
-    left = elementary.squared(float(np.min(np.diag(factor), initial=1.0)))
+    left = core.squared(float(np.min(np.diag(factor), initial=1.0)))
     if left < bounds.independent:
         return (
             f"a number of which the others leave a share of {left:.1g} of its variance, "

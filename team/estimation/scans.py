@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
+from team import core
 from team.config import Bounds, Sensor
-from team.estimation import elementary, elementwise
 from team.estimation.models import NEAREST_M
 
 SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
@@ -61,11 +61,11 @@ def point_scan(
     (r, b) = (‖p‖, atan2(y, x)) and J S Jᵀ with J = ∂(r, b)/∂p.
     """
     x, y = points[:, 0], points[:, 1]
-    ranges, bearings = elementwise.hypot(x, y), elementwise.atan2(y, x)
+    ranges, bearings = core.hypot(x, y), core.atan2(y, x)
     if covariances is None:
         return Scan(ids, ranges, bearings, unclaimed(len(ids)))
     reach = np.maximum(ranges, NEAREST_M)
-    s, c = elementwise.sin_and_cos(bearings)
+    s, c = core.sin_and_cos(bearings)
     xx, xy, yy = covariances.T
     with np.errstate(over="ignore", invalid="ignore"):  # `sensible` refuses what is not finite
         rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
@@ -79,7 +79,7 @@ def calibrated(own: Own, sensor: Sensor) -> Own:
     if not own.size or sensor.range_scale == sensor.covariance_factor == 1.0:
         return own
     scale, factor = sensor.range_scale, sensor.covariance_factor
-    scaled: Own = own * np.array([factor / elementary.squared(scale), factor / scale, factor, 1.0])
+    scaled: Own = own * np.array([factor / core.squared(scale), factor / scale, factor, 1.0])
     return scaled
 
 
@@ -130,9 +130,9 @@ def carried(
     """
     if own[3] == SENSOR:
         return own[None]
-    reach, far = max(distance, NEAREST_M), max(float(elementwise.hypot(*to)), NEAREST_M)
-    turn = direction - float(elementwise.atan2(to[1], to[0]))
-    s, c = elementary.sin_and_cos(turn)
+    reach, far = max(distance, NEAREST_M), max(float(core.hypot(*to)), NEAREST_M)
+    turn = direction - float(core.atan2(to[1], to[0]))
+    s, c = core.sin_and_cos(turn)
     rr, rb, bb = own[0], own[1] * reach, own[2] * reach * reach
     along = c * c * rr - 2.0 * c * s * rb + s * s * bb
     both = c * s * (rr - bb) + (c * c - s * s) * rb

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
+from team import core
 from team.config import UNNAMED, Bias
-from team.estimation import elementwise
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))
@@ -114,7 +114,7 @@ class LocalMap:
         """Distances [m] between unnamed landmarks that one keyframe saw; ∞ between others."""
         x, y = self.landmarks[self.ids >= UNNAMED].T
         masks = self.unnamed.seen.astype(np.float32)
-        away = elementwise.hypot(x[:, None] - x, y[:, None] - y)
+        away = core.hypot(x[:, None] - x, y[:, None] - y)
         away[masks @ masks.T == 0.0] = np.inf
         np.fill_diagonal(away, np.inf)
         return np.asarray(away)

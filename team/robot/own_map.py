@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.core import WholeMap
-from team.estimation import elementwise, geometry
+from team.estimation import se2
 from team.estimation.gaussian import (
     LandmarkGaussian,
     Matrix,
@@ -50,9 +51,9 @@ def thin_out(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
     """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]
-    weights = elementwise.exp(logs - logs.max())
+    weights = core.exp(logs - logs.max())
     poses = np.ascontiguousarray(particles.poses[::every])
-    return Cloud(geometry.composed_with(origin, poses), weights / weights.sum())
+    return Cloud(se2.compose(origin, poses), weights / weights.sum())
 
 
 class OwnMap:

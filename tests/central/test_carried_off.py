@@ -12,7 +12,7 @@ from sim.in_memory.team import final_map, run_team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from team import translate
-from team.estimation.geometry import compose, inverse
+from team.estimation.se2 import compose, inverse
 from team.wire import messages as m
 from team.wire.arrays import floats, from_floats, stamps
 from tests.central.test_withdrawal import messages, scenario, team_run

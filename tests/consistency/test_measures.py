@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtri, gammaincinv
 
-from team.estimation.chi2_kernel import chi2_quantiles
+from team.core import chi2_quantiles
 from team.estimation.consistency import (
     chi2_interval,
     chi2_limit,

@@ -10,7 +10,8 @@ import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_name
 
-from team.estimation import dense, elementwise
+from team import core
+from team.estimation import dense
 
 SIZES = (3, 40, 130)
 """Dense matrices: by loops, by a part of a tile, by several tiles and blocks."""
@@ -25,14 +26,14 @@ def digests() -> dict[str, str]:
     """A digest of what each function makes of the same arguments."""
     x = np.concatenate([0.08 * np.arange(-500.0, 500.0), np.ldexp(1.37, np.arange(-1000, 1000))])
     found = {
-        "sin": elementwise.sin(x),
-        "cos": elementwise.cos(x),
-        "atan2": elementwise.atan2(x, x[::-1].copy()),
-        "exp": elementwise.exp(x),
-        "log": elementwise.log(np.abs(x)),
+        "sin": core.sin(x),
+        "cos": core.cos(x),
+        "atan2": core.atan2(x, x[::-1].copy()),
+        "exp": core.exp(x),
+        "log": core.log(np.abs(x)),
     }
     for n in SIZES:
-        A = (elementwise.sin(np.arange(1.0, 1.0 + n * n)) + 0.1).reshape(n, n)
+        A = (core.sin(np.arange(1.0, 1.0 + n * n)) + 0.1).reshape(n, n)
         found |= {
             f"product {n}": dense.product(A, A),
             f"product with a vector {n}": dense.product(A, A[0]),

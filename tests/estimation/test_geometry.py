@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from team.estimation import geometry
+from team.estimation import se2
 
 metres = st.floats(-100.0, 100.0)
 angles = st.floats(-3.1, 3.1)
@@ -29,21 +29,21 @@ def assert_same_pose(actual, expected, tolerance=1e-9):
 @quick
 @given(poses, poses)
 def test_composition_is_the_product_of_matrices(a, b):
-    np.testing.assert_allclose(matrix(geometry.compose(a, b)), matrix(a) @ matrix(b), atol=1e-9)
+    np.testing.assert_allclose(matrix(se2.compose(a, b)), matrix(a) @ matrix(b), atol=1e-9)
 
 
 @quick
 @given(poses, poses)
 def test_between_undoes_composition_and_inverse_is_between_to_zero(a, b):
-    assert_same_pose(geometry.between(a, geometry.compose(a, b)), b)
-    assert_same_pose(geometry.inverse(a), geometry.between(a, np.zeros(3)))
+    assert_same_pose(se2.between(a, se2.compose(a, b)), b)
+    assert_same_pose(se2.inverse(a), se2.between(a, np.zeros(3)))
 
 
 @quick
 @given(poses)
 def test_exponential_is_that_of_the_twist_matrix_and_logarithm_its_inverse(xi):
-    np.testing.assert_allclose(matrix(geometry.exponential(xi)), expm(twist_matrix(xi)), atol=1e-9)
-    np.testing.assert_allclose(geometry.logarithm(geometry.exponential(xi)), xi, atol=1e-8)
+    np.testing.assert_allclose(matrix(se2.exponential(xi)), expm(twist_matrix(xi)), atol=1e-9)
+    np.testing.assert_allclose(se2.logarithm(se2.exponential(xi)), xi, atol=1e-8)
 
 
 @quick
@@ -51,15 +51,15 @@ def test_exponential_is_that_of_the_twist_matrix_and_logarithm_its_inverse(xi):
 def test_exponential_has_no_step_at_the_limit_of_straight_motion(forward, left, turn):
     exact = expm(twist_matrix(np.array([forward, left, turn])))
     np.testing.assert_allclose(
-        matrix(geometry.exponential(np.array([forward, left, turn]))), exact, atol=1e-9
+        matrix(se2.exponential(np.array([forward, left, turn]))), exact, atol=1e-9
     )
 
 
 @quick
 @given(poses, poses)
 def test_the_adjoint_carries_a_perturbation_from_the_right_to_the_left(pose, xi):
-    right = geometry.compose(pose, geometry.exponential(1e-3 * xi))
-    left = geometry.compose(geometry.exponential(geometry.adjoint(pose) @ (1e-3 * xi)), pose)
+    right = se2.compose(pose, se2.exponential(1e-3 * xi))
+    left = se2.compose(se2.exponential(se2.adjoint(pose) @ (1e-3 * xi)), pose)
     assert_same_pose(right, left, tolerance=1e-7)
 
 
@@ -67,18 +67,18 @@ def test_the_adjoint_carries_a_perturbation_from_the_right_to_the_left(pose, xi)
 @given(poses, metres, metres)
 def test_a_point_is_transformed_as_by_the_matrix(pose, x, y):
     np.testing.assert_allclose(
-        geometry.transformed(pose, np.array([x, y])), (matrix(pose) @ [x, y, 1.0])[:2], atol=1e-9
+        se2.transformed(pose, np.array([x, y])), (matrix(pose) @ [x, y, 1.0])[:2], atol=1e-9
     )
 
 
 @quick
 @given(st.floats(-50.0, 50.0))
 def test_a_wrapped_angle_is_the_same_direction_in_the_half_open_turn(angle):
-    wrapped = geometry.wrapped(angle)
+    wrapped = se2.wrapped(angle)
     assert -np.pi < wrapped <= np.pi
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-12)
 
 
 def test_half_a_turn_is_plus_pi():
-    assert geometry.wrapped(-np.pi) == np.pi
-    assert geometry.wrapped(np.pi) == np.pi
+    assert se2.wrapped(-np.pi) == np.pi
+    assert se2.wrapped(np.pi) == np.pi

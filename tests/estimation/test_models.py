@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from team.config import Lens, MotionModel, MotionNoise, Sensor
 from team.estimation import models
-from team.estimation.geometry import compose, exponential, inverse, logarithm
 from team.estimation.models import Increment, increment_of
 from team.estimation.randomness import generator
+from team.estimation.se2 import compose, exponential, inverse, logarithm
 
 quick = settings(deadline=None, max_examples=60)
 turns = st.floats(-2.5, 2.5)

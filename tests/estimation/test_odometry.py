@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from team.config import MotionModel, MotionNoise
-from team.estimation.geometry import between, compose, exponential, logarithm
 from team.estimation.models import Increment, increment_of
 from team.estimation.odometry import OdometryInterval, moved, part_of, steered
+from team.estimation.se2 import between, compose, exponential, logarithm
 
 SECOND = 1_000_000_000
 NOISY = MotionModel(

@@ -10,7 +10,7 @@ from central.node import CentralNode
 from central.submap_fold import RecordedFields, SubmapFold
 from team import translate
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.geometry import transformed
+from team.estimation.se2 import transformed
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded

@@ -23,8 +23,8 @@ from sim.studies.batch_reference.measurements import (
 )
 from sim.studies.batch_reference.reference import BatchReference, batch_map
 from team.config import MotionModel, MotionNoise, RobotConfig
-from team.estimation.geometry import between, compose, exponential, tangent
 from team.estimation.models import increment_of
+from team.estimation.se2 import between, compose, exponential, tangent
 from team.wire import channels as ch
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
 

@@ -15,9 +15,9 @@ from sim.studies.batch_reference.graph import pose_key, values_of
 from sim.studies.batch_reference.measurements import Chain, Scan, chains_of
 from sim.studies.batch_reference.reference import batch_map
 from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam.pose_grid import NodeSighting
 from team.estimation.models import increment_of, noise, predicted
+from team.estimation.se2 import Pose
 from tests.sim.logs import joined_log, scenario
 
 LANDMARKS = {7: np.array([4.0, 1.0]), 9: np.array([2.0, -3.0])}

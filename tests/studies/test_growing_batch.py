@@ -7,7 +7,8 @@ from sim.studies.batch_reference import growing as batch
 from sim.studies.batch_reference.graph import FLOOR_SIGMAS
 from team.config import Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.geometry import (
+from team.estimation.models import landmark_jacobian, noise, pose_jacobian, predicted
+from team.estimation.se2 import (
     adjoint,
     between,
     compose,
@@ -16,7 +17,6 @@ from team.estimation.geometry import (
     logarithm,
     tangent,
 )
-from team.estimation.models import landmark_jacobian, noise, pose_jacobian, predicted
 from tests.estimation.team_rounds import LANDMARKS, STARTS, team_run, wrap
 
 KNOWN = {robot: (pose, None) for robot, pose in STARTS.items()}

@@ -26,9 +26,9 @@ from sim.world.simulator import simulated
 from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.geometry import between, inverse, transformed
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.hybrid_slam.pipeline import HybridSlam
+from team.estimation.se2 import between, inverse, transformed
 
 PROBABILITY = 0.999
 WINDOW_S = 8.0

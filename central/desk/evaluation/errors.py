@@ -8,8 +8,8 @@ from scipy.linalg import solve_triangular
 
 from team.estimation.consistency import chi2_interval, coverage, nees
 from team.estimation.gaussian import cholesky_factor
-from team.estimation.geometry import between
 from team.estimation.map_joining.alignment import NEEDED, procrustes
+from team.estimation.se2 import between
 
 TRUTH_GAP_NS = 1_000_000_000
 """Largest gap between truth samples that is interpolated."""

@@ -24,7 +24,7 @@ from central.desk.evaluation.evaluation import Evaluation, RobotResult
 from central.desk.paths import SmoothedPath
 from central.desk.pictures.style import save
 from team.config import UNNAMED
-from team.estimation.geometry import inverse
+from team.estimation.se2 import inverse
 
 # Matplotlib takes half a second to import.
 if TYPE_CHECKING:

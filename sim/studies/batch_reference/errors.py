@@ -25,8 +25,8 @@ from central.config import BiasSigmas
 from sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
 from sim.studies.batch_reference.measurements import Chain
 from team.config import Sensor
-from team.estimation.geometry import Point, wrapped
 from team.estimation.models import NEAREST_M, predicted
+from team.estimation.se2 import Point, wrapped
 
 BIASES = ("bearing", "range_offset", "range_scale")
 """Sensor biases of the centre's model, in state order."""

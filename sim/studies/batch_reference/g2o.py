@@ -17,8 +17,8 @@ from sim.studies.batch_reference.graph import FLOOR_SIGMAS, landmark_starts
 from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from sim.studies.batch_reference.reference import placed
 from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Point
 from team.estimation.models import predicted
+from team.estimation.se2 import Point
 from team.wire.bus import Sample
 
 Poses = Float[np.ndarray, "K 3"]

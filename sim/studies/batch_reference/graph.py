@@ -12,8 +12,8 @@ from jaxtyping import Float
 from central.desk.evaluation.evaluation import MapResult
 from sim.studies.batch_reference.measurements import Chain
 from team.estimation.gaussian import Matrix
-from team.estimation.geometry import Point, Pose, tangent
 from team.estimation.models import located, predicted
+from team.estimation.se2 import Point, Pose, tangent
 from team.extras import install_command
 from team.registry import NotInstalledError
 

@@ -25,8 +25,8 @@ from sim.studies.batch_reference.graph import (
 from sim.studies.batch_reference.measurements import Scan
 from sim.studies.estimators.robot_step import RobotStep
 from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.geometry import Pose, compose, tangent
 from team.estimation.models import located, predicted
+from team.estimation.se2 import Pose, compose, tangent
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
 """A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning

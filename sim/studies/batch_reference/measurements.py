@@ -14,12 +14,12 @@ from central.team_config import TeamConfig
 from team import translate
 from team.config import RobotConfig, Sensor
 from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.geometry import Pose, between, compose, inverse
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from team.estimation.models import Increment, noise
 from team.estimation.mount import moved_by
 from team.estimation.scans import Own, unclaimed
+from team.estimation.se2 import Pose, between, compose, inverse
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Sample, opened

@@ -38,8 +38,8 @@ from sim.studies.batch_reference.graph import (
 )
 from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
 from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.geometry import inverse, tangent
 from team.estimation.mount import moved_by
+from team.estimation.se2 import inverse, tangent
 from team.registry import NotInstalledError
 from team.wire.bus import Sample
 

@@ -12,8 +12,8 @@ from jaxtyping import Float, UInt32
 from team.config import Sensor
 from team.estimation import dense
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose, tangent
 from team.estimation.models import Increment
+from team.estimation.se2 import Pose, tangent
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from jaxtyping import Float, UInt32
 from sim.studies.estimators import ekf_kernel
 from team.config import Sensor
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam.innovation import Innovation, joint_innovation, slots_of
 from team.estimation.models import Increment, variances
+from team.estimation.se2 import Pose
 from team.estimation.submap import LocalMap
 
 

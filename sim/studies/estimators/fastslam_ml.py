@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team import core
 from team.config import GATE, UNNAMED, Sensor
 from team.core import mean_direction
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from team.estimation.models import Increment
 
@@ -61,7 +62,7 @@ def filter_step(
     values, vectors = np.linalg.eigh(increment.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)
-    s, c = elementwise.sin_and_cos(state.poses[:, 2])
+    s, c = core.sin_and_cos(state.poses[:, 2])
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
     state = _with_room(replace(state, poses=poses), len(ranges))
@@ -94,29 +95,24 @@ class _Scan:
         )
         R = np.diag(
             [
-                elementary.squared(sensor.range_sigma)
-                + elementary.squared(sensor.range_sigma_per_m * r),
-                elementary.squared(sensor.bearing_sigma),
+                core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * r),
+                core.squared(sensor.bearing_sigma),
             ]
         )
         S = dense.product(dense.product(H, self._covariances), H.transpose(0, 1, 3, 2)) + R
-        turned = b - elementwise.atan2(dy, dx) + heading[:, None]
+        turned = b - core.atan2(dy, dx) + heading[:, None]
         off = np.stack((r - range_, np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi), -1)
         determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
         squared = (
-            S[..., 1, 1] * elementary.squared(off[..., 0])
+            S[..., 1, 1] * core.squared(off[..., 0])
             - 2.0 * S[..., 0, 1] * off[..., 0] * off[..., 1]
-            + S[..., 0, 0] * elementary.squared(off[..., 1])
+            + S[..., 0, 0] * core.squared(off[..., 1])
         ) / determinant
-        likely = -0.5 * squared - 0.5 * elementwise.log(determinant) - elementary.log(2.0 * np.pi)
+        likely = -0.5 * squared - 0.5 * core.log(determinant) - core.log(2.0 * np.pi)
         used = np.arange(self._means.shape[1]) < self._counts[:, None]
         likely = np.where(used & self._free & (squared < gate), likely, -np.inf)
         best = likely.argmax(axis=1)
-        edge = (
-            -0.5 * gate
-            - 0.5 * float(elementwise.log(np.linalg.det(R)))
-            - elementary.log(2.0 * np.pi)
-        )
+        edge = -0.5 * gate - 0.5 * float(core.log(np.linalg.det(R))) - core.log(2.0 * np.pi)
         old = likely[particles, best] > edge
         self._logs += np.where(old, likely[particles, best], edge)
         place = np.where(old, best, self._counts)
@@ -149,7 +145,7 @@ class _Scan:
     ) -> None:
         r, b = measured
         x, y, heading = self._state.poses[at].T
-        s, c = elementwise.sin_and_cos(heading + b)
+        s, c = core.sin_and_cos(heading + b)
         G = np.stack((np.stack((c, -r * s), -1), np.stack((s, r * c), -1)), -2)
         self._means[at, place] = np.column_stack((x + r * c, y + r * s))
         self._covariances[at, place] = dense.product(dense.product(G, R), G.transpose(0, 2, 1))
@@ -185,7 +181,7 @@ def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
 
 
 def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
-    weights = elementwise.exp(state.logs - state.logs.max())
+    weights = core.exp(state.logs - state.logs.max())
     return np.asarray(weights / weights.sum())
 
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team import core
 from team.config import Sensor
 from team.core import moments
-from team.estimation import elementary, elementwise
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.models import Increment
+from team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,7 @@ def filter_step(
         proposal="fastslam1",
         generator=generator,
     )
-    mean, P = moments(
-        after.poses, elementwise.exp(after.log_weights), after.means, after.covariances, 1.0
-    )
+    mean, P = moments(after.poses, core.exp(after.log_weights), after.means, after.covariances, 1.0)
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
     return absorbed(
         ThesisState(mean[:3], P[:3, :3], state.ids, state.landmarks, state.covariances),
@@ -85,7 +83,7 @@ def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> 
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
     return Particles(
         poses=np.tile(state.pose, (particles, 1)),
-        log_weights=np.full(particles, -elementary.log(float(particles))),
+        log_weights=np.full(particles, -core.log(float(particles))),
         ids=state.ids[observed],
         means=np.tile(state.landmarks[observed], (particles, 1, 1)),
         covariances=np.tile(triangles, (particles, 1, 1)),

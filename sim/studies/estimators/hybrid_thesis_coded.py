@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from team import core
 from team.config import Sensor
-from team.estimation import elementary, elementwise
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.models import Increment
+from team.estimation.se2 import Pose
 
 FIRST_RANGE_VAR = 15.0**2
 FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
@@ -87,8 +87,8 @@ def _at_first(
     poses: Float[np.ndarray, "M 3"], range_m: float, bearing: float
 ) -> Float[np.ndarray, "M 3"]:
     """Gz r Gzᵀ of each particle as (xx, xy, yy), with Gz as printed."""
-    s, c = elementwise.sin_and_cos(poses[:, 2] + bearing)
-    along, across = FIRST_RANGE_VAR, elementary.squared(range_m) * FIRST_BEARING_VAR
+    s, c = core.sin_and_cos(poses[:, 2] + bearing)
+    along, across = FIRST_RANGE_VAR, core.squared(range_m) * FIRST_BEARING_VAR
     return np.column_stack(
         (c * c * along + s * s * across, c * s * (along + across), s * s * along + c * c * across)
     )

@@ -13,11 +13,11 @@ from jaxtyping import Float, UInt32
 
 from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
 from sim.studies.estimators.robot_step import RobotStep
-from team.estimation import elementary
+from team import core
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def filter_step(
         state = replace(
             state,
             poses=state.poses[:, parents],
-            log_weights=np.full(len(parents), -elementary.log(float(len(parents)))),
+            log_weights=np.full(len(parents), -core.log(float(len(parents)))),
             means=state.means[parents],
             covariances=state.covariances[parents],
         )

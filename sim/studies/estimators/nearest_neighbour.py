@@ -12,13 +12,14 @@ from jaxtyping import Float, Int64, UInt32
 
 from sim.studies.estimators import ekf_slam
 from sim.studies.estimators.ekf_slam import EkfSlam
+from team import core
 from team.config import GATE, UNNAMED, Sensor
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.association.gating import compute_mahalanobis, match_best_first
 from team.estimation.association.scans import UNASSIGNED
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam.innovation import Innovation
 from team.estimation.models import Increment
+from team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)
@@ -96,14 +97,12 @@ def _associated(
     known = np.flatnonzero(slam.ids >= UNNAMED)
     predicted, spread = predictions(slam, known)
     R = np.zeros((len(ranges), 2, 2))
-    R[:, 0, 0] = elementary.squared(sensor.range_sigma) + elementary.squared(
-        sensor.range_sigma_per_m * ranges
-    )
-    R[:, 1, 1] = elementary.squared(sensor.bearing_sigma)
+    R[:, 0, 0] = core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges)
+    R[:, 1, 1] = core.squared(sensor.bearing_sigma)
     off = np.column_stack((ranges, bearings))[:, None] - predicted[None]
     off[..., 1] = np.remainder(off[..., 1] + np.pi, 2.0 * np.pi) - np.pi
     squared, determinants = compute_mahalanobis(off, spread[None] + R[:, None])
-    found = match_best_first(squared < gate, squared + elementwise.log(determinants))
+    found = match_best_first(squared < gate, squared + core.log(determinants))
     numbers = np.zeros(len(ranges), np.uint32)
     numbers[found != UNASSIGNED] = slam.ids[known[found[found != UNASSIGNED]]]
     new = np.flatnonzero(found == UNASSIGNED)
@@ -117,16 +116,16 @@ def predictions(
     """(range, bearing) of these landmarks and H P Hᵀ, without the sensor's noise."""
     at = 3 + 2 * which[:, None] + np.arange(2)
     dx, dy = (slam.mean[at] - slam.mean[:2]).T
-    r = np.maximum(elementwise.hypot(dx, dy), 1e-6)
+    r = np.maximum(core.hypot(dx, dy), 1e-6)
     H = np.zeros((len(which), 2, 5))
     H[:, 0, 0], H[:, 0, 1] = -dx / r, -dy / r
     H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = (
-        dy / elementary.squared(r),
-        -dx / elementary.squared(r),
+        dy / core.squared(r),
+        -dx / core.squared(r),
         -1.0,
     )
     H[:, :, 3:] = -H[:, :, :2]
     columns = np.concatenate((np.tile(np.arange(3), (len(which), 1)), at), axis=1)
     P = slam.covariance[columns[:, :, None], columns[:, None, :]]
-    bearing = elementwise.atan2(dy, dx) - slam.mean[2]
+    bearing = core.atan2(dy, dx) - slam.mean[2]
     return np.column_stack((r, bearing)), dense.product(dense.product(H, P), H.transpose(0, 2, 1))

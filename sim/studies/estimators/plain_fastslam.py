@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from team import core
 from team.config import Sensor
 from team.core import moments
-from team.estimation import elementwise
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.models import Increment
 from team.estimation.scans import Own
+from team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
 def pose_moments(particles: Particles) -> PoseGaussian:
     """Moments of the weighted poses; singular where fewer than four of them differ."""
     none = particles.means[:, :0], particles.covariances[:, :0]
-    weights = elementwise.exp(particles.log_weights)
+    weights = core.exp(particles.log_weights)
     return PoseGaussian(*moments(particles.poses, weights, *none, 1.0))
 
 
@@ -90,7 +90,7 @@ def landmark_moments(particles: Particles) -> LandmarkGaussian:
     order = np.argsort(particles.ids)
     mean, P = moments(
         particles.poses,
-        elementwise.exp(particles.log_weights),
+        core.exp(particles.log_weights),
         np.ascontiguousarray(particles.means[:, order]),
         np.ascontiguousarray(particles.covariances[:, order]),
         1.0,

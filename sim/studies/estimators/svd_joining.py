@@ -13,15 +13,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation import dense, elementary, elementwise
+from team import core
+from team.estimation import dense
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
-from team.estimation.geometry import Pose, wrapped
 from team.estimation.map_joining import joining
 from team.estimation.map_joining.alignment import procrustes
 from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold
 from team.estimation.models import located
+from team.estimation.se2 import Pose, wrapped
 from team.estimation.submap import LocalMap
 
 Weighting = Literal["identity", "spherical", "full"]
@@ -176,7 +177,7 @@ def exchanged(
         raise TooFewPointsError(n)
     a_from_b = procrustes(tie_a, tie_b, np.ones(n))
     moved, G = _moved(a_from_b, tie_b)
-    variance = 0.5 * float((elementary.squared(tie_a - moved)).sum()) / (2 * n - 3)
+    variance = 0.5 * float((core.squared(tie_a - moved)).sum()) / (2 * n - 3)
     of_motion = 2.0 * variance * information(dense.product(G.T, G), "two maps' points")
     common = np.isin(ids, a.ids) & np.isin(ids, b.ids)
     from_b = np.where(common, 0.5, np.isin(ids, b.ids))
@@ -198,7 +199,7 @@ def _moved(
     a_from_b: Pose, points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 3"]]:
     """R b + t and its derivative by (t, θ): [I, R b turned by 90°]."""
-    s, c = elementwise.sin_and_cos(a_from_b[2])
+    s, c = core.sin_and_cos(a_from_b[2])
     turned = dense.product(points, np.array([[c, s], [-s, c]]))
     G = np.zeros((2 * len(points), 3))
     G[0::2, 0] = G[1::2, 1] = 1.0
@@ -258,7 +259,7 @@ def _seen_from(
     state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""
-    s, c = elementwise.sin_and_cos(state[2])
+    s, c = core.sin_and_cos(state[2])
     back = np.array([[c, s], [-s, c]])
     offsets = state[columns].reshape(-1, 2) - state[:2]
     seen = dense.product(offsets, back.T)

@@ -32,8 +32,8 @@ from sim.studies.experiments.experiment import (
 from sim.studies.experiments.task import Task
 from sim.studies.experiments.team_runs import Figures
 from sim.world.config import SimulatedWorld, UtiasWorld
-from team.estimation.geometry import wrapped
 from team.estimation.map_joining.alignment import procrustes
+from team.estimation.se2 import wrapped
 
 STEPS = 600
 """Steps of his simulator, after which most landmarks were detected."""

@@ -32,11 +32,11 @@ from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from sim.world.config import SimulatedWorld
 from team import translate
 from team.estimation.consistency import nees
-from team.estimation.geometry import wrapped
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
+from team.estimation.se2 import wrapped
 from team.wire import messages as m
 from team.wire.bus import opened
 

@@ -25,10 +25,10 @@ from team import translate
 from team.config import Estimator, RobotConfig, Sensor
 from team.estimation import dense
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.geometry import tangent
 from team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment
+from team.estimation.se2 import tangent
 from team.robot.own_map import InitialPose
 
 

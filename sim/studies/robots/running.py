@@ -17,7 +17,6 @@ from team.estimation.gaussian import (
     NotACovarianceError,
     PoseGaussian,
 )
-from team.estimation.geometry import Pose, inverse
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from team.estimation.hybrid_slam.reduction import KeyframeScan
@@ -26,6 +25,7 @@ from team.estimation.mount import moved_by
 from team.estimation.odometry import OdometryInterval
 from team.estimation.randomness import generator
 from team.estimation.scans import Scan, unclaimed
+from team.estimation.se2 import Pose, inverse
 from team.estimation.submap import Became
 from team.pairs import FEEDBACK
 from team.rejection import Rejection

@@ -16,8 +16,8 @@ from sim.studies.rules.team_keyframes import RobotKeyframe
 from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.geometry import Pose, inverse
 from team.estimation.mount import moved_by
+from team.estimation.se2 import Pose, inverse
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 

@@ -14,9 +14,9 @@ from sim.studies.rules.team_keyframes import RobotKeyframe
 from team.config import RobotConfig
 from team.estimation import dense
 from team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
-from team.estimation.geometry import Pose, tangent
 from team.estimation.models import Increment
 from team.estimation.randomness import generator
+from team.estimation.se2 import Pose, tangent
 from team.wire.bus import Outgoing
 
 RESAMPLE_BELOW = 1.0

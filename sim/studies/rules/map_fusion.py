@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation import dense, elementwise
+from team import core
+from team.estimation import dense
 from team.estimation.gaussian import (
     NO_LANDMARKS,
     LandmarkGaussian,
@@ -198,7 +199,7 @@ def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:
     if criterion == "trace":
         return float(np.trace(information(metric, "the intersection")))
     factor = cholesky_factor(metric, "the intersection")
-    return float(-2.0 * elementwise.log(np.diag(factor)).sum())
+    return float(-2.0 * core.log(np.diag(factor)).sum())
 
 
 def _least(size: Callable[[float], float]) -> float:

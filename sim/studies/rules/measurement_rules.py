@@ -16,9 +16,9 @@ from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from team import translate
 from team.config import RobotConfig
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.geometry import Pose, inverse
 from team.estimation.mount import moved_by
 from team.estimation.plausible import start_beyond
+from team.estimation.se2 import Pose, inverse
 from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.bus import Outgoing

@@ -26,13 +26,13 @@ from sim.studies.estimators.svd_joining import (
     TooFewPointsError,
     Weighting,
 )
-from team import translate
-from team.estimation import dense, elementwise
+from team import core, translate
+from team.estimation import dense
 from team.estimation.contribution import named
 from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from team.estimation.geometry import Pose
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from team.estimation.plausible import start_beyond, submap_beyond
+from team.estimation.se2 import Pose
 from team.estimation.submap import LocalMap
 from team.store import Stream, SubmapStore
 from team.wire import channels as ch
@@ -245,7 +245,7 @@ def _seen(
         pairs = sightings.get((min(stream, other), max(stream, other)))
         if pairs is not None:
             theirs, own = pairs if other < stream else (pairs.in_b, pairs.in_a)
-            s, c = elementwise.sin_and_cos(frame[2])
+            s, c = core.sin_and_cos(frame[2])
             found.append(
                 PointPairs(dense.product(theirs, np.array([[c, s], [-s, c]])) + frame[:2], own)
             )

@@ -11,6 +11,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <span>
@@ -40,6 +41,72 @@ struct nanobind::detail::type_caster<Places> {
   }
 };
 
+// A number of Python: a float, an integer, one of NumPy's numbers; but no array, not even of one number.
+struct Number {
+  double value;
+};
+
+template <>
+struct nanobind::detail::type_caster<Number> {
+  NB_TYPE_CASTER(Number, const_name("float"))
+
+  bool from_python(handle from, std::uint8_t, cleanup_list*) noexcept {
+    if (!PyFloat_Check(from.ptr())) {
+      const PyNumberMethods* of_number = Py_TYPE(from.ptr())->tp_as_number;
+      if (!of_number || !of_number->nb_float || PySequence_Check(from.ptr())) return false;
+    }
+    value.value = PyFloat_AsDouble(from.ptr());
+    if (value.value != -1.0 || !PyErr_Occurred()) return true;
+    PyErr_Clear();
+    return false;
+  }
+};
+
+// An array of any shape, read row by row: one of another layout is copied, faster than by nanobind.
+class Array {
+ public:
+  using Any = nb::ndarray<const double, nb::device::cpu>;
+
+  Array() = default;
+  explicit Array(Any&& from) : held_(std::move(from)), data_(held_.data()) {
+    std::int64_t step = 1;
+    bool is_in_order = true;
+    for (std::size_t i = ndim(); i-- > 0; step *= std::int64_t(shape(i)))
+      is_in_order = is_in_order && (shape(i) == 1 || held_.stride(i) == step);
+    if (is_in_order || size() == 0) return;
+    copied_.reserve(size());
+    copy(0, held_.data());
+    data_ = copied_.data();
+  }
+
+  const double* data() const { return data_; }
+  std::size_t size() const { return held_.size(); }
+  std::size_t ndim() const { return held_.ndim(); }
+  std::size_t shape(std::size_t i) const { return held_.shape(i); }
+
+ private:
+  void copy(std::size_t axis, const double* from) {
+    if (axis == ndim()) return copied_.push_back(*from);
+    for (std::size_t i = 0; i < shape(axis); i++) copy(axis + 1, from + std::int64_t(i) * held_.stride(axis));
+  }
+
+  Any held_;
+  std::vector<double> copied_;
+  const double* data_ = nullptr;
+};
+
+template <>
+struct nanobind::detail::type_caster<Array> {
+  NB_TYPE_CASTER(Array, make_caster<Array::Any>::Name)
+
+  bool from_python(handle from, std::uint8_t flags, cleanup_list* cleanup) noexcept {
+    make_caster<Array::Any> caster;
+    if (!caster.from_python(from, flags, cleanup)) return false;
+    value = Array(std::move(caster.value));
+    return true;
+  }
+};
+
 namespace teamslam::binding {
 
 // Arrays from Python, and arrays to Python.
@@ -51,6 +118,7 @@ using Matrix3 = nb::ndarray<const double, nb::shape<3, 3>, nb::c_contig, nb::dev
 using Ids = nb::ndarray<const std::uint32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 template <class T, class Shape>
 using Made = nb::ndarray<nb::numpy, T, Shape, nb::c_contig>;
+using MadeArray = nb::ndarray<nb::numpy, double, nb::c_contig>;
 using MadeNumbers = Made<double, nb::ndim<1>>;
 using MadeTable = Made<double, nb::ndim<2>>;
 using MadeStack = Made<double, nb::ndim<3>>;
@@ -83,6 +151,65 @@ Made<T, Shape> made(std::vector<T>&& values, std::initializer_list<std::size_t> 
   return Made<T, Shape>(kept->data(), shape, owner);
 }
 
+// Lengths of an array's axes.
+using Axes = std::vector<std::size_t>;
+
+template <class Any>
+Axes axes_of(const Any& array) {
+  Axes axes(array.ndim());
+  for (std::size_t i = 0; i < axes.size(); i++) axes[i] = array.shape(i);
+  return axes;
+}
+
+inline std::size_t product_of(std::span<const std::size_t> axes) {
+  std::size_t count = 1;
+  for (const std::size_t each : axes) count *= each;
+  return count;
+}
+
+inline MadeArray made_array(std::vector<double>&& values, const Axes& axes) {
+  auto* kept = new std::vector<double>(std::move(values));
+  nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
+  return MadeArray(kept->data(), axes.size(), axes.data(), owner);
+}
+
+// Two shapes broadcast against each other, as by NumPy: the common shape, and the place in either
+// array of each of its entries.
+struct Broadcast {
+  Axes axes;
+  std::vector<std::size_t> left, right;
+
+  Broadcast(std::span<const std::size_t> a, std::span<const std::size_t> b) : axes(std::max(a.size(), b.size())) {
+    const std::size_t n = axes.size();
+    std::vector<std::size_t> of_a(n), of_b(n), at(n);  // steps; 0 along an axis that is repeated
+    std::size_t step_a = 1, step_b = 1;
+    for (std::size_t back = 1; back <= n; back++) {
+      const std::size_t i = n - back;
+      const std::size_t in_a = back <= a.size() ? a[a.size() - back] : 1, in_b = back <= b.size() ? b[b.size() - back] : 1;
+      check(in_a == in_b || in_a == 1 || in_b == 1, "the shapes do not fit each other");
+      axes[i] = in_a == 1 ? in_b : in_a;
+      if (in_a != 1) of_a[i] = step_a;
+      if (in_b != 1) of_b[i] = step_b;
+      step_a *= in_a;
+      step_b *= in_b;
+    }
+    const std::size_t count = product_of(axes);
+    std::size_t in_a = 0, in_b = 0;
+    for (std::size_t k = 0; k < count; k++) {
+      left.push_back(in_a);
+      right.push_back(in_b);
+      for (std::size_t i = n; i-- > 0;) {
+        in_a += of_a[i];
+        in_b += of_b[i];
+        if (++at[i] < axes[i]) break;
+        in_a -= of_a[i] * axes[i];
+        in_b -= of_b[i] * axes[i];
+        at[i] = 0;
+      }
+    }
+  }
+};
+
 inline MadeNumbers made_numbers(std::vector<double>&& values) {
   const std::size_t n = values.size();
   return made<double, nb::ndim<1>>(std::move(values), {n});
@@ -98,8 +225,10 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 }
 
 // One function for each file of bindings.
+void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
 void bind_maps(nb::module_& m);
+void bind_se2(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding

@@ -25,23 +25,22 @@ void divide(double* row, double by, std::size_t count) {
   for (std::size_t j = 0; j < count; j++) row[j] /= by;
 }
 
-// Adds to four rows of a tile the products of `deep` entries of A's rows with the packed rows of B.
+// Adds to four rows of a tile the products of `deep` entries of A's rows with the packed rows of B:
+// eight registers of sums at a time.
 void add_terms(const double* const (&a)[4], const double* packed, double* sums, std::size_t deep, std::size_t width) {
-  const std::size_t whole = deep - deep % 4;
-  for (std::size_t p = 0; p < whole; p += 4) {
-    const double* row = packed + p * TILE;
-    for (std::size_t j = 0; j < width; j += pack::WIDTH) {
-      const Pack b0 = load(row + j), b1 = load(row + TILE + j), b2 = load(row + 2 * TILE + j), b3 = load(row + 3 * TILE + j);
-#pragma GCC unroll 4
-      for (std::size_t r = 0; r < 4; r++) {
-        double* sum = sums + r * TILE + j;
-        store(sum, (((load(sum) + a[r][p] * b0) + a[r][p + 1] * b1) + a[r][p + 2] * b2) + a[r][p + 3] * b3);
-      }
+  constexpr std::size_t PACKS = 2 / pack::REGISTERS;
+  for (std::size_t j = 0; j < width; j += PACKS * pack::WIDTH) {
+    const auto place = [j](std::size_t k) { return k / PACKS * TILE + j + k % PACKS * pack::WIDTH; };
+    Pack s[4 * PACKS];
+#pragma GCC unroll 8
+    for (std::size_t k = 0; k < 4 * PACKS; k++) s[k] = load(sums + place(k));
+    for (std::size_t p = 0; p < deep; p++) {
+#pragma GCC unroll 8
+      for (std::size_t k = 0; k < 4 * PACKS; k++) s[k] += a[k / PACKS][p] * load(packed + p * TILE + j + k % PACKS * pack::WIDTH);
     }
+#pragma GCC unroll 8
+    for (std::size_t k = 0; k < 4 * PACKS; k++) store(sums + place(k), s[k]);
   }
-  for (std::size_t p = whole; p < deep; p++)
-    for (std::size_t r = 0; r < 4; r++)
-      for (std::size_t j = 0; j < width; j++) sums[r * TILE + j] += a[r][p] * packed[p * TILE + j];
 }
 
 }  // namespace

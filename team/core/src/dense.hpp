@@ -67,7 +67,7 @@ class Matrix {
   View view() { return {numbers_.data(), rows_, columns_, columns_}; }
   Const view() const { return {numbers_.data(), rows_, columns_, columns_}; }
   operator Const() const { return view(); }
-  std::vector<double> numbers() && { return std::move(numbers_); }
+  std::vector<double>&& numbers() && { return std::move(numbers_); }
 
  private:
   std::size_t rows_ = 0, columns_ = 0;

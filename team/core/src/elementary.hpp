@@ -1,8 +1,9 @@
 // Sine, logarithm and the like, with the same bits on every processor.
 //
 // A C library takes other paths on other processors. These functions are sums, products, quotients
-// and square roots in one order, so IEEE 754 leaves one result; team/estimation/elementary.py has
-// the same bits. Reductions by Cody and Waite 1980; coefficients of fdlibm (Sun Microsystems 1993).
+// and square roots in one order, so IEEE 754 leaves one result. Their errors, in units of the last
+// place, are what tests/core/test_elementary.py finds them to be against forty digits. Reductions by
+// Cody and Waite 1980; coefficients of fdlibm (Sun Microsystems 1993).
 #pragma once
 
 #include <limits>
@@ -57,6 +58,13 @@ inline SineCosine<T> sin_cos_near(T angle) {
 inline double near(double angle) { return std::fabs(angle) > FARTHEST ? std::fmod(angle, TWO_PI) : angle; }
 
 inline SineCosine<double> sin_cos(double angle) { return sin_cos_near(near(angle)); }
+
+inline double sin(double angle) { return sin_cos(angle).sine; }
+inline double cos(double angle) { return sin_cos(angle).cosine; }
+inline double tan(double angle) {
+  const auto [s, c] = sin_cos(angle);
+  return s / c;
+}
 
 // atan2(y, x) of y ≥ 0, the larger coordinate in 1e-240 … 1e270, without a branch.
 //

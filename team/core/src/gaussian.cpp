@@ -2,7 +2,7 @@
 
 #include <cmath>
 
-#include "elementary.hpp"
+#include "se2.hpp"
 
 namespace teamslam::gaussian {
 
@@ -29,6 +29,22 @@ Factor factor_or_fault(dense::Const P) {
     if (pivot * pivot <= double(P.rows) * elementary::EPSILON) return {{}, Fault::NOT_POSITIVE};
   }
   return {std::move(*L), Fault::NONE};
+}
+
+dense::Matrix curved(double heading, dense::Const P) {
+  const linalg::Matrix3 T = se2::tangent(heading);
+  const dense::Matrix S = dense::product(dense::product(dense::transposed(T), P), T);
+  const auto of_squares = [&](int i, int j) { return 0.25 * (S[2][2] * S[i][j] + 2.0 * (S[i][2] * S[j][2])); };
+  dense::Matrix away(2, 2);
+  away[0][0] = of_squares(1, 1);
+  away[0][1] = away[1][0] = -of_squares(0, 1);
+  away[1][1] = of_squares(0, 0);
+  const dense::Const turn = dense::Const(T).part(0, 0, 2, 2);
+  const dense::Matrix added = dense::product(dense::product(turn, away), dense::transposed(turn));
+  dense::Matrix curved(P);
+  for (int i = 0; i < 2; i++)
+    for (int j = 0; j < 2; j++) curved[i][j] += added[i][j];
+  return curved;
 }
 
 }  // namespace teamslam::gaussian

@@ -20,4 +20,8 @@ struct Factor {
 // rounding of a singular matrix.
 Factor factor_or_fault(dense::Const P);
 
+// The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order:
+// E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 is added to the variance of f, and so on.
+dense::Matrix curved(double heading, dense::Const P);
+
 }  // namespace teamslam::gaussian

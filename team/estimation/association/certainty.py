@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team import core
 from team.config import AssociationSettings
-from team.estimation import elementary, elementwise
 from team.estimation.association.gating import compute_mahalanobis
 from team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
 from team.estimation.association.smoothing import SmoothedWindow
@@ -55,16 +55,16 @@ class FieldOfView:
         self, seen: Float[np.ndarray, "L 2"], spread: Float[np.ndarray, "L 2 2"]
     ) -> Float[np.ndarray, " L"]:
         """Compute the probability that each place, in the sensor's frame, is in view."""
-        ranges = np.maximum(elementwise.hypot(seen[:, 0], seen[:, 1]), 1e-6)
-        bearings = elementwise.atan2(seen[:, 1], seen[:, 0])
+        ranges = np.maximum(core.hypot(seen[:, 0], seen[:, 1]), 1e-6)
+        bearings = core.atan2(seen[:, 1], seen[:, 0])
         along = seen / ranges[:, None]
         across = np.column_stack((-along[:, 1], along[:, 0]))
         far = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", along, spread, along), 1e-12))
         wide = np.sqrt(np.maximum(np.einsum("li,lij,lj->l", across, spread, across), 1e-12))
-        inside = elementwise.normal_below((self.farthest - ranges) / far)
+        inside = core.normal_below((self.farthest - ranges) / far)
         if self.most - self.least < 1.5 * np.pi:
-            inside *= elementwise.normal_below((self.most - bearings) * ranges / wide)
-            inside *= elementwise.normal_below((bearings - self.least) * ranges / wide)
+            inside *= core.normal_below((self.most - bearings) * ranges / wide)
+            inside *= core.normal_below((bearings - self.least) * ranges / wide)
         return np.asarray(np.maximum(inside, LEAST))
 
 
@@ -72,13 +72,13 @@ def estimate_view(scans: Scans) -> FieldOfView:
     """Estimate the sector filled by the window's detections, before its widening by their noise,
     and their density in it.
     """
-    ranges = elementwise.hypot(scans.points[:, 0], scans.points[:, 1])
-    bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
+    ranges = core.hypot(scans.points[:, 0], scans.points[:, 1])
+    bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
     along = scans.points / np.maximum(ranges, 1e-6)[:, None]
     noise = np.sqrt(np.einsum("ni,nij,nj->n", along, scans.covariances, along))
     farthest = max(float((ranges - 2.0 * noise).max()), FARTHER * float(np.median(ranges)))
     least, most = float(bearings.min()) - WIDER, float(bearings.max()) + WIDER
-    area = max(0.5 * min(most - least, 2.0 * np.pi) * elementary.squared(farthest), 1e-9)
+    area = max(0.5 * min(most - least, 2.0 * np.pi) * core.squared(farthest), 1e-9)
     looks = len(np.unique(scans.keyframes))
     return FieldOfView(len(ranges) / (looks * area), area, looks, farthest, least, most)
 
@@ -108,14 +108,14 @@ def association_probabilities(
         R = settings.variance_factor * scans.covariances[of_scan]
         S = spread[None] + R[:, None]
         squared, determinants = compute_mahalanobis(scans.points[of_scan][:, None] - seen[None], S)
-        logs = elementwise.log(determinants)
+        logs = core.log(determinants)
         detected = settings.detection_probability * view.probability_in_view(
             seen, spread + R.mean(axis=0)
         )
-        volume = np.pi * settings.gate * elementwise.exp(0.5 * logs)
-        other = out - view.density * elementwise.expm1(-view.density * volume)
+        volume = np.pi * settings.gate * core.exp(0.5 * logs)
+        other = out - view.density * core.expm1(-view.density * volume)
         with np.errstate(under="ignore"):
-            likely = elementwise.exp(-0.5 * np.minimum(squared, 1e3) - 0.5 * logs) / (2.0 * np.pi)
+            likely = core.exp(-0.5 * np.minimum(squared, 1e3) - 0.5 * logs) / (2.0 * np.pi)
             weights = detected / (1.0 - detected) * likely / other
         chosen = landmark_of[of_scan]
         found[of_scan] = marginals(weights)[np.arange(len(chosen)), chosen]

@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.association import AssociationProfile
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
 from team.estimation.association.island_view import (
     IslandView,
@@ -46,7 +47,7 @@ from team.estimation.association.visibility import (
 )
 from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
 from team.estimation.contribution import Stream
-from team.estimation.geometry import compose
+from team.estimation.se2 import compose
 
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
@@ -263,22 +264,20 @@ def combine_maps(
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
     local = patch.mean - patch.mean.mean(axis=0)
     placed = apply_motion(vote.motion, local)
-    away = elementwise.hypot(*(placed[:, None] - target.mean[None]).transpose(2, 0, 1))
+    away = core.hypot(*(placed[:, None] - target.mean[None]).transpose(2, 0, 1))
     near = away.min(axis=0) < BEND * profile.same
     near[vote.second] = True
     nearby = np.flatnonzero(near)
     target = target.select(nearby)
     m = len(nearby)
-    s, c = elementwise.sin_and_cos(vote.motion[2])
+    s, c = core.sin_and_cos(vote.motion[2])
     R = np.kron(np.eye(n), np.array([[c, -s], [s, c]]))
     lever = placed - vote.motion[:2]
     J = np.zeros((2 * n, 3))
     J[0::2, 0] = J[1::2, 1] = 1.0
     J[0::2, 2], J[1::2, 2] = -lever[:, 1], lever[:, 0]
     covariance = np.zeros((2 * (n + m), 2 * (n + m)))
-    spread = np.array(
-        [elementary.squared(extent), elementary.squared(extent), elementary.squared(np.pi)]
-    )
+    spread = np.array([core.squared(extent), core.squared(extent), core.squared(np.pi)])
     covariance[: 2 * n, : 2 * n] = dense.product(
         dense.product(R, patch.covariance), R.T
     ) + dense.product(J * spread, J.T)
@@ -299,7 +298,7 @@ def _grow_alignment(
     candidates = list_pairs(patch.at, target.at)
     points = patch.points.mean[vote.first]
     i, j = np.triu_indices(len(points), 1)
-    far = np.argsort(-elementwise.hypot(*(points[i] - points[j]).T), kind="stable")
+    far = np.argsort(-core.hypot(*(points[i] - points[j]).T), kind="stable")
     used: set[int] = set()
     best: MergedPairs | None = None
     for k in far:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.config import AssociationSettings
-from team.estimation import elementary, elementwise
 from team.estimation.association.certainty import association_probabilities
 from team.estimation.association.gating import compute_mahalanobis, match_scan
 from team.estimation.association.scans import (
@@ -174,7 +174,7 @@ def _merge_split(
         + own[None]
         - P
         - P.transpose(0, 1, 3, 2)
-        + elementary.squared(settings.slack_m) * np.eye(2)
+        + core.squared(settings.slack_m) * np.eye(2)
     )
     apart = window.landmarks[:, None] - window.landmarks[None]
     squared, _ = compute_mahalanobis(apart, S)
@@ -228,18 +228,16 @@ def _mark_clutter(
     first = np.unique(scan_of, return_index=True)[1]
     if not len(first):
         return clutter
-    bearings = elementwise.atan2(scans.points[:, 1], scans.points[:, 0])
-    farthest = np.maximum.reduceat(elementwise.hypot(scans.points[:, 0], scans.points[:, 1]), first)
+    bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
+    farthest = np.maximum.reduceat(core.hypot(scans.points[:, 0], scans.points[:, 1]), first)
     least, most = np.minimum.reduceat(bearings, first), np.maximum.reduceat(bearings, first)
     poses = window.poses[scan_of[first]]
     for landmark in np.nonzero(~confirmed)[0]:
         members = np.nonzero(landmark_of == landmark)[0]
         places = relative_to(poses, np.broadcast_to(window.landmarks[landmark], (len(poses), 2)))
-        bearing = elementwise.atan2(places[:, 1], places[:, 0])
+        bearing = core.atan2(places[:, 1], places[:, 0])
         inside = (least <= bearing) & (bearing <= most)
-        looks = np.count_nonzero(
-            inside & (elementwise.hypot(places[:, 0], places[:, 1]) <= farthest)
-        )
+        looks = np.count_nonzero(inside & (core.hypot(places[:, 0], places[:, 1]) <= farthest))
         clutter[members] = _is_rare(len(members), max(int(looks), len(members)), settings)
     return clutter
 

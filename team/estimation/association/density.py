@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.association import AssociationProfile
-from team.estimation import elementary, elementwise
 
 CLOSE = 0.1
 """Quantile of the landmarks' spacings taken as the spacing within groups."""
@@ -63,14 +63,14 @@ class LandmarkDensity:
         """
         within = np.searchsorted(self._distances, radius) + 1.0
         found: Float[np.ndarray, " k"] = within / (
-            max(self.landmarks, 1) * np.pi * elementary.squared(radius)
+            max(self.landmarks, 1) * np.pi * core.squared(radius)
         )
         return found
 
     @cached_property
     def _in_map(self) -> Float[np.ndarray, " p"]:
         one, two = np.triu_indices(len(self.confirmed), 1)
-        return np.sort(elementwise.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
+        return np.sort(core.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
 
     def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Density [1/m²] of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
@@ -80,7 +80,7 @@ class LandmarkDensity:
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (
-            max(len(self.confirmed), 1) * np.pi * elementary.squared(radius)
+            max(len(self.confirmed), 1) * np.pi * core.squared(radius)
         )
         return found
 

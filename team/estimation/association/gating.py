@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.association import AssociationProfile
 from team.config import AssociationSettings
-from team.estimation import elementary, elementwise
 from team.estimation.association.density import LandmarkDensity
 from team.estimation.association.scans import UNASSIGNED
 
@@ -61,7 +61,7 @@ def match_scan(
     squared, determinants = compute_mahalanobis(points[:, None] - seen[None], S)
     allowed = names[:, None] == mapped_names[None]
     allowed &= (squared < settings.gate) | (names[:, None] != UNASSIGNED)
-    return match_best_first(allowed, squared + elementwise.log(determinants))
+    return match_best_first(allowed, squared + core.log(determinants))
 
 
 def match_best_first(
@@ -152,8 +152,8 @@ def evaluate_pairs(
     P = joint.covariance.reshape(n, 2, n, 2)
     R = P[first, :, first] + P[second, :, second] - P[first, :, second] - P[second, :, first]
     half = 0.5 * (R[:, 0, 0] + R[:, 1, 1])
-    spread = elementwise.hypot(0.5 * (R[:, 0, 0] - R[:, 1, 1]), R[:, 0, 1])
-    S = R + elementary.squared(profile.slack) * np.eye(2)
+    spread = core.hypot(0.5 * (R[:, 0, 0] - R[:, 1, 1]), R[:, 0, 1])
+    S = R + core.squared(profile.slack) * np.eye(2)
     chi2, determinant = compute_mahalanobis(joint.mean[first] - joint.mean[second], S)
     density = np.full(len(chi2), profile.density)
     if joint.density is not None:
@@ -163,7 +163,7 @@ def evaluate_pairs(
             observed *= joint.unseen[second]
             density = np.minimum(density, joint.density.of_map(radius))
         density = np.maximum(density, observed)
-    llr = -0.5 * chi2 - 0.5 * elementwise.log(determinant) - elementwise.log(2.0 * np.pi * density)
+    llr = -0.5 * chi2 - 0.5 * core.log(determinant) - core.log(2.0 * np.pi * density)
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
 
 

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.association import AssociationProfile
 from team.config import UNNAMED
-from team.estimation import elementwise
 from team.estimation.association.density import LandmarkDensity
 from team.estimation.association.gating import (
     Indices,
@@ -276,7 +276,7 @@ class IslandView:
         later, earlier = np.nonzero(np.tril(away < self.profile.same, -1))
         one, two = at[later], at[earlier]
         x, y = (self.joint.mean[one] - self.joint.mean[two]).T
-        close = elementwise.hypot(x, y) < self.profile.same
+        close = core.hypot(x, y) < self.profile.same
         one, two, _ = gate_pairs(
             self.joint, one[close], two[close], self.profile, self.profile.tight
         )

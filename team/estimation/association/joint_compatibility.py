@@ -18,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from team import core
 from team.association import AssociationProfile
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.association.gating import (
     Indices,
     Joint,
@@ -66,7 +67,7 @@ def condition_on_pair(joint: Joint, first: int, second: int, profile: Associatio
     P = joint.covariance
     one, two = slice(2 * first, 2 * first + 2), slice(2 * second, 2 * second + 2)
     gain = P[:, one] - P[:, two]
-    S = gain[one] - gain[two] + elementary.squared(profile.slack) * np.eye(2)
+    S = gain[one] - gain[two] + core.squared(profile.slack) * np.eye(2)
     weighted = dense.solve(S, gain.T)
     difference = joint.mean[first] - joint.mean[second]
     mean = joint.mean - (dense.product(weighted.T, difference)).reshape(n, 2)
@@ -161,7 +162,7 @@ def _find_rivals(
         each, against = _list_common(mine)
         p, q = other[each], other[against]
         x, y = (joint.mean[p] - joint.mean[q]).T
-        differ = (x * x + y * y >= elementary.squared(profile.same)) | joint.apart[p, q]
+        differ = (x * x + y * y >= core.squared(profile.same)) | joint.apart[p, q]
         np.maximum.at(rival, each[differ], at.llr[against[differ]])
     return rival
 
@@ -212,7 +213,7 @@ def assign_jointly(
         longer = [more for one in beam for more in _extend(one, own, others, profile, most_sd)]
         longer.sort(key=lambda one: -one.weight)
         best = longer[0].weight
-        lost += sum(float(elementwise.exp(one.weight - best)) for one in longer[BEAM:])
+        lost += sum(float(core.exp(one.weight - best)) for one in longer[BEAM:])
         beam = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
     pairs = []
     for pair in _accept_agreed(part, beam, profile, lost):
@@ -262,7 +263,7 @@ def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) ->
     """Find a landmark's likely fragments, itself included, which are no rivals."""
     n = len(joint.mean)
     at = evaluate_pairs(joint, np.full(n, landmark), np.arange(n), profile)
-    near = elementwise.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
+    near = core.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
     least = required_llr(joint, np.full(n, landmark), np.arange(n), np.zeros(n), profile)
     one = (at.llr >= least) & near & ~joint.apart[landmark]
     return {landmark, *np.flatnonzero(one).tolist()}
@@ -277,16 +278,14 @@ def _accept_agreed(
     best one's.
     """
     best = beam[0]
-    weights = elementwise.exp(np.array([one.weight - best.weight for one in beam]))
+    weights = core.exp(np.array([one.weight - best.weight for one in beam]))
     others = [{pair.first: pair.second for pair in one.pairs} for one in beam]
     sure = []
     for pair in best.pairs:
         same = _find_fragments(best.joint, pair.second, profile)
         having = np.array([each.get(pair.first, -1) in same for each in others])
         against = float(weights[~having].sum()) + lost
-        odds = (
-            float(elementwise.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
-        )
+        odds = float(core.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
         if odds >= profile.odds:
             sure.append(pair._replace(rival=pair.llr - odds))
     alone = sure if len(sure) == len(best.pairs) else _evaluate_alone(part, sure, profile)

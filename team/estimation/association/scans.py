@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation import dense, elementary, elementwise
+from team import core
+from team.estimation import dense
 
 UNASSIGNED = -1
 """No identity, or no landmark."""
@@ -43,7 +44,7 @@ def points_of(
     """Convert ranges and bearings with covariances (rr, rb, bb) to points with theirs, to first
     order.
     """
-    s, c = elementwise.sin_and_cos(bearings)
+    s, c = core.sin_and_cos(bearings)
     J = np.stack((np.stack((c, -ranges * s), -1), np.stack((s, ranges * c), -1)), -2)
     R = variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     return np.column_stack((ranges * c, ranges * s)), dense.product(
@@ -53,13 +54,13 @@ def points_of(
 
 def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
     """The rotation matrix of an angle."""
-    s, c = elementary.sin_and_cos(angle)
+    s, c = core.sin_and_cos(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
     """The rotation matrix of each angle."""
-    s, c = elementwise.sin_and_cos(angles)
+    s, c = core.sin_and_cos(angles)
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
 

@@ -13,7 +13,7 @@ from team.estimation.association.scans import (
     relative_to,
     rotations,
 )
-from team.estimation.geometry import wrapped
+from team.estimation.se2 import wrapped
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team import core
 from team.config import AssociationSettings
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.association.gating import compute_mahalanobis, match_best_first, match_scan
 from team.estimation.association.scans import (
     UNASSIGNED,
@@ -23,7 +24,7 @@ from team.estimation.association.scans import (
     rotation,
 )
 from team.estimation.consistency import chi2_limit
-from team.estimation.geometry import adjoint, compose, inverse
+from team.estimation.se2 import adjoint, compose, inverse
 
 FEW = 0.5
 """Share of matched detections in a scan below which a slip is suspected."""
@@ -189,9 +190,9 @@ class Tracker:
         Hp = pose_jacobians(seen)
         loose = np.diag(
             [
-                elementary.squared(0.5 * reach),
-                elementary.squared(0.5 * reach),
-                elementary.squared(SLIP_TURN),
+                core.squared(0.5 * reach),
+                core.squared(0.5 * reach),
+                core.squared(SLIP_TURN),
             ]
         )
         tight = self._P[:3, :3]
@@ -201,7 +202,7 @@ class Tracker:
         ) * np.eye(2)
         HpD = dense.product(Hp, loose + tight)
         offsets = points[:, None] - seen[None]
-        near = elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach
+        near = core.hypot(offsets[..., 0], offsets[..., 1]) < reach
         possible = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
         least = MOST * max(possible, SLIP_DETECTIONS)
         known = np.nonzero(found != UNASSIGNED)[0]
@@ -221,7 +222,7 @@ class Tracker:
             squared, determinants = compute_mahalanobis(
                 offsets_after, S[None] + covariances[:, None]
             )
-            costs = squared + elementwise.log(determinants)
+            costs = squared + core.log(determinants)
             pairs = match_best_first(squared < gate, costs)
             rows = np.nonzero(pairs != UNASSIGNED)[0]
             figure = float(len(rows)), -float(squared[rows, pairs[rows]].sum())
@@ -242,11 +243,9 @@ def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Covariance of a motion with a slip of about this (forward, left, turn): the slip is its
     standard deviation, at least LEAST_SLIP.
     """
-    metres = max(float(elementwise.hypot(*slip[:2])), LEAST_SLIP)
+    metres = max(float(core.hypot(*slip[:2])), LEAST_SLIP)
     turn = max(abs(float(slip[2])), LEAST_SLIP)
-    return np.diag(
-        [elementary.squared(metres), elementary.squared(metres), elementary.squared(turn)]
-    )
+    return np.diag([core.squared(metres), core.squared(metres), core.squared(turn)])
 
 
 def track_window(scans: Scans, settings: AssociationSettings) -> TrackedWindow:
@@ -307,7 +306,7 @@ def _is_match_missed(
     free = np.ones(len(seen), np.bool_)
     free[found[found != UNASSIGNED]] = False
     offsets = points[found == UNASSIGNED][:, None] - seen[free][None]
-    return bool((elementwise.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
+    return bool((core.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
 
 
 def _smaller_eigenvalue(S: Float[np.ndarray, "l 2 2"]) -> Float[np.ndarray, " l"]:

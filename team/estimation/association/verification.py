@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from team import core
 from team.association import AssociationProfile
-from team.estimation import elementwise
 from team.estimation.association.gating import Indices, Pair, evaluate_pairs
 from team.estimation.association.island_view import IslandView
 
@@ -126,7 +126,7 @@ def overlap_share(
 
 def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
     """Twice the median distance [m] between neighbouring places, and at least twice `same`."""
-    away = elementwise.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
+    away = core.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     np.fill_diagonal(away, np.inf)
     return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
 
@@ -135,7 +135,7 @@ def nearest_distance(
     points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, " n"]:
     """Distance [m] from each point to the nearest one of `others`."""
-    away: Float[np.ndarray, " n"] = elementwise.hypot(
+    away: Float[np.ndarray, " n"] = core.hypot(
         *(points[:, None] - others[None]).transpose(2, 0, 1)
     ).min(axis=1)
     return away

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation import elementary, elementwise
+from team import core
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""
@@ -59,7 +59,7 @@ def mark_visible(
     if not len(point):
         return inside
     x, y = (at[view] - points[point, None]).transpose(2, 0, 1)
-    angle = np.sort(elementwise.atan2(y, x), axis=1)  # NaN, the padding, is last
+    angle = np.sort(core.atan2(y, x), axis=1)  # NaN, the padding, is last
     last = np.fmax.reduce(angle, axis=1)
     widest = np.fmax.reduce(angle[:, 1:] - angle[:, :-1], axis=1)
     gap = np.fmax(widest, angle[:, 0] + 2.0 * np.pi - last)
@@ -76,10 +76,10 @@ def miss_probabilities(
     place.
     """
     x, y = points.T
-    near = elementwise.hypot(x[:, None] - x, y[:, None] - y) < radius
+    near = core.hypot(x[:, None] - x, y[:, None] - y) < radius
     seen = np.zeros((len(seen_by), len(points)), np.float32)
     for row, places in zip(seen, seen_by, strict=True):
         row[places] = 1.0
     counts = (seen @ near.astype(np.float32) > 0.0).sum(axis=0)  # exact: sums of ones
-    chance = elementwise.exp(elementary.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
+    chance = core.exp(core.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
     return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation import dense, elementary, elementwise
+from team import core
+from team.estimation import dense
 
 MOST_BINS = 60
 """Number of refined motions, those with the most votes."""
@@ -73,7 +74,7 @@ def propose_alignments(
         ]
         if found:
             moving = np.array([vote.motion for vote in found])
-            s, c = elementwise.sin_and_cos(moving[:, 2])
+            s, c = core.sin_and_cos(moving[:, 2])
             x, y = centre - middle
             moving[:, :2] += np.column_stack([c * x - s * y, s * x + c * y])
             motions.append(moving)
@@ -113,12 +114,12 @@ def _propose_motions(
     of_b = of_b + np.arange(len(of_a))
     one, two = a[i[of_a]], a[j[of_a]]
     span = two - one
-    heading = elementwise.atan2(span[:, 1], span[:, 0])
+    heading = core.atan2(span[:, 1], span[:, 0])
     motions = []
     for p, q in ((k[of_b], last[of_b]), (last[of_b], k[of_b])):
         across = b[q] - b[p]
-        turn = elementwise.atan2(across[:, 1], across[:, 0]) - heading
-        s, c = elementwise.sin_and_cos(turn)
+        turn = core.atan2(across[:, 1], across[:, 0]) - heading
+        s, c = core.sin_and_cos(turn)
         middle = 0.5 * (one + two)
         rotated = np.column_stack(
             [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
@@ -131,7 +132,7 @@ def _list_baselines(
     points: Float[np.ndarray, "n 2"], shortest: float, longest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     i, j = np.triu_indices(len(points), 1)
-    length = elementwise.hypot(*(points[i] - points[j]).T)
+    length = core.hypot(*(points[i] - points[j]).T)
     chosen = (length >= shortest) & (length <= longest)
     return i[chosen], j[chosen], length[chosen]
 
@@ -155,9 +156,9 @@ def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np
         weight = np.bincount(at, minlength=len(fullest))
         x = np.bincount(at, some[:, 0], len(fullest)) / weight
         y = np.bincount(at, some[:, 1], len(fullest)) / weight
-        cosine = np.bincount(at, elementwise.cos(some[:, 2]), len(fullest))
-        sine = np.bincount(at, elementwise.sin(some[:, 2]), len(fullest))
-        peaks += list(np.column_stack([x, y, elementwise.atan2(sine, cosine)]))
+        cosine = np.bincount(at, core.cos(some[:, 2]), len(fullest))
+        sine = np.bincount(at, core.sin(some[:, 2]), len(fullest))
+        peaks += list(np.column_stack([x, y, core.atan2(sine, cosine)]))
     return peaks
 
 
@@ -198,9 +199,7 @@ def _refine(
             batch, to, agree = batch[lasting], to[lasting], agree[lasting]
             if step < REFINEMENTS - 1 and len(batch):
                 weights = agree / (
-                    elementary.squared(a.sd)
-                    + elementary.squared(b.sd[to])
-                    + elementary.squared(tolerance)
+                    core.squared(a.sd) + core.squared(b.sd[to]) + core.squared(tolerance)
                 )
                 batch = _fit_motions(local, b.mean[to], weights)
         votes += [
@@ -217,14 +216,14 @@ def _find_neighbours(
     reach: float,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
     """Find the nearest point of b for each point; mark those mutually nearest and within reach."""
-    s, c = elementwise.sin_and_cos(motions[:, 2:])
+    s, c = core.sin_and_cos(motions[:, 2:])
     x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
     y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
-    away = elementary.squared(x[:, :, None] - b[:, 0]) + elementary.squared(y[:, :, None] - b[:, 1])
+    away = core.squared(x[:, :, None] - b[:, 0]) + core.squared(y[:, :, None] - b[:, 1])
     to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
     nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
     mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
-    return to_b, mutual & (nearest < elementary.squared(reach))
+    return to_b, mutual & (nearest < core.squared(reach))
 
 
 def _fit_motions(
@@ -238,8 +237,8 @@ def _fit_motions(
     p, q = a - from_[:, None], to - onto[:, None]
     along = (share[:, :, None] * p * q).sum(axis=(1, 2))
     across = (share * (p[:, :, 0] * q[:, :, 1] - p[:, :, 1] * q[:, :, 0])).sum(axis=1)
-    angle = elementwise.atan2(across, along)
-    s, c = elementwise.sin_and_cos(angle)
+    angle = core.atan2(across, along)
+    s, c = core.sin_and_cos(angle)
     x = onto[:, 0] - c * from_[:, 0] + s * from_[:, 1]
     y = onto[:, 1] - s * from_[:, 0] - c * from_[:, 1]
     return np.column_stack([x, y, angle])
@@ -249,7 +248,7 @@ def apply_motion(
     motion: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 2"]:
     """Map points, given about the centroid, into the other side's frame."""
-    s, c = elementwise.sin_and_cos(motion[2])
+    s, c = core.sin_and_cos(motion[2])
     placed: Float[np.ndarray, "n 2"] = (
         dense.product(points, np.array([[c, s], [-s, c]])) + motion[:2]
     )

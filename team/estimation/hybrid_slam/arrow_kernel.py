@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team.estimation.compiled import compiled
-from team.estimation.dense_kernel import BLOCK
-from team.estimation.gaussian import EPSILON, NOT_POSITIVE, fault_of
+from team.estimation.dense_kernel import BLOCK, EPSILON, NOT_POSITIVE, fault_of
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

@@ -14,12 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
+from team import core
 from team.config import Sensor
-from team.estimation import dense, elementary
-from team.estimation.geometry import compose
+from team.estimation import dense
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.models import Increment, located, variances
 from team.estimation.scans import Own
+from team.estimation.se2 import compose
 
 EVIDENCE = 4.605170185988092
 """Log odds that a landmark's accepted measurements must reach; by chance they do so in one case
@@ -55,8 +56,8 @@ class _Measurements:
         self.means, self.covariances = _between(motions, seen.tolist())
         reach = min(sensor.max_range, float(measurements[:, 0].max()))
         uniform = 1.0 / (reach * sensor.field_of_view)
-        self.prior = elementary.log((1.0 - outlier_share) / outlier_share)
-        self.odds = self.prior - elementary.log(uniform)
+        self.prior = core.log((1.0 - outlier_share) / outlier_share)
+        self.odds = self.prior - core.log(uniform)
         """Added to log p(z): gives the log odds that the measurement is good."""
 
 
@@ -173,7 +174,7 @@ def _smoothed(
     """
     unknown = np.bincount(window.slots[taken], minlength=window.landmarks) == 0
     free = 3 * (len(path) - 1) + np.flatnonzero(np.repeat(unknown, 2))
-    far = elementary.squared(float(window.measurements[:, 0].max()))
+    far = core.squared(float(window.measurements[:, 0].max()))
     for _ in range(2):
         H, g = kernel.normal_equations(
             path, landmarks, window.means, metrics, window.keyframes, window.slots,
@@ -222,7 +223,7 @@ def _misread(
     total = np.bincount(window.slots[taken], logs[taken], minlength=window.landmarks)
     names = np.arange(window.landmarks)
     doubtful = np.zeros(window.landmarks, dtype=np.bool_)
-    own_name = window.prior + elementary.log(max(window.landmarks - 1, 1))
+    own_name = window.prior + core.log(max(window.landmarks - 1, 1))
     for other in np.flatnonzero(count >= 2):
         as_other = kernel.left_out(
             path, landmarks, covariance, window.keyframes, np.full_like(window.slots, other),

@@ -16,7 +16,6 @@ from jaxtyping import Float, Int64, UInt32
 from team import core
 from team.config import Sensor
 from team.core import effective_sample_size, normalise, systematic_parents
-from team.estimation import elementary
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.models import Increment
 from team.estimation.scans import Own, unclaimed
@@ -62,10 +61,10 @@ class Noise(NamedTuple):
 def noise_of(sensor: Sensor) -> Noise:
     """The variances of a sensor and their white shares, as the kernels take them."""
     return Noise(
-        elementary.squared(sensor.range_sigma),
-        elementary.squared(sensor.range_sigma_per_m),
+        core.squared(sensor.range_sigma),
+        core.squared(sensor.range_sigma_per_m),
         sensor.range_white,
-        elementary.squared(sensor.bearing_sigma),
+        core.squared(sensor.bearing_sigma),
         sensor.bearing_white,
     )
 
@@ -122,7 +121,7 @@ def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
     count = len(poses)
     return Particles(
         poses=poses,
-        log_weights=np.full(count, -elementary.log(count)),
+        log_weights=np.full(count, -core.log(count)),
         ids=np.empty(0, np.uint32),
         means=np.empty((count, 0, 2)),
         covariances=np.empty((count, 0, 3)),
@@ -136,7 +135,7 @@ def resampled(
     parents = systematic_parents(particles.log_weights, generator.random())
     copies = Particles(
         poses=particles.poses[parents],
-        log_weights=np.full(len(parents), -elementary.log(float(len(parents)))),
+        log_weights=np.full(len(parents), -core.log(float(len(parents)))),
         ids=particles.ids,
         means=particles.means[parents],
         covariances=particles.covariances[parents],

@@ -14,7 +14,6 @@ from team import core
 from team.config import Sensor
 from team.estimation import dense
 from team.estimation.gaussian import cholesky_factor, whitened
-from team.estimation.geometry import compose, tangent, wrapped
 from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
 from team.estimation.models import (
     Increment,
@@ -24,6 +23,7 @@ from team.estimation.models import (
     predicted,
 )
 from team.estimation.scans import Own, unclaimed
+from team.estimation.se2 import compose, tangent, wrapped
 
 Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
 """Ids, ranges [m], bearings [rad] and claimed noises of measurements."""

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, UInt32
 from msgspec.structs import force_setattr, replace
 
 from team.config import MotionModel, Sensor
-from team.estimation import dense, geometry
-from team.estimation.geometry import Pose, adjoint, inverse
+from team.estimation import dense, se2
 from team.estimation.hybrid_slam.odometry_run import OdometryRun
 from team.estimation.hybrid_slam.pose_grid import PoseGrid
 from team.estimation.hybrid_slam.reduction import KeyframeScan, all_between, reduced
@@ -18,6 +17,7 @@ from team.estimation.models import Increment, scanned
 from team.estimation.mount import of_sensor
 from team.estimation.odometry import STANDING, OdometryInterval
 from team.estimation.scans import Own, calibrated, unclaimed
+from team.estimation.se2 import Pose, adjoint, inverse
 from team.rejection import Rejection
 
 NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
@@ -265,7 +265,7 @@ class Segmenter:
                 column = dense.product(self._unmount, column)
             self._forward = carried_on(self._forward, step.mean) + column
         if self._keyframe_ns:
-            self._scan_motion = geometry.compose(self._scan_motion, step.mean)
+            self._scan_motion = se2.compose(self._scan_motion, step.mean)
         if self._since_look is not None:
             self._since_look = self._since_look.then(step)
 

@@ -19,15 +19,15 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from team import core
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.association.scans import Scans, points_of
 from team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
-from team.estimation.geometry import adjoint, between, inverse
 from team.estimation.hybrid_slam.fastslam import effective_sample_size, noise_of, normalise
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.hybrid_slam.reduction import variances
 from team.estimation.hybrid_slam.window import Window
 from team.estimation.scans import POINT
+from team.estimation.se2 import adjoint, between, inverse
 
 Paths = Float[np.ndarray, "K M 3"]
 FEW = 10.0
@@ -45,7 +45,7 @@ def redrawn(
     one pose at the first keyframe. Draws 3 K M normal numbers, where it draws.
     keyframes: of which the window has taken all measurements.
     """
-    weights = elementwise.exp(window.particles.log_weights)
+    weights = core.exp(window.particles.log_weights)
     if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
         return window
     slots = _slots(window)
@@ -120,7 +120,7 @@ def _drawn(
     error[..., :2] = _seen(motions, went - motions[..., :2])
     error[..., 2] = _wrapped(paths[..., 2] - before[..., 2] - motions[..., 2])
     squared = _squared(error, scans.motion_covariances + JITTER)
-    of_draw = _row_sums(elementary.squared(normals))
+    of_draw = _row_sums(core.squared(normals))
     return paths, 0.5 * (of_draw - squared)
 
 
@@ -151,7 +151,7 @@ def _placed(
     poses: Float[np.ndarray, "*n 3"], points: Float[np.ndarray, "*n 2"]
 ) -> Float[np.ndarray, "*n 2"]:
     """Each point of a pose's frame."""
-    s, c = elementwise.sin_and_cos(poses[..., 2])
+    s, c = core.sin_and_cos(poses[..., 2])
     x, y = points[..., 0], points[..., 1]
     return np.stack((poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y), axis=-1)
 
@@ -202,16 +202,16 @@ def _likelihood(
     rr, rb, bb = variances(ranges, own, window.sensor).T
     noise = np.stack((np.stack((rr, rb), -1), np.stack((rb, bb), -1)), -2)
     error = np.empty_like(seen)
-    error[..., 0] = elementwise.hypot(seen[..., 0], seen[..., 1]) - window.measurements[:, None, 0]
+    error[..., 0] = core.hypot(seen[..., 0], seen[..., 1]) - window.measurements[:, None, 0]
     error[..., 1] = _wrapped(
-        elementwise.atan2(seen[..., 1], seen[..., 0]) - window.measurements[:, None, 1]
+        core.atan2(seen[..., 1], seen[..., 0]) - window.measurements[:, None, 1]
     )
     if own.size:
         plane = own[:, 3] == POINT
         error[plane] = (seen - scans.points[:, None])[plane]
         noise[plane] = scans.covariances[plane]
     xx, xy, yy = covariances.transpose(2, 0, 1)
-    spread = _row_sums(elementwise.log(np.maximum(xx * yy - xy * xy, 1e-300)))
+    spread = _row_sums(core.log(np.maximum(xx * yy - xy * xy, 1e-300)))
     found: Float[np.ndarray, " M"] = 0.5 * (spread - _squared(error, noise))
     return found
 
@@ -220,7 +220,7 @@ def _seen(
     poses: Float[np.ndarray, "K M 3"], apart: Float[np.ndarray, "K M 2"]
 ) -> Float[np.ndarray, "K M 2"]:
     """Rᵀ d of each difference d from a pose."""
-    s, c = elementwise.sin_and_cos(poses[..., 2])
+    s, c = core.sin_and_cos(poses[..., 2])
     x, y = apart[..., 0], apart[..., 1]
     return np.stack((c * x + s * y, c * y - s * x), axis=-1)
 

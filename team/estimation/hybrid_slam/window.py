@@ -17,7 +17,6 @@ from team import core
 from team.config import Bias, FrontEnd, Sensor
 from team.estimation import dense
 from team.estimation.gaussian import FAULTS, NotACovarianceError
-from team.estimation.geometry import inverse, tangent
 from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
 from team.estimation.hybrid_slam.sensitivity import (
@@ -30,6 +29,7 @@ from team.estimation.hybrid_slam.sensitivity import (
 from team.estimation.models import Increment
 from team.estimation.mount import base_points, base_poses, base_shifts
 from team.estimation.scans import Own, unclaimed
+from team.estimation.se2 import inverse, tangent
 from team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)

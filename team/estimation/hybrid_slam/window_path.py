@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from team import core
 from team.core import POSE_JITTER, on_group, sample_factor
-from team.estimation import dense, elementwise
-from team.estimation.geometry import Pose, wrapped
+from team.estimation import dense
 from team.estimation.hybrid_slam.window import Window
+from team.estimation.se2 import Pose, wrapped
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
     With the particles' covariances P over (x_k, end), about the submap's means (`on_group`), gain =
     P_ke P_ee⁻¹ and what is left is P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
     """
-    weights = elementwise.exp(window.particles.log_weights)
+    weights = core.exp(window.particles.log_weights)
     poses = np.concatenate((window.paths, window.particles.poses[None]))
     means, off = (
         np.array(each) for each in zip(*(on_group(at, weights) for at in poses), strict=True)
@@ -76,14 +77,14 @@ def placed(
     left; that is taken times covariance_factor, as the map takes the submap's covariance.
     """
     heading = ends.start[2]
-    s, c = elementwise.sin_and_cos(heading)
+    s, c = core.sin_and_cos(heading)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     local_end = dense.product(turn.T, ends.end - ends.start)
     off = local_end - path.end_mean
     off[2] = wrapped(off[2])
     local = path.means + dense.product(path.gains, off)
     poses = ends.start + dense.product(local, turn.T)
-    poses[:, 2] = elementwise.atan2(elementwise.sin(poses[:, 2]), elementwise.cos(poses[:, 2]))
+    poses[:, 2] = core.atan2(core.sin(poses[:, 2]), core.cos(poses[:, 2]))
     J_end_start = np.column_stack((-turn.T[:, :2], [local_end[1], -local_end[0], -1.0]))
     covariances = np.empty((len(local), 3, 3))
     for k, (gain, left) in enumerate(zip(path.gains, path.covariances, strict=True)):

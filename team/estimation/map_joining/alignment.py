@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation import dense, elementary, elementwise
+from team import core
+from team.estimation import dense
 from team.estimation.consistency import chi2_limit
 from team.estimation.gaussian import deviation, information
-from team.estimation.geometry import wrapped
+from team.estimation.se2 import wrapped
 
 ITERATIONS = 10
 NEEDED = 2
@@ -48,8 +49,8 @@ def procrustes(
     share = weights / weights.sum()
     mean_a, mean_b = dense.product(share, in_a), dense.product(share, in_b)
     spread = dense.product(((in_b - mean_b) * share[:, None]).T, in_a - mean_a)
-    turn = elementary.atan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
-    s, c = elementary.sin_and_cos(turn)
+    turn = core.atan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
+    s, c = core.sin_and_cos(turn)
     x, y = c * mean_b[0] - s * mean_b[1], s * mean_b[0] + c * mean_b[1]
     return np.array([mean_a[0] - x, mean_a[1] - y, turn])
 
@@ -90,7 +91,7 @@ def aligned(
     chi2 = float(dense.product(dense.product(residual, metric), residual))
     difference = information(metric, "the metric of an alignment")
     sigma = _shape_heading_sigma(near_b, jacobian, difference)
-    s, c = elementwise.sin_and_cos(about[2])
+    s, c = core.sin_and_cos(about[2])
     x, y = c * of_b[0] - s * of_b[1], s * of_b[0] + c * of_b[1]
     a_from_b = np.array([of_a[0] + about[0] - x, of_a[1] + about[1] - y, about[2]])
     lever = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
@@ -133,7 +134,7 @@ def _shape_heading_sigma(
     variance = np.trace(dense.product(dense.product(shape, covariance), shape)) / (
         len(jacobian) - 3
     )
-    extent = float((elementary.squared(in_b - in_b.mean(axis=0))).sum())
+    extent = float((core.squared(in_b - in_b.mean(axis=0))).sum())
     return deviation(variance / extent)
 
 
@@ -146,7 +147,7 @@ def _linearised(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
     """Return the differences d, (P_a + R P_b Rᵀ)⁻¹ and the Jacobian ∂(R b + t)/∂(t, θ)."""
     n = len(in_a)
-    s, c = elementwise.sin_and_cos(a_from_b[2])
+    s, c = core.sin_and_cos(a_from_b[2])
     rotation = np.array([[c, -s], [s, c]])
     turned = dense.product(in_b, rotation.T)
     all_turned = np.kron(np.eye(n), rotation)

@@ -24,7 +24,6 @@ from team.estimation.association.landmark_sets import (
 from team.estimation.association.member_log import LocalLandmark, MergeRecord
 from team.estimation.association.verification import Closure
 from team.estimation.contribution import Contribution, Stream
-from team.estimation.geometry import inverse
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -37,6 +36,7 @@ from team.estimation.map_joining.joining import Fold, merged_islands
 from team.estimation.map_joining.merging import Merge, placed
 from team.estimation.map_joining.minima import minimum
 from team.estimation.map_joining.submap_graph import tied
+from team.estimation.se2 import inverse
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:

@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
-from team.estimation import dense, elementary, elementwise
+from team.estimation import dense
 from team.estimation.dense_kernel import add_product
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining import inter_robot_kernel as sightings
@@ -146,7 +147,7 @@ class Island:
         chi2 = kernel.landmark_chi2(
             self.state, self.graph.offset, factors, settings.covariance_factor
         )
-        gate = settings.landmark_gate * elementary.squared(self.scale / settings.robust_c)
+        gate = settings.landmark_gate * core.squared(self.scale / settings.robust_c)
         return chi2, np.repeat(gate, np.diff(factors.block_start))
 
     @cached_property
@@ -199,14 +200,14 @@ class Island:
         """
         if self.factors is self._submaps:
             return self.chi2
-        factors = self._discounted(elementary.squared(self.landmark_weight))
+        factors = self._discounted(core.squared(self.landmark_weight))
         factor = self.settings.covariance_factor
         return kernel.costs(self.state, self.graph.offset, factors, factor)
 
     @property
     def weight(self) -> Float[np.ndarray, " F"]:
         """Robust weight of each submap, 1 without a robust loss."""
-        relative: Values = self.chi2 / (self.graph.dimensions * elementary.squared(self.scale))
+        relative: Values = self.chi2 / (self.graph.dimensions * core.squared(self.scale))
         return 1.0 / (1.0 + relative)
 
     @cached_property
@@ -217,7 +218,7 @@ class Island:
     @property
     def sighting_weight(self) -> Float[np.ndarray, " S"]:
         """Robust weight of each inter-robot measurement, 1 without a robust loss."""
-        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * elementary.squared(self.sighting_scale)))
+        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * core.squared(self.sighting_scale)))
 
     @cached_property
     def prior_chi2(self) -> Float[np.ndarray, " priors"]:
@@ -244,7 +245,7 @@ class Island:
         if self.settings.robust_c is None:
             return np.ones(len(self.graph.priors))
         of_bias = self.graph.of_bias
-        weight: Values = 1.0 / (1.0 + self.prior_chi2 / elementary.squared(self.settings.robust_c))
+        weight: Values = 1.0 / (1.0 + self.prior_chi2 / core.squared(self.settings.robust_c))
         return np.where(of_bias, weight, 1.0)
 
     def cost_of(self, other: "Island") -> float:
@@ -288,22 +289,20 @@ class Island:
         if self.settings.robust_c is None:
             chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
             return chi2 + float(self.sighting_chi2[sightings].sum())
-        scale = (elementary.squared(self.scale) * self.graph.dimensions)[submaps]
-        cost = float((scale * elementwise.log1p(self.chi2[submaps] / scale)).sum())
+        scale = (core.squared(self.scale) * self.graph.dimensions)[submaps]
+        cost = float((scale * core.log1p(self.chi2[submaps] / scale)).sum())
         cost += self._prior_cost(priors)
         own, gate = self._landmark_chi2_and_gate
         of = np.repeat(submaps, np.diff(self.graph.factors.block_start))
         beyond = (own > gate) & of
-        cost += float((gate[beyond] * elementwise.log(own[beyond] / gate[beyond])).sum())
-        scale = 2.0 * elementary.squared(self.sighting_scale[sightings])
-        return cost + float(
-            (scale * elementwise.log1p(self.sighting_chi2[sightings] / scale)).sum()
-        )
+        cost += float((gate[beyond] * core.log(own[beyond] / gate[beyond])).sum())
+        scale = 2.0 * core.squared(self.sighting_scale[sightings])
+        return cost + float((scale * core.log1p(self.sighting_chi2[sightings] / scale)).sum())
 
     def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
-        c2 = 1.0 if self.settings.robust_c is None else elementary.squared(self.settings.robust_c)
+        c2 = 1.0 if self.settings.robust_c is None else core.squared(self.settings.robust_c)
         of_bias = (self.prior_weight < 1.0) & chosen
-        robust = float((c2 * elementwise.log1p(self.prior_chi2[of_bias] / c2)).sum())
+        robust = float((c2 * core.log1p(self.prior_chi2[of_bias] / c2)).sum())
         return robust + float(self.prior_chi2[chosen & ~of_bias].sum())
 
     @cached_property

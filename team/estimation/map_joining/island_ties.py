@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation import dense, elementary
+from team import core
+from team.estimation import dense
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
@@ -88,8 +89,8 @@ def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -
             points[k] = located(value[:3], distance, bearing)
             x, y = points[k] - value[:2]
             J[rows, begin + 2] = -y, x
-            direction = elementary.atan2(y, x)
-            s, c = elementary.sin_and_cos(direction)
+            direction = core.atan2(y, x)
+            s, c = core.sin_and_cos(direction)
             polar = np.array([[c, -distance * s], [s, distance * c]])
             noise[rows, rows] = dense.product(dense.product(polar, seen.covariance), polar.T)
         begin += int(island.graph.offset[node + 1] - island.graph.offset[node])

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from team import core
 from team.config import UNNAMED
-from team.estimation import elementary
 from team.estimation.map_joining.gauss_newton import Island
 from team.estimation.map_joining.submap_graph import RANGE_POWER, CommonError, Joined, Prior
 
@@ -29,7 +29,7 @@ def add_markers(island: Island) -> Island:
     first = len(graph.fixed)
     errors = dict.fromkeys(error for each in marked for error in each)
     nodes: dict[CommonError, int] = {error: first + k for k, error in enumerate(errors)}
-    certainty = np.array([[1.0 / elementary.squared(sigma)]])
+    certainty = np.array([[1.0 / core.squared(sigma)]])
     count = len(nodes)
     graph = replace(
         graph,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation import elementwise
+from team import core
 from team.estimation.gaussian import deviation
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining import alignment
@@ -135,7 +135,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
     """Word the reason to defer a merge with two likely places."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
-        f"{shared} leave two places {elementwise.hypot(away[0], away[1]):.1f} m apart: "
+        f"{shared} leave two places {core.hypot(away[0], away[1]):.1f} m apart: "
         f"chi² of one is only {second.cost - search.best.cost:.1f} more"
     )
 

@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation import elementary, elementwise
+from team import core
 from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Stream, named
-from team.estimation.geometry import wrapped
 from team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -33,6 +32,7 @@ from team.estimation.map_joining.nonlinearity import (
     profile,
 )
 from team.estimation.map_joining.relaxation import relaxed
+from team.estimation.se2 import wrapped
 from team.estimation.sparse_cholesky import sparse_kernel
 
 Values = Float[np.ndarray, " _"]
@@ -172,7 +172,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
             a, b = (complex(*island.state[at_l : at_l + 2]) for at_l in pair)
             if a == b:
                 continue
-            along = (b - a) / elementary.hypot(b.real - a.real, b.imag - a.imag)
+            along = (b - a) / core.hypot(b.real - a.real, b.imag - a.imag)
             turned = along * along
             p = island.state[at] + 1j * island.state[at + 1]
             p = a + turned * np.conj(p - a)
@@ -291,7 +291,7 @@ def warnings(search: Search) -> list[str]:
     if search.second is not None and search.ambiguous:
         away = _difference(search.second.island, island)
         points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
-        farthest = float(elementwise.hypot(away[points], away[points + 1]).max())
+        farthest = float(core.hypot(away[points], away[points + 1]).max())
         found.append(
             f"another map fits about as well: chi² {search.second.cost - search.best.cost:.1f} "
             f"more, up to {farthest:.1f} m away"

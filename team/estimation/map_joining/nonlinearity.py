@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from team.estimation import dense, elementwise
+from team import core
+from team.estimation import dense
 from team.estimation.contribution import Stream, named
 from team.estimation.gaussian import deviation, information
-from team.estimation.geometry import compose, inverse, logarithm
 from team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     Island,
@@ -22,6 +22,7 @@ from team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     solved_with_fixed,
 )
+from team.estimation.se2 import compose, inverse, logarithm
 
 STEPS = (1.0, 2.0, 3.0)
 """Displacements of a heading, in its standard deviations."""
@@ -102,7 +103,7 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
-    s, c = elementwise.sin_and_cos(mean[2])
+    s, c = core.sin_and_cos(mean[2])
     A = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     metric = information(dense.product(dense.product(A, covariance), A.T), "a pose")
     at = int(island.graph.offset[node])
@@ -110,7 +111,7 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
     for walked, rise in profile(island, node):
         pose = walked.state[at : at + 3]
         eta = logarithm(compose(inverse(mean), pose))
-        distance = float(elementwise.hypot(*(pose - mean)[:2]))
+        distance = float(core.hypot(*(pose - mean)[:2]))
         found.append(
             UnderstatedUncertainty(
                 distance, rise, float(dense.product(dense.product(eta, metric), eta))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation import elementary, elementwise
+from team import core
 from team.estimation.map_joining.submap_graph import Graph
 from team.estimation.sparse_cholesky.sparse import (
     NotPositiveDefiniteError,
@@ -60,13 +60,13 @@ def relaxed(graph: Graph, state: Values) -> Values | None:
     for node in np.flatnonzero(movable):
         value, size = found[at[node] : at[node + 1]], sizes[node]
         if size == 3:
-            value = np.array([value[0], value[1], elementary.atan2(value[3], value[2])])
+            value = np.array([value[0], value[1], core.atan2(value[3], value[2])])
         moved[graph.offset[node] : graph.offset[node + 1]] = value
     return moved
 
 
 def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
-    return np.array([pose[0], pose[1], elementary.cos(pose[2]), elementary.sin(pose[2])])
+    return np.array([pose[0], pose[1], core.cos(pose[2]), core.sin(pose[2])])
 
 
 def _least_squares(
@@ -117,9 +117,9 @@ def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
     for sighting, observer, teammate in graph.sightings:
         distance, bearing = sighting.measurement.tolist()
         spread = 0.5 * (
-            sighting.covariance[0, 0] + sighting.covariance[1, 1] * elementary.squared(distance)
+            sighting.covariance[0, 0] + sighting.covariance[1, 1] * core.squared(distance)
         )
-        point = distance * np.array([[elementary.cos(bearing), elementary.sin(bearing)]])
+        point = distance * np.array([[core.cos(bearing), core.sin(bearing)]])
         weight = np.array([1.0 / math.sqrt(spread)])
         yield _points(int(at[observer]), at[[teammate]], point, weight)
     for node, mean, information in graph.priors:
@@ -155,7 +155,7 @@ def _turns(
     weights: Float[np.ndarray, " n"],
 ) -> _Rows:
     n = len(poses)
-    s, c = elementwise.sin_and_cos(angles)
+    s, c = core.sin_and_cos(angles)
     numbers = np.empty((2 * n, 3), dtype=np.int64)
     numbers[0::2, 0], numbers[1::2, 0] = poses + 2, poses + 3
     numbers[:, 1:] = start + 2, start + 3

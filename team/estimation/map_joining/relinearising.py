@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from team.estimation.contribution import Contribution, Key, Stream
-from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import EliminatedPath
 from team.estimation.map_joining.condensing import LIMITS
@@ -27,6 +26,7 @@ from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.landmark_view import known, points_of
 from team.estimation.map_joining.merging import ages, sighted
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
+from team.estimation.se2 import compose, transformed
 
 Values = Float[np.ndarray, " _"]
 

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.config import UNNAMED
-from team.estimation import elementary, elementwise
 from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.gauss_newton import Island
@@ -149,16 +149,16 @@ def _align_beyond_chance(
 def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius: float) -> float:
     """Compute ln E of n points of which `matched` match others."""
     count = len(others)
-    area = max(float(np.ptp(others, axis=0).prod()), math.pi * elementary.squared(radius))
-    p = min(math.pi * elementary.squared(radius) * count / area, 1.0 - 1e-9)
+    area = max(float(np.ptp(others, axis=0).prod()), math.pi * core.squared(radius))
+    p = min(math.pi * core.squared(radius) * count / area, 1.0 - 1e-9)
     left, least = n - 2, matched - 2
     terms: Int64[np.ndarray, " k"] = np.arange(least, left + 1)
     logs = np.array([_log_choose(left, int(k)) for k in terms])
-    logs = logs + terms * elementary.log(p) + (left - terms) * elementary.log(1.0 - p)
+    logs = logs + terms * core.log(p) + (left - terms) * core.log(1.0 - p)
     most = float(logs.max())
-    tail = most + elementary.log(float(elementwise.exp(logs - most).sum()))
-    return tail + elementary.log(float(n * (n - 1)) * count * (count - 1))
+    tail = most + core.log(float(core.exp(logs - most).sum()))
+    return tail + core.log(float(n * (n - 1)) * count * (count - 1))
 
 
 def _log_choose(n: int, k: int) -> float:
-    return elementary.log(float(math.comb(n, k)))
+    return core.log(float(math.comb(n, k)))

@@ -15,16 +15,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.config import UNNAMED, Bias
-from team.estimation import elementary
 from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
-from team.estimation.geometry import compose, transformed
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
 from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
 from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
 from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from team.estimation.map_joining.priors_kernel import PriorFactors
+from team.estimation.se2 import compose, transformed
 from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
@@ -198,7 +198,7 @@ class Graph:
             np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
             np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
             np.array([each.sighting.information for each in self.sightings]).reshape(-1, 2, 2),
-            int((elementary.squared(np.diff(self.factors.member_start))).sum()),
+            int((core.squared(np.diff(self.factors.member_start))).sum()),
         )
 
     @cached_property
@@ -383,13 +383,13 @@ def extended(
         for bias in local.biases:
             if (stream, bias) not in growth.biases:
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[1.0 / elementary.squared(bias_sigma[bias])]])
+                certainty = np.array([[1.0 / core.squared(bias_sigma[bias])]])
                 priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
         common = _in_common(local, common_bias_sigma)
         for error, sigma in common.items():
             if error not in growth.common:
                 growth.common[error] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[1.0 / elementary.squared(sigma)]])
+                certainty = np.array([[1.0 / core.squared(sigma)]])
                 priors.append(Prior(growth.common[error], np.zeros(1), certainty))
         errors = [growth.biases[stream, bias] for bias in local.biases]
         errors += [growth.common[error] for error in common]

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64, UInt32
 
 from team.core import WholeMap
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
-from team.estimation.geometry import wrapped
+from team.estimation.se2 import wrapped
 from team.estimation.submap import LocalMap
 
 INDEFINITE, SINGULAR = 1, 2

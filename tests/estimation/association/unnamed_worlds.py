@@ -9,7 +9,7 @@ from team.config import UNNAMED
 from team.estimation.association.landmark_sets import Landmarks
 from team.estimation.association.member_log import LocalLandmark
 from team.estimation.contribution import Contribution
-from team.estimation.geometry import between, inverse, transformed
+from team.estimation.se2 import between, inverse, transformed
 from team.estimation.submap import LocalMap, Unnamed
 
 POSE_SD = (0.03, 0.03, 0.004)

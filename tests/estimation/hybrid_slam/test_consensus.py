@@ -15,12 +15,12 @@ from sim.scenarios.source import streams_of
 from sim.world.streams import WorldStreams
 from team.config import MotionModel, MotionNoise, Sensor
 from team.estimation import dense
-from team.estimation.geometry import compose
 from team.estimation.hybrid_slam import consensus
 from team.estimation.hybrid_slam import consensus_kernel as kernel
 from team.estimation.hybrid_slam.consensus import agreeing, confirmed
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.scans import point_scan, polar_scan, unclaimed
+from team.estimation.se2 import compose
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))

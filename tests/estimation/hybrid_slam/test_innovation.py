@@ -7,11 +7,11 @@ import pytest
 
 from team.config import Sensor
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.geometry import compose, exponential, transformed
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
 from team.estimation.models import Increment, predicted
+from team.estimation.se2 import compose, exponential, transformed
 from tests.estimation.hybrid_slam.test_window import ACCURATE, drive, driven, wrap
 
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.03)

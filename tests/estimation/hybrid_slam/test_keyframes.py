@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from team import core
 from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation import elementary, geometry
+from team.estimation import se2
 from team.estimation.hybrid_slam.keyframes import Segmenter
 from team.estimation.hybrid_slam.sensitivity_kernel import carried_on
 from team.estimation.models import Increment, increment_of, located
@@ -277,7 +278,7 @@ def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_t
             part = (end if until is None else max(until, here)) - here
             if part:
                 step = increment_of(WHITE, part * 1e-9, forward, yaw_rate)
-                pose, here = geometry.compose(pose, step.mean), here + part
+                pose, here = se2.compose(pose, step.mean), here + part
             if until is not None:
                 poses.append(pose)
     for k, stamp in enumerate(stamps):
@@ -287,6 +288,6 @@ def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_t
     (found,), _ = segmenter.cut(int(ends[-1]))
     assert found.ids.tolist() == list(range(6))
     for k, at in enumerate(poses):
-        x, y = located(geometry.between(pose, at), 4.0 + k, 0.2 * k)
-        assert found.ranges[k] == elementary.hypot(x, y)
-        assert found.bearings[k] == elementary.atan2(y, x)
+        x, y = located(se2.between(pose, at), 4.0 + k, 0.2 * k)
+        assert found.ranges[k] == core.hypot(x, y)
+        assert found.bearings[k] == core.atan2(y, x)

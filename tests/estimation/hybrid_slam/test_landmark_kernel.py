@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from team.estimation.geometry import compose, exponential, tangent, wrapped
 from team.estimation.hybrid_slam.consensus_kernel import _prediction
 from team.estimation.models import landmark_jacobian, predicted
+from team.estimation.se2 import compose, exponential, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.mount import base_points, base_poses, base_shifts, of_base, of_sensor
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import polar_scan
+from team.estimation.se2 import compose, inverse, transformed
 
 MOUNT = (3.78, 0.5, -0.6)
 SECOND = 1_000_000_000

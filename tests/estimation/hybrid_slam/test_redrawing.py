@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
-from team.estimation.geometry import between, compose, inverse, transformed
 from team.estimation.hybrid_slam import open_window
 from team.estimation.hybrid_slam.keyframes import Keyframe
 from team.estimation.hybrid_slam.open_window import OpenWindow
@@ -12,6 +11,7 @@ from team.estimation.hybrid_slam.reduction import KeyframeScan
 from team.estimation.hybrid_slam.window import gaussian
 from team.estimation.models import Increment
 from team.estimation.scans import unclaimed
+from team.estimation.se2 import between, compose, inverse, transformed
 from team.estimation.submap import LocalMap
 
 SECOND = 10**9

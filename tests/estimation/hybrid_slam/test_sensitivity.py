@@ -12,7 +12,7 @@ from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
 from team import translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import dense, geometry
+from team.estimation import dense, se2
 from team.estimation.consistency import nees
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import FAULTS
@@ -50,7 +50,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
     landmarks = np.array([[4, 3], [6, -3], [9, 2], [3, -4], [11, -2], [8, 6]], dtype=float)
     pose = np.zeros(3)
     for _ in range(8):
-        pose = geometry.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
+        pose = se2.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
         offset = landmarks - pose[:2]
         ranges = np.hypot(*offset.T)
         seen = np.flatnonzero(ranges < 8.0)
@@ -137,14 +137,14 @@ def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, 
 
     def driven_with(scale):
         first = increment_of(motion, 0.5, scale * speed, rate).mean
-        return geometry.compose(first, increment_of(motion, 0.5, scale * speed, more).mean)
+        return se2.compose(first, increment_of(motion, 0.5, scale * speed, more).mean)
 
     h = 1e-6
-    step = geometry.between(driven_with(1.0 - h), driven_with(1.0 + h))
+    step = se2.between(driven_with(1.0 - h), driven_with(1.0 + h))
     first = forward_column(motion, 0.5, speed, rate)
     second = increment_of(motion, 0.5, speed, more).mean
     column = carried_on(first, second) + forward_column(motion, 0.5, speed, more)
-    np.testing.assert_allclose(column, geometry.logarithm(step) / (2 * h), atol=2e-2 * speed)
+    np.testing.assert_allclose(column, se2.logarithm(step) / (2 * h), atol=2e-2 * speed)
 
 
 # --- the factor ---

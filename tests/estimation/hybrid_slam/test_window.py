@@ -15,10 +15,10 @@ from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.core import POSE_JITTER, moments, on_group, sample_factor
 from team.estimation.consistency import nees, state_error
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from team.estimation.geometry import compose, exponential
 from team.estimation.hybrid_slam import window as windows
 from team.estimation.models import Increment, increment_of
 from team.estimation.randomness import generator
+from team.estimation.se2 import compose, exponential
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(

@@ -7,7 +7,6 @@ import pytest
 
 from team.estimation.consistency import nees
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, curved
-from team.estimation.geometry import compose, exponential, tangent
 from team.estimation.map_joining import conditioning, whole_map
 from team.estimation.map_joining.conditioning import (
     TRUSTING,
@@ -19,6 +18,7 @@ from team.estimation.map_joining.conditioning import (
 from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
 from team.estimation.map_joining.marginals import prior_for, trajectory
 from team.estimation.map_joining.whole_map import without
+from team.estimation.se2 import compose, exponential, tangent
 from team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import solved, team, wrap

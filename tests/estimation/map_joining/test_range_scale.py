@@ -9,7 +9,6 @@ from team.association import AssociationProfile
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import packed, unpacked
-from team.estimation.geometry import compose, inverse, transformed
 from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import Limits, condense_submaps
@@ -17,6 +16,7 @@ from team.estimation.map_joining.gauss_newton import settled
 from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
 from team.estimation.map_joining.markers import add_markers
 from team.estimation.map_joining.submap_graph import tied
+from team.estimation.se2 import compose, inverse, transformed
 from team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from team.config import Sensor
 from team.estimation.consistency import nees
-from team.estimation.geometry import compose, exponential, inverse, transformed
 from team.estimation.inter_robot import CarriedPoint, carried_back, carried_on, point_seen, reduced
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import converged
 from team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
 from team.estimation.models import Increment
+from team.estimation.se2 import compose, exponential, inverse, transformed
 from team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import seen_from, wrap

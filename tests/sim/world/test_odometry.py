@@ -14,8 +14,8 @@ from sim.world.odometry import measured_speeds
 from sim.world.simulator import simulated
 from sim.world.streams import WorldStreams
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.geometry import compose, inverse, logarithm
 from team.estimation.models import increment_of
+from team.estimation.se2 import compose, inverse, logarithm
 from team.robot.node import RobotNode
 from team.wire import messages as m
 from tests import build

@@ -13,9 +13,9 @@ from sim.studies.estimators.ekf_slam import EkfSlam
 from team.config import Sensor
 from team.estimation.consistency import chi2_interval, nees, state_error
 from team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from team.estimation.geometry import compose, exponential
 from team.estimation.hybrid_slam import innovation as innovations
 from team.estimation.models import Increment
+from team.estimation.se2 import compose, exponential
 from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)

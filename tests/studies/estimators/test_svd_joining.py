@@ -10,9 +10,9 @@ from sim.studies.estimators import svd_joining
 from sim.studies.estimators.svd_joining import PointPairs, TooFewPointsError
 from team.estimation.consistency import chi2_interval, nees
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.geometry import compose, transformed
 from team.estimation.map_joining import joining
 from team.estimation.map_joining.joining import EMPTY_FOLD
+from team.estimation.se2 import compose, transformed
 from team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth, team, wrap
 

@@ -15,7 +15,7 @@ from sim.studies.rules.svd_rule import tied
 from team import translate
 from team.estimation.contribution import Stream
 from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.geometry import inverse, transformed
+from team.estimation.se2 import inverse, transformed
 from team.wire import channels as ch
 from team.wire.bus import Outgoing
 from team.wire.codec import encoded

@@ -1,0 +1,37 @@
+"""SE(2): poses are (x [m], y [m], theta [rad]); `a_from_b` maps coordinates in b into a.
+
+Perturbations are on the right, in the tangent space of the pose they perturb:
+`pose ∘ Exp(xi)` with xi = (forward [m], left [m], turn [rad]). Every function returns a new array.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from team.core import (
+    adjoint,
+    between,
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    tangent,
+    transformed,
+    wrapped,
+)
+
+__all__ = [
+    "Point",
+    "Pose",
+    "adjoint",
+    "between",
+    "compose",
+    "exponential",
+    "inverse",
+    "logarithm",
+    "tangent",
+    "transformed",
+    "wrapped",
+]
+
+Pose = Float[np.ndarray, "3"]
+Point = Float[np.ndarray, "2"]
