@@ -228,6 +228,45 @@ class ChainSolution:
     def at(self) -> int:
         """The map without covariance; 0 is the prior."""
 
+def check_finite(data: bytes, what: str, count: int | None = None) -> None:
+    """Raise ValueError unless there are `count` float64, all finite."""
+
+def check_angles(data: bytes, what: str, count: int) -> None:
+    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
+
+def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
+    """
+    Raise ValueError unless there are `count` finite float64, none negative.
+    """
+
+def check_named(data: bytes, what: str) -> None:
+    """
+    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
+
+    A window assigns these numbers itself, so they would collide.
+    """
+
+def check_ascending(data: bytes, what: str) -> None:
+    """Raise ValueError unless the ids are strictly ascending."""
+
+def check_pose_covariance(data: bytes, what: str) -> None:
+    """
+    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
+
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding
+    error of a matrix with a unit diagonal.
+    """
+
+def check_packed_covariance(data: bytes, n: int, what: str) -> None:
+    """
+    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
+    """
+
+def check_blocks(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
+    """
+
 def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.

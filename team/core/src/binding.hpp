@@ -225,6 +225,7 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 }
 
 // One function for each file of bindings.
+void bind_checks(nb::module_& m);
 void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
 void bind_maps(nb::module_& m);
