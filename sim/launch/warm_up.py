@@ -16,6 +16,7 @@ import team
 from sim.scenarios.scenario import load, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
+from team.core import WholeMap
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import curved
 from team.estimation.geometry import inverse, logarithm, wrapped
@@ -23,7 +24,6 @@ from team.estimation.map_joining.conditioning import Followed, followed, pose_no
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, converged, folded, started
 from team.estimation.map_joining.marginals import joint_cost, landmark_blocks, landmark_map
-from team.estimation.map_joining.whole_map import WholeMap
 from team.estimation.submap import LocalMap
 from team.wire.bus import Sample
 from team.wire.channels import SUBMAP, channel_of

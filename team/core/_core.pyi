@@ -134,6 +134,139 @@ def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
 @overload
 def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
+class WholeMap:
+    """
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]:
+        """The landmarks' ids (L,), ascending; read-only."""
+
+    @property
+    def mean(self) -> NDArray[numpy.float64]:
+        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
+
+    @property
+    def covariance(self) -> NDArray[numpy.float64]:
+        """(n, n); read-only."""
+
+    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Copy mean (3,) and covariance (3, 3) of the pose."""
+
+    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
+        """
+        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
+
+        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
+        is as it was.
+        """
+
+    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+        """
+        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
+
+        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
+        of `joined`, 2 where a single landmark's innovation is singular.
+        """
+
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    """
+
+class Chain:
+    """
+    A prior and the submaps after it, each beginning at the end of the one before.
+    """
+
+    def __init__(self, prior: WholeMap) -> None: ...
+
+    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
+        """Append the next submap, without pose nodes."""
+
+    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
+        """
+        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
+
+        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
+        """
+
+class ChainSolution:
+    """The least-squares solution of a prior and the submaps after it."""
+
+    @property
+    def map(self) -> WholeMap:
+        """The last end pose and all landmarks."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared of all maps, in `dof` degrees of freedom."""
+
+    @property
+    def dof(self) -> int: ...
+
+    @property
+    def known(self) -> NDArray[numpy.int64]:
+        """
+        For each submap, the number of its landmarks that another map has, too.
+        """
+
+    @property
+    def landmark_chi2(self) -> NDArray[numpy.float64]:
+        """Chi-squared of each landmark of the submaps by its own covariance."""
+
+    @property
+    def fault(self) -> int:
+        """
+        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
+        """
+
+    @property
+    def at(self) -> int:
+        """The map without covariance; 0 is the prior."""
+
+def check_finite(data: bytes, what: str, count: int | None = None) -> None:
+    """Raise ValueError unless there are `count` float64, all finite."""
+
+def check_angles(data: bytes, what: str, count: int) -> None:
+    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
+
+def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
+    """
+    Raise ValueError unless there are `count` finite float64, none negative.
+    """
+
+def check_named(data: bytes, what: str) -> None:
+    """
+    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
+
+    A window assigns these numbers itself, so they would collide.
+    """
+
+def check_ascending(data: bytes, what: str) -> None:
+    """Raise ValueError unless the ids are strictly ascending."""
+
+def check_pose_covariance(data: bytes, what: str) -> None:
+    """
+    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
+
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding
+    error of a matrix with a unit diagonal.
+    """
+
+def check_packed_covariance(data: bytes, n: int, what: str) -> None:
+    """
+    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
+    """
+
+def check_blocks(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
+    """
+
 def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.

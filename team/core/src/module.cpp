@@ -13,6 +13,8 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   nb::exception<binding::NotFiniteError>(m, "NotFiniteError", PyExc_ValueError);
   nb::exception<window::MotionError>(m, "MotionError", PyExc_ValueError);
   binding::bind_elementary(m);
+  binding::bind_maps(m);
+  binding::bind_checks(m);
   binding::bind_dense(m);
   binding::bind_se2(m);
   binding::bind_sparse(m);
