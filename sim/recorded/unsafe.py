@@ -7,13 +7,13 @@ import numpy as np
 
 from team import translate
 from team.config import Exchange, RobotConfig
+from team.core import WholeMap, check_packed_covariance
 from team.estimation.hybrid_slam.closed_window import ClosedWindow
 from team.estimation.map_joining.conditioning import RobotPrior
-from team.estimation.map_joining.whole_map import WholeMap, initial_map, joined
+from team.estimation.map_joining.whole_map import initial_map, joined
 from team.estimation.submap import LocalMap
 from team.robot.node import RobotNode
 from team.wire import messages as m
-from team.wire.arrays import check_packed_covariance
 
 
 def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:

@@ -221,6 +221,142 @@ def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 class Calibration:
     """What corrects a raw measurement of range and bearing, or refuses it."""
+class WholeMap:
+    """
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]:
+        """The landmarks' ids (L,), ascending; read-only."""
+
+    @property
+    def mean(self) -> NDArray[numpy.float64]:
+        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
+
+    @property
+    def covariance(self) -> NDArray[numpy.float64]:
+        """(n, n); read-only."""
+
+    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Copy mean (3,) and covariance (3, 3) of the pose."""
+
+    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
+        """
+        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
+
+        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
+        is as it was.
+        """
+
+    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+        """
+        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
+
+        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
+        of `joined`, 2 where a single landmark's innovation is singular.
+        """
+
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    """
+
+class Chain:
+    """
+    A prior and the submaps after it, each beginning at the end of the one before.
+    """
+
+    def __init__(self, prior: WholeMap) -> None: ...
+
+    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
+        """Append the next submap, without pose nodes."""
+
+    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
+        """
+        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
+
+        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
+        """
+
+class ChainSolution:
+    """The least-squares solution of a prior and the submaps after it."""
+
+    @property
+    def map(self) -> WholeMap:
+        """The last end pose and all landmarks."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared of all maps, in `dof` degrees of freedom."""
+
+    @property
+    def dof(self) -> int: ...
+
+    @property
+    def known(self) -> NDArray[numpy.int64]:
+        """
+        For each submap, the number of its landmarks that another map has, too.
+        """
+
+    @property
+    def landmark_chi2(self) -> NDArray[numpy.float64]:
+        """Chi-squared of each landmark of the submaps by its own covariance."""
+
+    @property
+    def fault(self) -> int:
+        """
+        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
+        """
+
+    @property
+    def at(self) -> int:
+        """The map without covariance; 0 is the prior."""
+
+def check_finite(data: bytes, what: str, count: int | None = None) -> None:
+    """Raise ValueError unless there are `count` float64, all finite."""
+
+def check_angles(data: bytes, what: str, count: int) -> None:
+    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
+
+def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
+    """
+    Raise ValueError unless there are `count` finite float64, none negative.
+    """
+
+def check_named(data: bytes, what: str) -> None:
+    """
+    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
+
+    A window assigns these numbers itself, so they would collide.
+    """
+
+def check_ascending(data: bytes, what: str) -> None:
+    """Raise ValueError unless the ids are strictly ascending."""
+
+def check_pose_covariance(data: bytes, what: str) -> None:
+    """
+    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
+
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding
+    error of a matrix with a unit diagonal.
+    """
+
+def check_packed_covariance(data: bytes, n: int, what: str) -> None:
+    """
+    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
+    """
+
+def check_blocks(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
+    """
+
+def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
 
     def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
         """
@@ -532,6 +668,221 @@ def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int6
     Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
     of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
     """
+
+class SubmapFactor:
+    """
+    A submap as a factor between its start pose, its other poses, its landmarks and its biases.
+
+    mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).
+    sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with
+    which the bias moves it, 0 or 1; -1 for none. A state is additive; `at` has the index in it of the
+    first number of each member.
+    """
+
+    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> None: ...
+
+    def with_errors(self, sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> SubmapFactor:
+        """Make the same submap with other biases."""
+
+    def normal(self, state: NDArray[numpy.float64], at: NDArray[numpy.int64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
+        """Compute JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r over the members."""
+
+    def at_joined_ranges(self, state: NDArray[numpy.float64], at: NDArray[numpy.int64]) -> SubmapFactor:
+        """
+        Make the same submap with its noise at the ranges in a state, for errors proportional to the range.
+        """
+
+    def discounted(self, weights: NDArray[numpy.float64]) -> SubmapFactor:
+        """
+        Make the same submap with each landmark's own covariance enlarged by its weight: P + blkdiag(0, (1/w - 1) P_ll).
+        """
+
+    @property
+    def information(self) -> NDArray[numpy.float64]:
+        """P⁻¹."""
+
+    @property
+    def sensitivity(self) -> NDArray[numpy.float64]:
+        """∂mean/∂b, a row per bias."""
+
+    @property
+    def landmarks(self) -> NDArray[numpy.float64]:
+        """Each landmark's own covariance (xx, xy, yy)."""
+
+LARGEST_RATIO: float
+
+def linearise_sighting(observer: NDArray[numpy.float64], teammate: NDArray[numpy.float64], measurement: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute the residual of an inter-robot measurement (range, bearing), and its Jacobian over both poses.
+    """
+
+class Quadratic:
+    """
+    Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,
+    over some nodes of a graph, ascending, none of them fixed.
+    """
+
+    def __init__(self, nodes: NDArray[numpy.int64], at: NDArray[numpy.float64], headings: NDArray[numpy.bool_], information: NDArray[numpy.float64], slope: NDArray[numpy.float64], cost: float) -> None: ...
+
+def add_product(a: NDArray[numpy.float64], b: NDArray[numpy.float64], c: NDArray[numpy.float64], upper: bool = False, lower: bool = False) -> None:
+    """
+    Add A B to the first rows and columns of C, in place; each entry adds its terms in order.
+
+    upper: only the upper triangle of the square A B is required, the rest of C may change or not. lower: B is
+    lower triangular, entries above its diagonal count as zero.
+    """
+
+def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.
+    """
+
+class SubmapGraph:
+    """
+    The factor graph of one frame, independent of the state.
+
+    offset: of each node's first number in the state, and the state's length. fixed: nodes that are
+    constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,
+    measurement, information). priors: (node, mean, information, whether it is of one robot's bias).
+    Raises ValueError where a factor does not fit its nodes.
+    """
+
+    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[int, NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
+
+    @property
+    def pattern(self) -> Pattern:
+        """
+        Blocks of the normal equations, a variable per node, and their places in the factor.
+        """
+
+    def landmark_chi2(self, state: NDArray[numpy.float64], covariance_factor: float) -> NDArray[numpy.float64]:
+        """
+        Compute r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap.
+        """
+
+class Estimate:
+    """
+    A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
+
+    scale, sighting_scale: the robust c of each submap and inter-robot measurement. robust_c: their
+    final one; None for least squares. The arrays are in the graph's order. What is computed is kept.
+    """
+
+    def __init__(self, graph: SubmapGraph, state: NDArray[numpy.float64], scale: NDArray[numpy.float64], sighting_scale: NDArray[numpy.float64], robust_c: float | None, landmark_gate: float, covariance_factor: float, joined_ranges: bool) -> None: ...
+
+    @property
+    def landmark_weights(self) -> NDArray[numpy.float64]:
+        """
+        Weight of each landmark of each submap: 1 up to its gate or without a robust loss.
+        """
+
+    @property
+    def dimensions(self) -> NDArray[numpy.float64]:
+        """
+        Dimension of each submap, a discounted landmark counting by its weight.
+        """
+
+    @property
+    def chi2(self) -> NDArray[numpy.float64]:
+        """rᵀ(f P)⁻¹r of each submap, with discounted landmarks."""
+
+    @property
+    def whole_chi2(self) -> NDArray[numpy.float64]:
+        """rᵀ(f P)⁻¹r of each submap, without discounting."""
+
+    @property
+    def counted_chi2(self) -> NDArray[numpy.float64]:
+        """χ² of each submap in which each landmark's share w χ² counts w times."""
+
+    @property
+    def weights(self) -> NDArray[numpy.float64]:
+        """Robust weight of each submap."""
+
+    @property
+    def sighting_chi2(self) -> NDArray[numpy.float64]:
+        """rᵀR⁻¹r of each inter-robot measurement."""
+
+    @property
+    def sighting_weights(self) -> NDArray[numpy.float64]:
+        """Robust weight of each inter-robot measurement."""
+
+    @property
+    def prior_chi2(self) -> NDArray[numpy.float64]:
+        """χ² of each prior."""
+
+    @property
+    def prior_weights(self) -> NDArray[numpy.float64]:
+        """
+        Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
+        """
+
+    @property
+    def cost(self) -> float:
+        """The minimised cost, at these robust scales."""
+
+    def cost_of(self, other: Estimate) -> float:
+        """
+        Evaluate Σ w χ² of another state with the weights and noise of this one, which a step lowers.
+        """
+
+    @property
+    def normal_equations(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.
+        """
+
+    @property
+    def gradient(self) -> NDArray[numpy.float64]:
+        """Half the gradient, Σ w JᵀP⁻¹r."""
+
+    @property
+    def posterior(self) -> Cholesky:
+        """The Cholesky factor of A. Raises NotPositiveDefiniteError."""
+
+    @property
+    def step(self) -> NDArray[numpy.float64]:
+        """The full step, -A⁻¹g."""
+
+    @property
+    def squared_length(self) -> float:
+        """The full step's squared length in standard deviations, gᵀA⁻¹g."""
+
+    @property
+    def selected_covariance(self) -> NDArray[numpy.float64]:
+        """
+        Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.
+        """
+
+    @property
+    def boundary_covariance(self) -> NDArray[numpy.float64]:
+        """The joint covariance of the condensed factor's nodes."""
+
+    def take_step(self, damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
+        """
+        Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a more
+        damped one. Returns the next state, the next damping and the full step's largest change; where no damping
+        helps the state is None, the damping infinite and the change that of the first step.
+        """
+
+    @property
+    def explained(self) -> NDArray[numpy.float64]:
+        """
+        tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.
+        """
+
+    @property
+    def explained_by_sightings(self) -> NDArray[numpy.float64]:
+        """tr(JᵀR⁻¹J Σ) of each inter-robot measurement."""
+
+    @property
+    def explained_by_priors(self) -> NDArray[numpy.float64]:
+        """tr(P⁻¹ Σ) of each prior."""
+
+    def quadratic(self, nodes: NDArray[numpy.int64], submaps: NDArray[numpy.bool_], sightings: NDArray[numpy.bool_], priors: NDArray[numpy.bool_]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
+        """
+        Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,
+        ascending; other nodes are constants.
+        """
 
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from team import core
+from team.core import WholeMap
 from team.estimation import se2
 from team.estimation.gaussian import (
     LandmarkGaussian,
@@ -21,7 +22,7 @@ from team.estimation.gaussian import (
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.map_joining.conditioning import pose_now
 from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.map_joining.whole_map import WholeMap, initial_map, joined
+from team.estimation.map_joining.whole_map import initial_map, joined
 from team.estimation.plausible import are_landmarks
 from team.estimation.submap import LocalMap
 
@@ -67,7 +68,7 @@ class OwnMap:
 
     def join(self, local: LocalMap) -> None:
         """Join the next submap, or its motion alone if it contradicts the map numerically."""
-        self.origin = self.whole.mean[:3]
+        self.origin, _ = self.whole.pose()
         named = local.named
         try:
             after = joined(self.whole, named)

@@ -1,16 +1,13 @@
-"""Arrays on the wire: little-endian `bin` fields, and the checks of their contents.
+"""Arrays on the wire: little-endian `bin` fields. The core checks their contents.
 
 NumPy (14 MB) is imported at the first array; router and recorder receive none.
 """
 
-import math
 import struct
-import sys
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from team.config import UNNAMED
+from team.core import check_finite
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,16 +29,10 @@ Ids = bytes
 Stamps = bytes
 """int64 nanoseconds, little-endian."""
 
-EPSILON = sys.float_info.epsilon
 _SIZES = {"<f8": 8, "<u4": 4, "<i8": 8, "u1": 1}
 FEW = 16
-"""Largest number of floats that are checked one by one, faster than as an array."""
+"""Largest number of plain floats that are encoded without an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
-_POSE = _NUMBERS[9]
-_SMALL = 128
-"""Largest number of rows for which the indices of a packed triangle are cached."""
-LARGEST_JOINT = 4096
-"""Largest number of rows of a covariance."""
 
 
 def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
@@ -91,86 +82,6 @@ def from_stamps(values: Any) -> Stamps:
     return np.ascontiguousarray(values, dtype="<i8").tobytes()
 
 
-def _few(data: Floats) -> tuple[float, ...] | None:
-    """Return at most FEW numbers as plain floats, else None; their check is five times as fast."""
-    count, rest = divmod(len(data), 8)
-    return None if rest or count > FEW else _NUMBERS[count].unpack(data)
-
-
-def check_finite(data: Floats, what: str, count: int | None = None) -> None:
-    """Raise ValueError unless there are `count` floats, all finite."""
-    few = _few(data)
-    values = floats(data, what) if few is None else few
-    if count is not None and len(values) != count:
-        raise ValueError(f"wrong length: {what} has {len(values)} numbers, {count} expected")
-    if not (np.isfinite(values).all() if few is None else all(map(math.isfinite, few))):
-        raise ValueError(f"not finite: {what}")
-
-
-def check_angles(data: Floats, what: str, count: int) -> None:
-    """Raise ValueError unless there are `count` angles in [−π, π]."""
-    check_finite(data, what, count)
-    few = _few(data)
-    values = np.abs(floats(data, what)).tolist() if few is None else map(abs, few)
-    if max(values, default=0.0) > math.pi:
-        raise ValueError(f"out of bounds: {what} outside (−π, π]")
-
-
-def check_ranges(data: Floats, what: str, count: int | None = None) -> None:
-    """Raise ValueError unless there are `count` finite floats, none negative."""
-    check_finite(data, what, count)
-    few = _few(data)
-    if min(floats(data, what).tolist() if few is None else few, default=0.0) < 0.0:
-        raise ValueError("out of bounds: a range is negative")
-
-
-def check_named(data: Ids, what: str) -> None:
-    """Raise ValueError if an id is that of a landmark without identity, 2³¹ or larger.
-
-    A window assigns these numbers itself, so they would collide.
-    """
-    if ids(data, what).max(initial=0) >= UNNAMED:
-        raise ValueError(f"out of bounds: {what} from 2³¹ on are of landmarks without identities")
-
-
-def check_ascending(data: Ids, what: str) -> None:
-    """Raise ValueError unless the ids are strictly ascending."""
-    values = ids(data, what)
-    if len(values) > 1 and not (values[1:] > values[:-1]).all():
-        raise ValueError(f"not ascending: {what}")
-
-
-def check_pose_covariance(data: Floats, what: str) -> None:
-    """Raise ValueError unless nine floats form a symmetric positive definite 3 × 3 matrix.
-
-    Symmetry is judged by the standard deviations, |Pᵢⱼ − Pⱼᵢ| ≤ 1e-9 σᵢ σⱼ; a pivot by the rounding
-    error of a matrix with a unit diagonal. Plain floats take a tenth of the time of arrays of nine
-    numbers.
-    """
-    if len(data) != _POSE.size:
-        check_finite(data, what, 9)
-    xx, xy, xt, yx, yy, yt, tx, ty, tt = _POSE.unpack(data)
-    if not math.isfinite(xx + xy + xt + yx + yy + yt + tx + ty + tt):
-        check_finite(data, what, 9)
-    if not (xx > 0.0 and yy > 0.0 and tt > 0.0):
-        raise ValueError(f"not positive definite: {what}")
-    x, y, t = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
-    a, b, c = _clipped(yx / x / y), _clipped(tx / x / t), _clipped(ty / y / t)
-    above = _clipped(xy / y / x), _clipped(xt / t / x), _clipped(yt / t / y)
-    if max(abs(a - above[0]), abs(b - above[1]), abs(c - above[2])) > 1e-9:
-        raise ValueError(f"not symmetric: {what}")
-    of_y = 1.0 - a * a
-    if of_y > 3.0 * EPSILON:
-        rest = c - a * b
-        if 1.0 - b * b - rest * rest / of_y > 3.0 * EPSILON:
-            return
-    raise ValueError(f"not positive definite: {what}")
-
-
-def _clipped(value: float) -> float:
-    return -2.0 if value < -2.0 else 2.0 if value > 2.0 else value
-
-
 def check_semidefinite(data: Floats, n: int, what: str) -> None:
     """Raise ValueError unless n × n floats are symmetric and positive semi-definite, of any rank.
 
@@ -187,63 +98,6 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
     if np.abs(scaled - scaled.T).max(initial=0.0) > 1e-9:
         raise ValueError(f"not symmetric: {what}")
     if np.linalg.eigvalsh(scaled).min(initial=0.0) < -1e-9:
-        raise ValueError(f"not positive definite: {what}")
-
-
-def check_packed_covariance(data: Floats, n: int, what: str) -> None:
-    """Raise ValueError unless a packed upper triangle is a positive definite n × n matrix."""
-    if n > LARGEST_JOINT:
-        raise ValueError(f"too large: {what} has {n} rows, {LARGEST_JOINT} at most")
-    check_finite(data, what, n * (n + 1) // 2)
-    if n:
-        _check_positive(_unit_diagonal(floats(data, what), n, what), what)
-
-
-def check_blocks(data: Floats, count: int, what: str) -> None:
-    """Raise ValueError unless there are `count` packed 2 × 2 covariances (3 floats each)."""
-    check_finite(data, what, 3 * count)
-    a, b, c = floats(data, what).reshape(count, 3).T
-    root = np.sqrt(np.maximum(a, 0.0)) * np.sqrt(np.maximum(c, 0.0))  # a·c could overflow
-    if not np.all(np.abs(b) < root):
-        raise ValueError(f"not positive definite: {what}")
-
-
-def _unit_diagonal(
-    packed: "np.typing.NDArray[np.float64]", n: int, what: str
-) -> "np.typing.NDArray[np.float64]":
-    """Return the lower triangle of D⁻¹ P D⁻¹, D = √diag P, with zeros above it.
-
-    Units and scale then do not influence the conditioning.
-    """
-    rows, columns, places, diagonal = _triangle(n) if n <= _SMALL else _triangle.__wrapped__(n)
-    with np.errstate(over="ignore", invalid="ignore"):  # negative variances are refused below
-        sigmas = np.sqrt(packed[diagonal])
-        if not (sigmas > 0.0).all():
-            raise ValueError(f"not positive definite: {what}")
-        scaled = packed / sigmas[rows] / sigmas[columns]
-    lower = np.zeros(n * n)
-    lower[places] = np.minimum(np.maximum(scaled, -2.0), 2.0)
-    return lower.reshape(n, n)
-
-
-@lru_cache(maxsize=16)
-def _triangle(n: int) -> "tuple[np.typing.NDArray[np.intp], ...]":
-    """Return the indices of a packed upper triangle of n rows.
-
-    They are the row and the column of each number, its index in the transposed matrix, row by row,
-    and the indices of the diagonal in the triangle.
-    """
-    rows, columns = np.triu_indices(n)
-    return rows, columns, columns * n + rows, np.flatnonzero(rows == columns)
-
-
-def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
-    """Raise ValueError unless each pivot of a matrix with a unit diagonal exceeds n ε."""
-    try:
-        factor = np.linalg.cholesky(scaled)  # reads the lower triangle
-    except np.linalg.LinAlgError:
-        raise ValueError(f"not positive definite: {what}") from None
-    if factor.diagonal().min() ** 2 <= len(scaled) * EPSILON:
         raise ValueError(f"not positive definite: {what}")
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from team.wire.arrays import check_packed_covariance, check_pose_covariance, from_floats
+from team.core import check_packed_covariance, check_pose_covariance
+from team.wire.arrays import from_floats
 
 
 def verdict(check, *arguments):

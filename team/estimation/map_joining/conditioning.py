@@ -15,19 +15,14 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
+from jaxtyping import Bool, Float, UInt32
 
+from team import core
 from team.config import Bias
-from team.estimation.compiled import compiled
+from team.core import WholeMap
 from team.estimation.consistency import chi2_limit
 from team.estimation.contribution import Contribution
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian
-from team.estimation.map_joining.chain_kernel import (
-    NO_COVARIANCE,
-    Chain,
-    SolvedChain,
-    solved_chain,
-)
 from team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
@@ -35,10 +30,9 @@ from team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     settled,
 )
-from team.estimation.map_joining.joining_kernel import landmark_chi2
 from team.estimation.map_joining.merging import ages
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
-from team.estimation.map_joining.whole_map import WholeMap, end_pose, without
+from team.estimation.map_joining.whole_map import end_pose, without
 from team.estimation.submap import LocalMap
 
 GATE = 18.420680744107813
@@ -59,6 +53,8 @@ FEWEST = 2
 """Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a
 misread.
 """
+NO_COVARIANCE = 2
+"""Fault of the core: a map of the chain has no covariance."""
 SELF = ("self", 0)
 """The stream of the prior and of the robot's submaps in the graph that is solved."""
 
@@ -88,33 +84,14 @@ class SubmapCorrection(NamedTuple):
                 self.covariance_factor * local.covariance,
                 local.node_stamps,
             )
-        mean, covariance = _shifted(
+        mean, covariance = core.corrected(
             local.mean,
-            np.ascontiguousarray(local.covariance),
+            local.covariance,
             self.covariance_factor,
             local.sensitivity[[local.biases.index(name) for name, _, _ in known]],
             np.array([(value, sigma) for _, value, sigma in known]),
         )
         return LocalMap(local.ids, mean, covariance, local.node_stamps)
-
-
-@compiled
-def _shifted(
-    mean: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n n"],
-    factor: float,
-    columns: Float[np.ndarray, "B n"],
-    estimates: Float[np.ndarray, "B 2"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
-    """Compute mean + Sᵀ b and f P + Sᵀ diag(σ²) S of biases (b, σ) with the columns S."""
-    shifted, total = mean.copy(), factor * covariance
-    for k in range(len(columns)):
-        variance = estimates[k, 1] * estimates[k, 1]
-        for i in range(len(mean)):
-            shifted[i] += estimates[k, 0] * columns[k, i]
-            for j in range(len(mean)):
-                total[i, j] += variance * (columns[k, i] * columns[k, j])
-    return shifted, total
 
 
 class RobotPrior(NamedTuple):
@@ -177,13 +154,13 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
         return Followed(whole)
     found = _solved(whole, submaps)
     known, refused = tuple(found.known.tolist()), tuple(0 for _ in submaps)
-    if found.beyond.any():
+    if (found.landmark_chi2 > GATE).any():
         doubted, _, _ = settled(_island(whole, submaps, DOUBTING))
         beyond = _beyond_gate(doubted)
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
             found = _solved(whole, [_without(*pair) for pair in zip(submaps, beyond, strict=True)])
-    joint = WholeMap(found.ids, found.mean, found.covariance)
+    joint = found.map
     disputed = found.cost > _most(found.dof) or any(
         is_majority(*pair) for pair in zip(refused, known, strict=True)
     )
@@ -192,32 +169,21 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     return Followed(joint, known, refused, found.cost, found.dof, disputed)
 
 
-def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> SolvedChain:
+def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolution:
     """Solve plain least squares of the map and the submaps, with all landmarks.
 
     Raises NotACovarianceError, NotDeterminedError.
     """
-    ids = [whole.ids, *(each.ids for each in submaps)]
-    means = [whole.mean, *(each.mean for each in submaps)]
-    covariances = [whole.covariance.ravel(), *(each.covariance.ravel() for each in submaps)]
-    chain = Chain(
-        np.concatenate(ids),
-        _starts(ids),
-        np.concatenate(means),
-        _starts(means),
-        np.concatenate(covariances),
-    )
-    found = solved_chain(chain, GATE, TRUSTING.max_iterations, TRUSTING.step_tolerance)
+    chain = core.Chain(whole)
+    for each in submaps:
+        chain.append(each.ids, each.mean, each.covariance)
+    found = chain.solve(TRUSTING.max_iterations, TRUSTING.step_tolerance)
     if found.fault == NO_COVARIANCE:
-        what = f"the robot's submap {found.of} behind the prior" if found.of else "the prior"
+        what = f"the robot's submap {found.at} behind the prior" if found.at else "the prior"
         raise NotACovarianceError(what, "not positive definite")
     if found.fault:
         raise NotDeterminedError("the robot's map")
     return found
-
-
-def _starts(parts: Sequence[np.ndarray]) -> Int64[np.ndarray, " _"]:
-    return np.cumsum([0, *map(len, parts)], dtype=np.int64)
 
 
 def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
@@ -247,9 +213,8 @@ def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings
 
 
 def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    factors = island.graph.factors
-    beyond = landmark_chi2(island.state, island.graph.offset, factors, 1.0) > GATE
-    return np.split(beyond, factors.block_start[1:-1])[1:]
+    beyond = island.graph.factors.landmark_chi2(island.state, 1.0) > GATE
+    return np.split(beyond, island.graph.landmark_start[1:-1])[1:]
 
 
 def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
@@ -264,5 +229,5 @@ def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
     Only the marginal of the window's landmarks is taken from the map, which is exact.
     """
     if open_window is None:
-        return Posed(PoseGaussian(whole.mean[:3], whole.covariance[:3, :3]))
+        return Posed(PoseGaussian(*whole.pose()))
     return Posed(*end_pose(whole, open_window, GATE))

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from team.estimation import dense
 from team.estimation.map_joining.condensed_factor import Resting, nobody_rests, places
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from team.estimation.map_joining.resting_kernel import between
+from team.estimation.map_joining.upper_triangle import between
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

@@ -255,7 +255,7 @@ def _difference(one: Island, other: Island) -> Values:
 
 def _quadratic(island: Island, x: Values) -> float:
     """xᵀAx with the information A of the island at its state."""
-    values, _ = island.normal_equations
+    values, _ = island.estimate.normal_equations
     return island.graph.pattern.quadratic(values, x)
 
 

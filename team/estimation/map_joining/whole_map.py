@@ -7,36 +7,19 @@ linearised again, so the map is overconfident after many joins.
 """
 
 import math
-from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
+from team.core import WholeMap
 from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
-from team.estimation.map_joining.join_kernel import joined_by_id
-from team.estimation.map_joining.tie_kernel import INDEFINITE, SINGULAR, end_pose_of
 from team.estimation.se2 import wrapped
 from team.estimation.submap import LocalMap
 
-Maps = tuple[
-    UInt32[np.ndarray, " L"],
-    Float[np.ndarray, " n"],
-    Float[np.ndarray, "n n"],
-    UInt32[np.ndarray, " K"],
-    Float[np.ndarray, " q"],
-    Float[np.ndarray, "q q"],
-]
-"""Ids, mean and covariance of a map, then those of a local map."""
-
-
-@dataclass(frozen=True, eq=False)
-class WholeMap:
-    """N(mean, covariance) of (pose, landmarks by ascending id) in the map frame [m, rad]."""
-
-    ids: UInt32[np.ndarray, " L"]
-    mean: Float[np.ndarray, " n"]
-    covariance: Float[np.ndarray, "n n"]
+INDEFINITE, SINGULAR = 1, 2
+"""Faults of the core: the covariance of the innovation of all known landmarks is not positive
+definite, or that of one landmark is singular.
+"""
 
 
 def initial_map(
@@ -50,14 +33,12 @@ def initial_map(
 def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
     """Compose the local map onto the current pose: known landmarks fused, new ones added.
 
-    With s = (whole, local) and the constraint h(s) = pose ∘ local landmark − whole landmark = 0 for
-    each known landmark: the iterated EKF update of s, then (pose ∘ end pose, landmarks, pose ∘ new
-    landmarks) with its Jacobian. The update has rank 2k for k known landmarks and the Jacobian is
-    the identity for the landmarks of the whole map: O(n²k) for its n numbers.
+    Raises NotACovarianceError where the known landmarks contradict the map numerically.
     """
-    ids, mean, covariance, fault = joined_by_id(*_parts(whole, local.without_nodes))
+    local = local.without_nodes
+    after, fault = whole.joined(local.ids, local.mean, local.covariance)
     _refuse(fault)
-    return WholeMap(ids, mean, covariance)
+    return after
 
 
 def end_pose(
@@ -71,20 +52,11 @@ def end_pose(
     multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed with
     two degrees of freedom.
     """
-    pose, covariance, known, refused, fault = end_pose_of(*_parts(whole, local), gate)
+    pose, covariance, known, refused, fault = whole.end_pose(
+        local.ids, local.mean, local.covariance, gate
+    )
     _refuse(fault)
     return PoseGaussian(pose, covariance), known, refused
-
-
-def _parts(whole: WholeMap, local: LocalMap) -> Maps:
-    """Lay both maps out alike: each layout would compile kernels of its own."""
-    parts = (
-        whole.ids, whole.mean, whole.covariance, local.ids, local.mean, local.covariance
-    )  # fmt: skip
-    for values in parts:
-        if not values.flags.carray:
-            return cast(Maps, tuple(each.copy() for each in parts))
-    return parts
 
 
 def _refuse(fault: int) -> None:

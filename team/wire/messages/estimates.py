@@ -5,7 +5,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.wire.arrays import Floats, Ids, check_finite, check_pose_covariance, floats
+from team.core import check_finite, check_pose_covariance
+from team.wire.arrays import Floats, Ids, floats
 from team.wire.messages.base import Count, Digest, Message, Name, Text, check_landmarks
 
 

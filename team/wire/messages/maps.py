@@ -6,17 +6,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.wire.arrays import (
-    Floats,
-    Ids,
-    Stamps,
-    check_ascending,
-    check_finite,
-    check_packed_covariance,
-    check_pose_covariance,
-    ids,
-    stamps,
-)
+from team.core import check_ascending, check_finite, check_packed_covariance, check_pose_covariance
+from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
 from team.wire.messages.base import (
     Bias,
     Count,

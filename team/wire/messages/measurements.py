@@ -6,19 +6,15 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from team.wire.arrays import (
-    Floats,
-    Ids,
+from team.core import (
     check_angles,
     check_blocks,
     check_finite,
     check_named,
     check_pose_covariance,
     check_ranges,
-    check_semidefinite,
-    floats,
-    ids,
 )
+from team.wire.arrays import Floats, Ids, check_semidefinite, floats, ids
 from team.wire.messages.base import Count, Message, Name, Real, Text
 
 

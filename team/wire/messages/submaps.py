@@ -4,16 +4,8 @@ import math
 from itertools import pairwise
 
 from team.config import UNNAMED
-from team.wire.arrays import (
-    Floats,
-    Ids,
-    Stamps,
-    check_ascending,
-    check_finite,
-    check_packed_covariance,
-    ids,
-    stamps,
-)
+from team.core import check_ascending, check_finite, check_packed_covariance
+from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
 from team.wire.messages.base import Bias, Count, Digest, Message, Name, Real, StampNs, check_counts
 
 

@@ -1,15 +1,7 @@
 """Truth for the evaluation, the known map of localisation, the plan of a simulated radio."""
 
-from team.wire.arrays import (
-    Floats,
-    Ids,
-    Stamps,
-    check_ascending,
-    check_finite,
-    check_named,
-    ids,
-    stamps,
-)
+from team.core import check_ascending, check_finite, check_named
+from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
 from team.wire.messages.base import Message, Name, StampNs, check_counts
 
 

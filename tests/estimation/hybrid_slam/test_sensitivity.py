@@ -19,7 +19,6 @@ from team.estimation.hybrid_slam import window as windows
 from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
-from team.estimation.map_joining.submap_factor import biased_normal
 from team.estimation.models import increment_of, model_of
 from team.estimation.randomness import generator
 from team.robot.node import RobotNode
@@ -266,7 +265,9 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
     at = np.array(
         [0, 3, *(6 + 2 * k for k in range(count)), *range(len(state) - biases, len(state))]
     )
-    hessian, gradient, chi2 = biased_normal(state, at, mean, information, sensitivity)
+    powers = np.zeros(biases, np.int64)
+    factor = core.SubmapFactor(mean, information, np.zeros((count, 3)), sensitivity, powers)
+    hessian, gradient, chi2 = factor.normal(state, at)
     r = residual(state)
     tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
     assert chi2 == pytest.approx(r @ information @ r)
@@ -409,12 +410,12 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
         state[at] = prior.mean[0] + by
         return replace(island, state=state)
 
-    assert shifted(10.0 * sigma).prior_weight[k] == pytest.approx(1.0 / 101.0)
+    assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
-    assert plain.prior_weight[k] == 1.0
+    assert plain.estimate.prior_weights[k] == 1.0
     h, everyone = 1e-4 * sigma, np.ones(len(island.graph.priors), np.bool_)
     for by in (0.5 * sigma, 10.0 * sigma):
         above, below = (shifted(by + d)._prior_cost(everyone) for d in (h, -h))
         slope = (above - below) / (2.0 * h)
-        weighted = shifted(by).prior_weight[k] * prior.information[0, 0] * by
+        weighted = shifted(by).estimate.prior_weights[k] * prior.information[0, 0] * by
         assert slope == pytest.approx(2.0 * weighted, rel=1e-5)

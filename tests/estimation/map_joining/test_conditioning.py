@@ -62,7 +62,7 @@ def test_conditioning_equals_the_full_join_in_the_linear_case(seed, known):
 
 
 def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
-    """The kernel has the graph's iterations, dense and in one call; the answers differ by rounding.
+    """The chain has the graph's iterations, dense and in one call; the answers differ by rounding.
 
     Large errors of the first guess, so that steps are shortened.
     """
@@ -76,15 +76,16 @@ def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
         island, _, _ = settled(conditioning._island(prior.whole, pending, TRUSTING))
         graph = island.graph
         nodes = [graph.streams[conditioning.SELF][-1]]
-        nodes += [graph.landmarks[id_] for id_ in found.ids.tolist()]
+        nodes += [graph.landmarks[id_] for id_ in found.map.ids.tolist()]
         mean, covariance = joint_marginal(island, nodes)
         sigma = np.sqrt(np.diag(covariance))
-        away = max(away, np.abs((found.mean - mean) / sigma).max())
-        away = max(away, np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max())
-        assert found.cost == pytest.approx(island.chi2.sum(), rel=1e-9)
+        away = max(away, np.abs((found.map.mean - mean) / sigma).max())
+        off = (found.map.covariance - covariance) / np.outer(sigma, sigma)
+        away = max(away, np.abs(off).max())
+        assert found.cost == pytest.approx(island.estimate.chi2.sum(), rel=1e-9)
         assert found.dof == int(graph.dimensions.sum()) - graph.unknowns
         beyond = np.concatenate(conditioning._beyond_gate(island))
-        np.testing.assert_array_equal(found.beyond, beyond)
+        np.testing.assert_array_equal(found.landmark_chi2 > conditioning.GATE, beyond)
     assert away < 1e-9
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from team.core import WholeMap
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.gauss_newton import JoinSettings
 from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
@@ -136,4 +137,22 @@ def test_a_map_whose_shared_landmarks_have_no_covariance_has_no_end_pose():
     world = team(6, robots=1, submaps=4, landmarks=12, reach=30.0)
     whole, local = whole_of(world, 3), world.submaps[3].local
     with pytest.raises(NotACovarianceError, match="not positive definite"):
-        end_pose(replace(whole, covariance=-2.0 * whole.covariance), local)
+        end_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), local)
+
+
+def test_a_map_keeps_its_numbers_and_refuses_others():
+    mean, covariance = np.arange(5.0), np.eye(5)
+    whole = WholeMap(np.array([7], np.uint32), mean, covariance)
+    mean[0] = 9.0
+    assert whole.mean[0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        whole.mean[0] = 1.0
+    for ids, n in (([7], 7), ([7, 7], 7), ([8, 7], 7), ([7], 3)):
+        with pytest.raises(ValueError, match=r"must"):
+            WholeMap(np.array(ids, np.uint32), np.zeros(n), np.eye(n))
+        with pytest.raises(ValueError, match=r"must"):
+            whole.joined(np.array(ids, np.uint32), np.zeros(n), np.eye(n))
+    with pytest.raises(ValueError, match="covariance must"):
+        whole.end_pose(whole.ids, whole.mean, np.eye(4), 1.0)
+    with pytest.raises(TypeError):
+        whole.joined(np.array([7.0]), whole.mean, covariance)

@@ -1,0 +1,124 @@
+// Bindings of a robot's map and of the submaps after a prior.
+#include "binding.hpp"
+#include "chain.hpp"
+
+namespace teamslam::binding {
+
+using maps::Chain, maps::ChainSolution, maps::LocalMap, maps::WholeMap;
+
+namespace {
+
+using View1 = nb::ndarray<nb::numpy, const double, nb::ndim<1>, nb::c_contig>;
+using View2 = nb::ndarray<nb::numpy, const double, nb::ndim<2>, nb::c_contig>;
+using ViewIds = nb::ndarray<nb::numpy, const std::uint32_t, nb::ndim<1>, nb::c_contig>;
+
+LocalMap submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
+  const std::size_t n = mean.size();
+  check(n >= 3 + 2 * ids.size() && (n - 2 * ids.size()) % 3 == 0, "mean must be of poses (x, y, theta), then of each landmark");
+  check(covariance.shape(0) == n && covariance.shape(1) == n, "covariance must be (n, n) of a mean of n numbers");
+  for (std::size_t k = 1; k < ids.size(); k++) check(ids(k - 1) < ids(k), "ids must ascend");
+  return {{ids.data(), ids.size()}, {mean.data(), n}, matrix_of(covariance)};
+}
+
+// Without pose nodes.
+LocalMap bare_submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
+  check(mean.size() == 3 + 2 * ids.size(), "mean must be of a pose (x, y, theta), then of each landmark");
+  return submap_of(ids, mean, covariance);
+}
+
+}  // namespace
+
+void bind_maps(nb::module_& m) {
+  nb::class_<WholeMap>(m, "WholeMap",
+                       "N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.")
+      .def("__init__",
+           [](WholeMap* self, const Ids& ids, const Numbers& mean, const Table& covariance) {
+             const LocalMap of = bare_submap_of(ids, mean, covariance);
+             new (self) WholeMap{{of.ids.begin(), of.ids.end()}, {of.mean.begin(), of.mean.end()}, dense::Matrix(of.covariance)};
+           },
+           "ids"_a.noconvert(), "mean"_a, "covariance"_a)
+      .def_prop_ro("ids", [](WholeMap& self) { return ViewIds(self.ids.data(), {self.ids.size()}, nb::find(self)); },
+                   "The landmarks' ids (L,), ascending; read-only.")
+      .def_prop_ro("mean", [](WholeMap& self) { return View1(self.mean.data(), {self.mean.size()}, nb::find(self)); },
+                   "(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only.")
+      .def_prop_ro(
+          "covariance",
+          [](WholeMap& self) {
+            const std::size_t n = self.mean.size();
+            return View2(self.covariance.view().data, {n, n}, nb::find(self));
+          },
+          "(n, n); read-only.")
+      .def(
+          "pose",
+          [](const WholeMap& self) {
+            std::vector<double> covariance;
+            for (std::size_t i = 0; i < 3; i++) covariance.insert(covariance.end(), self.covariance[i], self.covariance[i] + 3);
+            return std::tuple(made_numbers({self.mean.begin(), self.mean.begin() + 3}),
+                              made<double, nb::ndim<2>>(std::move(covariance), {3, 3}));
+          },
+          "Copy mean (3,) and covariance (3, 3) of the pose.")
+      .def(
+          "joined",
+          [](const WholeMap& self, const Ids& ids, const Numbers& mean, const Table& covariance) {
+            WholeMap joined;
+            const maps::Fault fault = maps::join(self, bare_submap_of(ids, mean, covariance), joined);
+            return std::tuple(fault == maps::Fault::NONE ? std::move(joined) : self, int(fault));
+          },
+          "ids"_a.noconvert(), "mean"_a, "covariance"_a,
+          "Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.\n\n"
+          "Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map\n"
+          "is as it was.")
+      .def(
+          "end_pose",
+          [](const WholeMap& self, const Ids& ids, const Numbers& mean, const Table& covariance, double gate) {
+            const maps::TiedPose at = maps::end_pose(self, submap_of(ids, mean, covariance), gate);
+            return std::tuple(made_numbers({at.pose.begin(), at.pose.end()}),
+                              made<double, nb::ndim<2>>({at.covariance.begin(), at.covariance.end()}, {3, 3}), at.known,
+                              at.refused, int(at.fault));
+          },
+          "ids"_a.noconvert(), "mean"_a, "covariance"_a, "gate"_a,
+          "Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.\n\n"
+          "Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as\n"
+          "of `joined`, 2 where a single landmark's innovation is singular.");
+  m.def(
+      "corrected",
+      [](const Numbers& mean, const Table& covariance, double factor, const Table& sensitivity, const Table& errors) {
+        const std::size_t n = mean.size(), k = errors.shape(0);
+        check(covariance.shape(0) == n && covariance.shape(1) == n, "covariance must be (n, n) of a mean of n numbers");
+        check(errors.shape(1) == 2 && sensitivity.shape(0) == k && (k == 0 || sensitivity.shape(1) == n),
+              "errors must be (k, 2), sensitivity (k, n)");
+        static_assert(sizeof(maps::SharedError) == 2 * sizeof(double));
+        std::vector<double> shifted(mean.data(), mean.data() + n);
+        dense::Matrix total(matrix_of(covariance));
+        maps::correct(shifted, total.view(), factor, {reinterpret_cast<const maps::SharedError*>(errors.data()), k},
+                      matrix_of(sensitivity));
+        return std::tuple(made_numbers(std::move(shifted)), made_matrix(std::move(total)));
+      },
+      "mean"_a, "covariance"_a, "factor"_a, "sensitivity"_a, "errors"_a,
+      "Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).");
+  nb::class_<Chain>(m, "Chain", "A prior and the submaps after it, each beginning at the end of the one before.")
+      .def("__init__", [](Chain* self, const WholeMap& prior) { new (self) Chain(prior.view()); }, "prior"_a)
+      .def(
+          "append",
+          [](Chain& self, const Ids& ids, const Numbers& mean, const Table& covariance) {
+            self.append(bare_submap_of(ids, mean, covariance));
+          },
+          "ids"_a.noconvert(), "mean"_a, "covariance"_a, "Append the next submap, without pose nodes.")
+      .def("solve", &Chain::solve, "iterations"_a, "tolerance"_a,
+           "Minimise the squares over all poses and landmarks by damped Gauss-Newton.\n\n"
+           "tolerance: the largest change of a number, of an undamped step, at which the iterations stop.");
+  nb::class_<ChainSolution>(m, "ChainSolution", "The least-squares solution of a prior and the submaps after it.")
+      .def_ro("map", &ChainSolution::map, "The last end pose and all landmarks.")
+      .def_ro("cost", &ChainSolution::cost, "Chi-squared of all maps, in `dof` degrees of freedom.")
+      .def_ro("dof", &ChainSolution::dof)
+      .def_prop_ro("known", [](const ChainSolution& self) { return Places{self.known}; },
+                   "For each submap, the number of its landmarks that another map has, too.")
+      .def_prop_ro("landmark_chi2",
+                   [](ChainSolution& self) { return View1(self.landmark_chi2.data(), {self.landmark_chi2.size()}, nb::find(self)); },
+                   "Chi-squared of each landmark of the submaps by its own covariance.")
+      .def_prop_ro("fault", [](const ChainSolution& self) { return int(self.fault); },
+                   "0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.")
+      .def_ro("at", &ChainSolution::at, "The map without covariance; 0 is the prior.");
+}
+
+}  // namespace teamslam::binding
