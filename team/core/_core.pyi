@@ -347,6 +347,328 @@ def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
 def tangent(heading: float) -> NDArray[numpy.float64]:
     """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
 
+class NotPositiveDefiniteError(ValueError):
+    """
+    A pivot of the factorisation is not positive: the block `variable` is undetermined.
+    """
+
+    variable: int = -1
+
+class Pattern:
+    """
+    The stored blocks of the lower triangle of a symmetric matrix, and their places in its factor.
+
+    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1] is
+    block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block.
+    The numbers of a matrix are one flat array: block e row by row from value_start[e] on, diagonal
+    blocks as full squares. Each property makes a new array.
+    """
+
+    def __init__(self, sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> None:
+        """
+        Analyse a pattern: order of elimination, structure of the factor. Raises ValueError for no pattern.
+        """
+
+    @property
+    def sizes(self) -> NDArray[numpy.int64]:
+        """Unknowns of each variable."""
+
+    @property
+    def offset(self) -> NDArray[numpy.int64]:
+        """
+        Index of each variable's first unknown; the last one is the number of unknowns.
+        """
+
+    @property
+    def column_start(self) -> NDArray[numpy.int64]:
+        """
+        Index of each column's first entry; the last one is the number of entries.
+        """
+
+    @property
+    def rows(self) -> NDArray[numpy.int64]:
+        """Row of each entry."""
+
+    @property
+    def columns(self) -> NDArray[numpy.int64]:
+        """Column of each entry."""
+
+    @property
+    def value_start(self) -> NDArray[numpy.int64]:
+        """Index of each entry's first number; the last one is the total length."""
+
+    @property
+    def diagonal(self) -> NDArray[numpy.int64]:
+        """Indices of the diagonal among the numbers of a matrix."""
+
+    @property
+    def panels(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64]]:
+        """Number of columns and of rows of each dense panel of the factor."""
+
+    @property
+    def has_big_panel(self) -> bool:
+        """Whether a panel is factorised by blocks."""
+
+    def block(self, values: NDArray[numpy.float64], row: int, column: int) -> NDArray[numpy.float64]:
+        """
+        Block (row, column) of a symmetric matrix on this pattern; zero where none is stored.
+        """
+
+    def quadratic(self, values: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> float:
+        """Compute xᵀ A x of a matrix on this pattern."""
+
+class Cholesky:
+    """
+    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
+    """
+
+    def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
+        """
+        Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
+        rounding noise of its diagonal entry counts as zero.
+        """
+
+    def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+        """Solve A X = right, (n,) or (n, k)."""
+
+    def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute columns of A⁻¹, (n, k): the covariance of all unknowns with some.
+        """
+
+    def inverse_block(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.
+        """
+
+    def selected_inverse(self) -> NDArray[numpy.float64]:
+        """
+        Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
+        """
+
+def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
+    """
+    Find the elimination order of a pattern's variables by minimum degree, in postorder.
+
+    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
+    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
+    """
+
+class SubmapFactor:
+    """
+    A submap as a factor between its start pose, its other poses, its landmarks and its biases.
+
+    mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).
+    sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with
+    which the bias moves it, 0 or 1; -1 for none. A state is additive; `at` has the index in it of the
+    first number of each member.
+    """
+
+    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> None: ...
+
+    def with_errors(self, sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> SubmapFactor:
+        """Make the same submap with other biases."""
+
+    def normal(self, state: NDArray[numpy.float64], at: NDArray[numpy.int64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
+        """Compute JᵀP⁻¹J, JᵀP⁻¹r and χ² = rᵀP⁻¹r over the members."""
+
+    def at_joined_ranges(self, state: NDArray[numpy.float64], at: NDArray[numpy.int64]) -> SubmapFactor:
+        """
+        Make the same submap with its noise at the ranges in a state, for errors proportional to the range.
+        """
+
+    def discounted(self, weights: NDArray[numpy.float64]) -> SubmapFactor:
+        """
+        Make the same submap with each landmark's own covariance enlarged by its weight: P + blkdiag(0, (1/w - 1) P_ll).
+        """
+
+    @property
+    def information(self) -> NDArray[numpy.float64]:
+        """P⁻¹."""
+
+    @property
+    def sensitivity(self) -> NDArray[numpy.float64]:
+        """∂mean/∂b, a row per bias."""
+
+    @property
+    def landmarks(self) -> NDArray[numpy.float64]:
+        """Each landmark's own covariance (xx, xy, yy)."""
+
+LARGEST_RATIO: float
+
+def linearise_sighting(observer: NDArray[numpy.float64], teammate: NDArray[numpy.float64], measurement: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute the residual of an inter-robot measurement (range, bearing), and its Jacobian over both poses.
+    """
+
+class Quadratic:
+    """
+    Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,
+    over some nodes of a graph, ascending, none of them fixed.
+    """
+
+    def __init__(self, nodes: NDArray[numpy.int64], at: NDArray[numpy.float64], headings: NDArray[numpy.bool_], information: NDArray[numpy.float64], slope: NDArray[numpy.float64], cost: float) -> None: ...
+
+def add_product(a: NDArray[numpy.float64], b: NDArray[numpy.float64], c: NDArray[numpy.float64], upper: bool = False, lower: bool = False) -> None:
+    """
+    Add A B to the first rows and columns of C, in place; each entry adds its terms in order.
+
+    upper: only the upper triangle of the square A B is required, the rest of C may change or not. lower: B is
+    lower triangular, entries above its diagonal count as zero.
+    """
+
+def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.
+    """
+
+class SubmapGraph:
+    """
+    The factor graph of one frame, independent of the state.
+
+    offset: of each node's first number in the state, and the state's length. fixed: nodes that are
+    constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,
+    measurement, information). priors: (node, mean, information, whether it is of one robot's bias).
+    Raises ValueError where a factor does not fit its nodes.
+    """
+
+    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[int, NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
+
+    @property
+    def pattern(self) -> Pattern:
+        """
+        Blocks of the normal equations, a variable per node, and their places in the factor.
+        """
+
+    def landmark_chi2(self, state: NDArray[numpy.float64], covariance_factor: float) -> NDArray[numpy.float64]:
+        """
+        Compute r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap.
+        """
+
+class Estimate:
+    """
+    A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
+
+    scale, sighting_scale: the robust c of each submap and inter-robot measurement. robust_c: their
+    final one; None for least squares. The arrays are in the graph's order. What is computed is kept.
+    """
+
+    def __init__(self, graph: SubmapGraph, state: NDArray[numpy.float64], scale: NDArray[numpy.float64], sighting_scale: NDArray[numpy.float64], robust_c: float | None, landmark_gate: float, covariance_factor: float, joined_ranges: bool) -> None: ...
+
+    @property
+    def landmark_weights(self) -> NDArray[numpy.float64]:
+        """
+        Weight of each landmark of each submap: 1 up to its gate or without a robust loss.
+        """
+
+    @property
+    def dimensions(self) -> NDArray[numpy.float64]:
+        """
+        Dimension of each submap, a discounted landmark counting by its weight.
+        """
+
+    @property
+    def chi2(self) -> NDArray[numpy.float64]:
+        """rᵀ(f P)⁻¹r of each submap, with discounted landmarks."""
+
+    @property
+    def whole_chi2(self) -> NDArray[numpy.float64]:
+        """rᵀ(f P)⁻¹r of each submap, without discounting."""
+
+    @property
+    def counted_chi2(self) -> NDArray[numpy.float64]:
+        """χ² of each submap in which each landmark's share w χ² counts w times."""
+
+    @property
+    def weights(self) -> NDArray[numpy.float64]:
+        """Robust weight of each submap."""
+
+    @property
+    def sighting_chi2(self) -> NDArray[numpy.float64]:
+        """rᵀR⁻¹r of each inter-robot measurement."""
+
+    @property
+    def sighting_weights(self) -> NDArray[numpy.float64]:
+        """Robust weight of each inter-robot measurement."""
+
+    @property
+    def prior_chi2(self) -> NDArray[numpy.float64]:
+        """χ² of each prior."""
+
+    @property
+    def prior_weights(self) -> NDArray[numpy.float64]:
+        """
+        Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
+        """
+
+    @property
+    def cost(self) -> float:
+        """The minimised cost, at these robust scales."""
+
+    def cost_of(self, other: Estimate) -> float:
+        """
+        Evaluate Σ w χ² of another state with the weights and noise of this one, which a step lowers.
+        """
+
+    @property
+    def normal_equations(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.
+        """
+
+    @property
+    def gradient(self) -> NDArray[numpy.float64]:
+        """Half the gradient, Σ w JᵀP⁻¹r."""
+
+    @property
+    def posterior(self) -> Cholesky:
+        """The Cholesky factor of A. Raises NotPositiveDefiniteError."""
+
+    @property
+    def step(self) -> NDArray[numpy.float64]:
+        """The full step, -A⁻¹g."""
+
+    @property
+    def squared_length(self) -> float:
+        """The full step's squared length in standard deviations, gᵀA⁻¹g."""
+
+    @property
+    def selected_covariance(self) -> NDArray[numpy.float64]:
+        """
+        Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.
+        """
+
+    @property
+    def boundary_covariance(self) -> NDArray[numpy.float64]:
+        """The joint covariance of the condensed factor's nodes."""
+
+    def take_step(self, damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
+        """
+        Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a more
+        damped one. Returns the next state, the next damping and the full step's largest change; where no damping
+        helps the state is None, the damping infinite and the change that of the first step.
+        """
+
+    @property
+    def explained(self) -> NDArray[numpy.float64]:
+        """
+        tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.
+        """
+
+    @property
+    def explained_by_sightings(self) -> NDArray[numpy.float64]:
+        """tr(JᵀR⁻¹J Σ) of each inter-robot measurement."""
+
+    @property
+    def explained_by_priors(self) -> NDArray[numpy.float64]:
+        """tr(P⁻¹ Σ) of each prior."""
+
+    def quadratic(self, nodes: NDArray[numpy.int64], submaps: NDArray[numpy.bool_], sightings: NDArray[numpy.bool_], priors: NDArray[numpy.bool_]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
+        """
+        Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,
+        ascending; other nodes are constants.
+        """
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 

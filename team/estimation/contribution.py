@@ -1,12 +1,16 @@
 """The contents of the team's map: submaps with their place in the set, and initial poses."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
+from team import core
+from team.config import Bias
 from team.estimation.gaussian import information
 from team.estimation.submap import LocalMap, Unnamed
 
@@ -14,6 +18,10 @@ Stream: TypeAlias = tuple[str, int]
 """(robot, incarnation): one unbroken life of a robot's sensor stream."""
 Key: TypeAlias = tuple[int, str, int, int]
 """(end stamp, robot, incarnation, sequence): a submap's place in the canonical order."""
+RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
+    {"bearing": 1, "range_offset": 0, "range_scale": 1, "forward_scale": -1}
+)
+"""The power of a landmark's range with which each bias moves it; -1: it moves none."""
 UNIX_S = 1e9
 """Team times from here on [s] are Unix times (2001)."""
 
@@ -77,11 +85,18 @@ class Contribution:
         return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
 
     @cached_property
-    def blocks(self) -> Float[np.ndarray, "L 3"]:
-        """Each landmark's own covariance (xx, xy, yy)."""
-        P, n = self.local.covariance, len(self.local.mean)
-        x = np.arange(n - 2 * len(self.local.ids), n, 2)
-        return np.column_stack([P[x, x], P[x, x + 1], P[x + 1, x + 1]])
+    def factor(self) -> core.SubmapFactor:
+        """The submap as a factor of a graph. Raises NotACovarianceError that names the submap."""
+        local = self.local
+        P, n = local.covariance, len(local.mean)
+        x = np.arange(n - 2 * len(local.ids), n, 2)
+        return core.SubmapFactor(
+            local.mean,
+            self.information,
+            np.column_stack([P[x, x], P[x, x + 1], P[x + 1, x + 1]]),
+            local.sensitivity,
+            np.array([RANGE_POWER[each] for each in local.biases], np.int64),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -228,8 +228,10 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 void bind_checks(nb::module_& m);
 void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
+void bind_graph(nb::module_& m);
 void bind_maps(nb::module_& m);
 void bind_se2(nb::module_& m);
+void bind_sparse(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding

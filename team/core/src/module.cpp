@@ -17,5 +17,7 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_checks(m);
   binding::bind_dense(m);
   binding::bind_se2(m);
+  binding::bind_sparse(m);
+  binding::bind_graph(m);
   binding::bind_window(m);
 }

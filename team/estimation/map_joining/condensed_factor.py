@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.estimation import dense
 from team.estimation.contribution import Stream
-from team.estimation.map_joining.resting_kernel import packed_of, unpacked_of
+from team.estimation.map_joining.upper_triangle import packed_of, unpacked_of
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -145,8 +146,6 @@ def nobody_rests(numbers: int) -> Resting:
 class Condensed:
     """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
 
-    Its methods take the indices in the state of the numbers of these nodes (`Graph.boundary`).
-
     headings: which of its numbers are headings. submaps: number of submaps that it replaces.
     redundancy: number of measured quantities less that of eliminated unknowns. resting: landmarks
     given these nodes; None: there have never been any.
@@ -169,18 +168,18 @@ class Condensed:
         return self if self.resting is None else replace(self, resting=self.resting.packed)
 
     def moved(self, state: Values, numbers: Indices) -> Values:
-        """Difference d = state − at, headings wrapped."""
+        """Difference d = state − at, headings wrapped; numbers: `Graph.boundary`."""
         d: Values = state[numbers] - self.at
         turn = d[self.headings]
         d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
         return d
 
-    def at_state(self, state: Values, numbers: Indices) -> tuple[float, Values]:
-        """Evaluate cost(x) and half of its derivative, slope + information d."""
-        d = self.moved(state, numbers)
-        pulled = dense.product(self.information, d)
-        cost = self.cost + float(2.0 * (dense.product(self.slope, d)) + dense.product(d, pulled))
-        return cost, self.slope + pulled
+    @cached_property
+    def quadratic(self) -> core.Quadratic:
+        """The factor, to compute with."""
+        return core.Quadratic(
+            self.nodes, self.at, self.headings, self.information, self.slope, self.cost
+        )
 
 
 def places(offset: Indices, nodes: Indices) -> Indices:

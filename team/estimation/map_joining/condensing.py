@@ -231,9 +231,10 @@ def _departed(
     now = terms(island)
     believed = dict(before.believed)
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
+    is_believed = island.estimate.landmark_weights >= BELIEVED
     for f in np.flatnonzero(leaving):
-        begin, end = graph.factors.block_start[f : f + 2]
-        nodes = graph.submaps[f].landmarks[island.landmark_weight[begin:end] >= BELIEVED]
+        begin, end = graph.landmark_start[f : f + 2]
+        nodes = graph.submaps[f].landmarks[is_believed[begin:end]]
         for id_ in (id_of[node] for node in nodes.tolist()):
             believed[id_] = believed.get(id_, 0) + 1
     for node in given_up.tolist():

@@ -30,7 +30,6 @@ from team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     settled,
 )
-from team.estimation.map_joining.joining_kernel import landmark_chi2
 from team.estimation.map_joining.merging import ages
 from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from team.estimation.map_joining.whole_map import end_pose, without
@@ -207,9 +206,8 @@ def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings
 
 
 def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    factors = island.graph.factors
-    beyond = landmark_chi2(island.state, island.graph.offset, factors, 1.0) > GATE
-    return np.split(beyond, factors.block_start[1:-1])[1:]
+    beyond = island.graph.factors.landmark_chi2(island.state, 1.0) > GATE
+    return np.split(beyond, island.graph.landmark_start[1:-1])[1:]
 
 
 def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:

@@ -8,44 +8,32 @@ that a true loop closure is not taken for an outlier before the chain has adapte
 
 With a robust loss each landmark of a submap has a weight of its own as well, so that a mistaken
 landmark does not break the robot's chain: beyond the gate g its χ² counts g (1 + log(χ²/g)), whose
-slope, the weight, is g/χ². The weight enters as additional variance of that landmark alone
-(`joining_kernel.discounted_information`).
+slope, the weight, is g/χ². The weight enters as additional variance of that landmark alone.
+`core.Estimate` computes all of these.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 
 from team import core
 from team.association import DEFAULT_PROFILE, AssociationProfile
 from team.config import Bias
 from team.estimation import dense
-from team.estimation.dense_kernel import add_product
 from team.estimation.gaussian import NotACovarianceError
-from team.estimation.map_joining import inter_robot_kernel as sightings
-from team.estimation.map_joining import joining_kernel as kernel
-from team.estimation.map_joining.condensing_kernel import add_blocks
 from team.estimation.map_joining.least_squares import (
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    ROUNDING,
-    SHARES,
     STUCK,
     Values,
     robust_scale,
 )
-from team.estimation.map_joining.priors_kernel import add_priors, prior_terms
-from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
-from team.estimation.sparse_cholesky import sparse
 
-LEAST_WEIGHT = 1e-6
-"""Lower bound of a landmark's weight, so that each landmark stays determined."""
 STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
 tenth of the shift by condensing (docs/decisions/25).
@@ -70,8 +58,8 @@ class JoinSettings:
     submaps share. common_bias_sigma: the same for errors that all robots share, in addition;
     "marker": the share of the range by which all robots measure one landmark too far.
     joined_ranges: whether errors of ranges are proportional to the range in the joined map
-    (`joining_kernel.with_joined_ranges`). landmark_sigma: standard deviation [m], per direction, of
-    the measured point, the same for all robots, about the landmark's place: part of a map's
+    (`core.SubmapFactor.at_joined_ranges`). landmark_sigma: standard deviation [m], per direction,
+    of the measured point, the same for all robots, about the landmark's place: part of a map's
     covariance, not of the measurements' weights.
     """
 
@@ -133,231 +121,37 @@ class Island:
         return robust_scale(age, settings.robust_c, settings.robust_start, settings.robust_decay)
 
     @cached_property
-    def _submaps(self) -> kernel.SubmapFactors:
-        factors = self.graph.factors
-        if not self.settings.joined_ranges:
-            return factors
-        return kernel.with_joined_ranges(self.state, self.graph.offset, factors)
-
-    @cached_property
-    def _landmark_chi2_and_gate(self) -> tuple[Values, Values]:
-        factors, settings = self._submaps, self.settings
-        if settings.robust_c is None:
-            return np.zeros(len(factors.block)), np.ones(len(factors.block))
-        chi2 = kernel.landmark_chi2(
-            self.state, self.graph.offset, factors, settings.covariance_factor
-        )
-        gate = settings.landmark_gate * core.squared(self.scale / settings.robust_c)
-        return chi2, np.repeat(gate, np.diff(factors.block_start))
-
-    @cached_property
-    def landmark_weight(self) -> Float[np.ndarray, " B"]:
-        """Weight of each landmark of each submap: 1 up to its gate or without a robust loss."""
-        chi2, gate = self._landmark_chi2_and_gate
-        weight, beyond = np.ones(len(chi2)), chi2 > gate
-        weight[beyond] = np.maximum(gate[beyond] / chi2[beyond], LEAST_WEIGHT)
-        return weight
-
-    @cached_property
-    def factors(self) -> kernel.SubmapFactors:
-        """The submaps with the covariances of discounted landmarks enlarged."""
-        return self._discounted(self.landmark_weight)
-
-    def _discounted(self, weight: Values) -> kernel.SubmapFactors:
-        factors = self._submaps
-        if (weight == 1.0).all():
-            return factors
-        return factors._replace(information=kernel.discounted_information(factors, weight))
-
-    @cached_property
-    def dimensions(self) -> Float[np.ndarray, " F"]:
-        """Dimension of each submap, a discounted landmark counting by its weight."""
-        factors = self.graph.factors
-        of = np.repeat(np.arange(len(self.graph.submaps)), np.diff(factors.block_start))
-        lost = np.bincount(of, 2.0 * (1.0 - self.landmark_weight), len(self.graph.submaps))
-        return self.graph.dimensions - lost.astype(np.float64)
-
-    @cached_property
-    def chi2(self) -> Float[np.ndarray, " F"]:
-        """rᵀ(f P)⁻¹r of each submap, with discounted landmarks."""
-        factor = self.settings.covariance_factor
-        return kernel.costs(self.state, self.graph.offset, self.factors, factor)
-
-    @cached_property
-    def whole_chi2(self) -> Float[np.ndarray, " F"]:
-        """rᵀ(f P)⁻¹r of each submap, without discounting."""
-        if self.factors is self._submaps:
-            return self.chi2
-        factor = self.settings.covariance_factor
-        return kernel.costs(self.state, self.graph.offset, self._submaps, factor)
-
-    @cached_property
-    def counted_chi2(self) -> Float[np.ndarray, " F"]:
-        """χ² of each submap in which each landmark's share w χ² counts w times.
-
-        `dimensions` counts its numbers by the same weight: the agreement test leaves out
-        down-weighted terms.
-        """
-        if self.factors is self._submaps:
-            return self.chi2
-        factors = self._discounted(core.squared(self.landmark_weight))
-        factor = self.settings.covariance_factor
-        return kernel.costs(self.state, self.graph.offset, factors, factor)
-
-    @property
-    def weight(self) -> Float[np.ndarray, " F"]:
-        """Robust weight of each submap, 1 without a robust loss."""
-        relative: Values = self.chi2 / (self.graph.dimensions * core.squared(self.scale))
-        return 1.0 / (1.0 + relative)
-
-    @cached_property
-    def sighting_chi2(self) -> Float[np.ndarray, " S"]:
-        """rᵀR⁻¹r of each inter-robot measurement."""
-        return sightings.sighting_costs(self.state, self.graph.offset, self.graph.sighting_factors)
-
-    @property
-    def sighting_weight(self) -> Float[np.ndarray, " S"]:
-        """Robust weight of each inter-robot measurement, 1 without a robust loss."""
-        return 1.0 / (1.0 + self.sighting_chi2 / (2.0 * core.squared(self.sighting_scale)))
-
-    @cached_property
-    def prior_chi2(self) -> Float[np.ndarray, " priors"]:
-        """χ² of each prior, of an initial pose or of a bias."""
-        return self._prior_terms[1]
-
-    @cached_property
-    def _prior_terms(self) -> tuple[Float[np.ndarray, "priors 3"], Values]:
-        return prior_terms(self.state, self.graph.prior_factors)
-
-    def prior_slope(self, k: int) -> Values:
-        """P⁻¹r of a prior."""
-        return self._prior_terms[0][k, : self.graph.prior_factors.size[k]]
-
-    @cached_property
-    def prior_weight(self) -> Float[np.ndarray, " priors"]:
-        """Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
-
-        A sensor changed since its calibration is one robot's: its prior is an outlier, and must not
-        draw the other robots' biases away through the common errors. Markers do not change; the
-        error of a marker seen from one side only is distinguished from its landmark's position by
-        its prior alone.
-        """
-        if self.settings.robust_c is None:
-            return np.ones(len(self.graph.priors))
-        of_bias = self.graph.of_bias
-        weight: Values = 1.0 / (1.0 + self.prior_chi2 / core.squared(self.settings.robust_c))
-        return np.where(of_bias, weight, 1.0)
-
-    def cost_of(self, other: "Island") -> float:
-        """Evaluate Σ w χ² of another state with the weights and noise of this one, which an
-        iteration lowers.
-
-        The robust cost then falls too, since each loss lies below its parabola.
-        """
+    def estimate(self) -> core.Estimate:
+        """Costs, weights and normal equations at this state. Raises NotACovarianceError."""
         settings = self.settings
-        if other is self or (settings.robust_c is None and not settings.joined_ranges):
-            costs = other.chi2
-        else:
-            factor = settings.covariance_factor
-            costs = kernel.costs(other.state, self.graph.offset, self.factors, factor)
-        chi2 = float((self.weight * costs).sum())
-        seen = float((self.sighting_weight * other.sighting_chi2).sum())
-        seen += float((self.prior_weight * other.prior_chi2).sum())
-        return chi2 + seen + other.condensed_terms[0]
+        return core.Estimate(
+            self.graph.factors,
+            self.state,
+            self.scale,
+            self.sighting_scale,
+            settings.robust_c,
+            settings.landmark_gate,
+            settings.covariance_factor,
+            settings.joined_ranges,
+        )
 
-    @cached_property
+    @property
     def cost(self) -> float:
         """The minimised cost, at the present robust scales."""
-        graph = self.graph
-        sizes = len(self.age), len(self.sighting_age), len(graph.priors)
-        submaps, seen, priors = (np.ones(size, np.bool_) for size in sizes)
-        return self.cost_of_factors(submaps, seen, priors) + self.condensed_terms[0]
+        return self.estimate.cost
 
     @cached_property
-    def condensed_terms(self) -> tuple[float, Values]:
-        """Cost and half the gradient of the condensed factor; zero and none without one."""
-        old = self.graph.condensed
-        return (0.0, np.zeros(0)) if old is None else old.at_state(self.state, self.graph.boundary)
-
-    def cost_of_factors(
-        self,
-        submaps: Bool[np.ndarray, " F"],
-        sightings: Bool[np.ndarray, " S"],
-        priors: Bool[np.ndarray, " priors"],
-    ) -> float:
-        """Sum the cost of the marked factors."""
-        if self.settings.robust_c is None:
-            chi2 = float(self.chi2[submaps].sum() + self.prior_chi2[priors].sum())
-            return chi2 + float(self.sighting_chi2[sightings].sum())
-        scale = (core.squared(self.scale) * self.graph.dimensions)[submaps]
-        cost = float((scale * core.log1p(self.chi2[submaps] / scale)).sum())
-        cost += self._prior_cost(priors)
-        own, gate = self._landmark_chi2_and_gate
-        of = np.repeat(submaps, np.diff(self.graph.factors.block_start))
-        beyond = (own > gate) & of
-        cost += float((gate[beyond] * core.log(own[beyond] / gate[beyond])).sum())
-        scale = 2.0 * core.squared(self.sighting_scale[sightings])
-        return cost + float((scale * core.log1p(self.sighting_chi2[sightings] / scale)).sum())
-
-    def _prior_cost(self, chosen: Bool[np.ndarray, " priors"]) -> float:
-        c2 = 1.0 if self.settings.robust_c is None else core.squared(self.settings.robust_c)
-        of_bias = (self.prior_weight < 1.0) & chosen
-        robust = float((c2 * core.log1p(self.prior_chi2[of_bias] / c2)).sum())
-        return robust + float(self.prior_chi2[chosen & ~of_bias].sum())
-
-    @cached_property
-    def normal_equations(self) -> tuple[Values, Values]:
-        """A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w
-        JᵀP⁻¹r.
-        """
-        graph, pattern = self.graph, self.graph.pattern
-        values, gradient, _ = kernel.normal_equations(
-            self.state,
-            graph.offset,
-            graph.fixed,
-            self.factors,
-            self.settings.covariance_factor,
-            self.scale,
-            graph.entry,
-            pattern.column_start,
-            pattern.value_start,
-        )
-        sightings.add_sightings(
-            values,
-            gradient,
-            self.state,
-            graph.offset,
-            graph.fixed,
-            graph.sighting_factors,
-            self.sighting_scale,
-            graph.entry,
-            pattern.value_start,
-        )
-        if graph.condensed is not None:
-            old = graph.condensed
-            gradient[graph.boundary] += self.condensed_terms[1]
-            sizes = np.diff(graph.offset)[old.nodes]
-            add_blocks(values, old.information, sizes, graph.condensed_entry, pattern.value_start)
-        at = pattern.value_start[pattern.column_start[graph.prior_factors.node]]
-        slopes = self._prior_terms[0]
-        add_priors(values, gradient, graph.prior_factors, slopes, self.prior_weight, at)
-        return values, gradient
-
-    @cached_property
-    def step(self) -> Values:
-        """The full step, −A⁻¹g."""
-        return -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
-
-    @cached_property
-    def posterior(self) -> sparse.Cholesky:
+    def posterior(self) -> core.Cholesky:
         """Cholesky factor of the information matrix at this state."""
-        return self.factorised(self.normal_equations[0])
+        with self.determined():
+            return self.estimate.posterior
 
-    def factorised(self, values: Values) -> sparse.Cholesky:
-        """Factorise a matrix in the layout of the graph's pattern."""
+    @contextmanager
+    def determined(self) -> Iterator[None]:
+        """Raise NotDeterminedError that names the node, where a matrix cannot be factored."""
         try:
-            return sparse.factorised(self.graph.analysis, values)
-        except sparse.NotPositiveDefiniteError as error:
+            yield
+        except core.NotPositiveDefiniteError as error:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
     def moved(self, step: Values, older: int = 1) -> "Island":
@@ -373,7 +167,8 @@ class Island:
     @cached_property
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
-        return sparse.selected_inverse(self.posterior)
+        with self.determined():
+            return self.estimate.selected_covariance
 
     @cached_property
     def resting_points(self) -> Float[np.ndarray, "L 2"]:
@@ -388,15 +183,8 @@ class Island:
     @cached_property
     def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
         """Joint covariance of the condensed factor's nodes, if there is one."""
-        graph, old = self.graph, self.graph.condensed
-        assert old is not None
-        return symmetric_of(
-            self.selected_covariance,
-            np.diff(graph.offset)[old.nodes],
-            graph.condensed_entry,
-            graph.pattern.value_start,
-            len(old.at),
-        )
+        with self.determined():
+            return self.estimate.boundary_covariance
 
     @cached_property
     def resting_spread(self) -> Float[np.ndarray, "r n"]:
@@ -408,7 +196,7 @@ class Island:
         assert old.resting is not None
         spread = np.zeros(old.resting.gain.shape)
         root = dense.cholesky(self.boundary_covariance)
-        add_product(old.resting.gain, root, spread, (0, 0), False, True)
+        core.add_product(old.resting.gain, root, spread, lower=True)
         return spread
 
     @cached_property
@@ -417,7 +205,7 @@ class Island:
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
-        return own_blocks(old.resting.upper, self.resting_spread)
+        return core.own_blocks(old.resting.upper, self.resting_spread)
 
 
 def aged(island: Island, iterations: int | None) -> Island:
@@ -437,17 +225,15 @@ def final_cost(island: Island) -> float:
 def is_solvable(island: Island) -> bool:
     """Whether the island has a solution: finite numbers, every unknown determined.
 
-    The pivots of the factorisation are judged by their diagonal entries (`sparse_kernel`), so units
+    The pivots of the factorisation are judged by their diagonal entries (`core.Cholesky`), so units
     and the size of covariances have no influence.
     """
     try:
         with np.errstate(all="ignore"):
-            factor, cost = island.posterior, island.cost
+            _, cost = island.posterior, island.cost
     except UNSOLVABLE:
         return False
-    return bool(np.isfinite(island.state).all() and np.isfinite(factor.panels).all()) and (
-        math.isfinite(cost)
-    )
+    return bool(np.isfinite(island.state).all()) and math.isfinite(cost)
 
 
 def iterated(island: Island) -> Island:
@@ -468,8 +254,8 @@ def iterated(island: Island) -> Island:
 
 def _stands_still(island: Island) -> bool:
     """Whether a full step is shorter than STILL: gᵀA⁻¹g bounds how far any number moves."""
-    squared = -float(dense.product(island.normal_equations[1], island.step))
-    return squared <= STILL * len(island.graph.submaps)
+    with island.determined():
+        return island.estimate.squared_length <= STILL * len(island.graph.submaps)
 
 
 class Iteration(NamedTuple):
@@ -492,28 +278,12 @@ def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
     of it; else a more damped one. Where no damping helps the island is returned unchanged, with the
     change of the first step.
     """
-    values, gradient = island.normal_equations
-    before = island.cost_of(island)
-    refused = None
-    while damping < MOST_DAMPING:
-        if damping:
-            damped = values.copy()
-            damped[island.graph.pattern.diagonal] *= 1.0 + damping
-            step = -sparse.solved(island.factorised(damped), gradient[:, None])[:, 0]
-        else:
-            step = island.step
-        for share in (1.0,) if damping else SHARES:
-            moved = island.moved(share * step)
-            if island.cost_of(moved) <= before * (1.0 + ROUNDING) + ROUNDING:
-                eased = damping / 10.0 if damping > LEAST_DAMPING else 0.0
-                return moved, Iteration(eased, _largest(step))
-        refused = _largest(step) if refused is None else refused
-        damping = max(10.0 * damping, LEAST_DAMPING)
-    return island, Iteration(STUCK, math.inf if refused is None else refused)
-
-
-def _largest(step: Values) -> float:
-    return float(np.abs(step).max(initial=0.0))
+    with island.determined():
+        state, damping, change = island.estimate.take_step(damping)
+    if state is None:
+        return island, Iteration(STUCK, change)
+    older = replace(aged(island, 1), state=state)
+    return older, Iteration(damping, change)
 
 
 def _eased(damping: float) -> float:
@@ -552,10 +322,10 @@ def solved_with_fixed(
     """
     missing = by
     for _ in range(iterations):
-        gradient = island.normal_equations[1]
+        gradient = island.estimate.gradient
         right = np.column_stack([-gradient, np.zeros(len(island.state))])
         right[unknown, 1] = 1.0
-        p, q = sparse.solved(island.posterior, right).T
+        p, q = island.posterior.solve(right).T
         force = (missing - p[unknown]) / q[unknown]
         step = p + force * q
         squared = float(force * step[unknown] - dense.product(gradient, step))
@@ -570,7 +340,7 @@ def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
-    covariance = sparse.inverse_block(island.posterior, unknowns)
+    covariance = island.posterior.inverse_block(unknowns)
     constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
     covariance[constant] = 0.0
     covariance[:, constant] = 0.0

@@ -14,11 +14,9 @@ from jaxtyping import Float, UInt32
 from team.config import UNNAMED, Bias
 from team.estimation.contribution import Stream
 from team.estimation.gaussian import deviation
-from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
 from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from team.estimation.map_joining.inter_robot_kernel import explained_by_sightings
 from team.estimation.map_joining.joining import Fold
 from team.estimation.map_joining.landmark_view import blocks_of, joint, joints, known, points_of
 
@@ -138,7 +136,9 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
     if submaps <= 1 and unnamed <= 1:
         return known(island)
     nodes = np.concatenate([each.landmarks for each in island.graph.submaps])
-    found, counts = np.unique(nodes[island.landmark_weight >= BELIEVED], return_counts=True)
+    found, counts = np.unique(
+        nodes[island.estimate.landmark_weights >= BELIEVED], return_counts=True
+    )
     count_of = dict(zip(found.tolist(), counts.tolist(), strict=True))
     old = island.graph.condensed
     before = {} if old is None else old.departed.believed
@@ -272,26 +272,19 @@ def terms(island: Island) -> Terms:
     """Evaluate the agreement of each factor of an island with the rest."""
     found = _TERMS.get(island)
     if found is None:
-        found = _TERMS[island] = _terms(island)
+        with island.determined():
+            found = _TERMS[island] = _terms(island)
     return found
 
 
 def _terms(island: Island) -> Terms:
     graph = island.graph
-    explained = kernel.explained(
-        island.state,
-        graph.offset,
-        island.factors,
-        island.settings.covariance_factor,
-        graph.entry,
-        graph.pattern.value_start,
-        island.selected_covariance,
-    )
-    weight = island.weight
-    taken = weight * explained
+    now = island.estimate
+    weight = now.weights
+    taken = weight * now.explained
     of = [each.contribution for each in graph.submaps]
-    whole, left = island.whole_chi2.tolist(), (graph.dimensions - taken).tolist()
-    counted = (weight * island.counted_chi2).tolist(), (island.dimensions - taken).tolist()
+    whole, left = now.whole_chi2.tolist(), (graph.dimensions - taken).tolist()
+    counted = (weight * now.counted_chi2).tolist(), (now.dimensions - taken).tolist()
     return Terms(
         [
             SubmapCost(each.stream, each.sequence, *rest)
@@ -328,24 +321,17 @@ def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
 def _own_marginal(
     island: Island, node: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
+    block = island.graph.pattern.block(island.selected_covariance, node, node)
     fixed = bool(island.graph.fixed[node])
     return _mean(island, node), np.zeros_like(block) if fixed else block
 
 
 def _sightings(island: Island) -> list[tuple[str, float, float]]:
     """(observer, w χ², dof) of each inter-robot measurement."""
-    graph, weight = island.graph, island.sighting_weight
-    explained = explained_by_sightings(
-        island.state,
-        graph.offset,
-        graph.sighting_factors,
-        graph.entry,
-        graph.pattern.value_start,
-        island.selected_covariance,
-    )
-    chi2, dof = weight * island.sighting_chi2, 2.0 - weight * explained
-    observers = [each.sighting.robot for each in graph.sightings]
+    now = island.estimate
+    weight = now.sighting_weights
+    chi2, dof = weight * now.sighting_chi2, 2.0 - weight * now.explained_by_sightings
+    observers = [each.sighting.robot for each in island.graph.sightings]
     return list(zip(observers, chi2.tolist(), dof.tolist(), strict=True))
 
 
@@ -357,14 +343,9 @@ def _priors(island: Island) -> list[tuple[str, float, float]]:
     robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
     robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}
     robots |= dict.fromkeys(graph.common.values(), min(graph.streams)[0])
-    factors, pattern = graph.prior_factors, graph.pattern
-    begin = pattern.value_start[pattern.column_start[factors.node]]
-    absorbed = factors.information[:, 0, 0] * island.selected_covariance[begin]
-    absorbed[graph.fixed[factors.node]] = 0.0
-    for k in np.flatnonzero(factors.size > 1).tolist():
-        prior = graph.priors[k]
-        absorbed[k] = np.sum(prior.information * _own_marginal(island, prior.node)[1])
-    weight = island.prior_weight
-    chi2, dof = weight * island.prior_chi2, factors.size - weight * absorbed
-    of = [robots[node] for node in factors.node.tolist()]
+    now = island.estimate
+    sizes = np.array([len(each.mean) for each in graph.priors], np.int64)
+    weight = now.prior_weights
+    chi2, dof = weight * now.prior_chi2, sizes - weight * now.explained_by_priors
+    of = [robots[each.node] for each in graph.priors]
     return list(zip(of, chi2.tolist(), dof.tolist(), strict=True))

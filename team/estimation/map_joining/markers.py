@@ -14,7 +14,7 @@ import numpy as np
 from team import core
 from team.config import UNNAMED
 from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.submap_graph import RANGE_POWER, CommonError, Joined, Prior
+from team.estimation.map_joining.submap_graph import CommonError, Joined, Prior
 
 
 def add_markers(island: Island) -> Island:
@@ -92,6 +92,5 @@ def _add_rows(
     return submap._replace(
         nodes=np.append(submap.nodes, [nodes[error] for error in errors]),
         biases=(*submap.biases, *errors),
-        range_power=np.append(submap.range_power, np.full(len(errors), RANGE_POWER["range_scale"])),
         sensitivity=np.concatenate((submap.sensitivity, rows)),
     )

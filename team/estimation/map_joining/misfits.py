@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 
 from team.config import UNNAMED
-from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining.gauss_newton import Island
 
 LEAST_SUBMAPS = 4
@@ -46,7 +45,7 @@ def worst_landmark(island: Island) -> Misfit | None:
     if not graph.submaps:
         return None
     factor = island.settings.covariance_factor
-    chi2 = kernel.landmark_chi2(island.state, graph.offset, graph.factors, factor)
+    chi2 = graph.factors.landmark_chi2(island.state, factor)
     nodes = np.concatenate([each.landmarks for each in graph.submaps])
     count = np.bincount(nodes, minlength=len(graph.fixed))
     total = np.bincount(nodes, chi2, minlength=len(graph.fixed))

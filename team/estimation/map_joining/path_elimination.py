@@ -12,12 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team.estimation import dense
 from team.estimation.contribution import Stream
 from team.estimation.map_joining.condensed_factor import places
-from team.estimation.map_joining.condensing_kernel import add_submaps
 from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.resting import split
 
 Indices = Int64[np.ndarray, " _"]
@@ -52,52 +49,7 @@ def quadratic(
     """Sum these factors and the condensed one to matrix A, half the gradient and the cost, over the
     union of their nodes.
     """
-    leaving, seen, prior = factors
-    graph, state = island.graph, island.state
-    sizes = np.diff(graph.offset)[union]
-    place = np.full(len(graph.fixed), -1, np.int64)
-    place[union] = np.cumsum(sizes) - sizes
-    total = int(sizes.sum())
-    H, g, cost = np.zeros((total, total)), np.zeros(total), 0.0
-    before = graph.condensed
-    if before is not None:
-        within = places(
-            np.concatenate([place[union], [total]]), np.searchsorted(union, before.nodes)
-        )
-        H[np.ix_(within, within)] += before.information
-        cost, slope = island.condensed_terms
-        g[within] += slope
-    weights = island.weight / island.settings.covariance_factor
-    at_work = np.flatnonzero(leaving)
-    add_submaps(H, g, place, state, graph.offset, island.factors, at_work, weights)
-    cost += island.cost_of_factors(leaving, seen, prior)
-    for s in np.flatnonzero(seen):
-        _add_sighting(H, g, place, island, int(s))
-    for k in np.flatnonzero(prior):
-        each, slope = graph.priors[k], island.prior_slope(int(k))
-        begin, weight = place[each.node], island.prior_weight[k]
-        end = begin + len(slope)
-        g[begin:end] += weight * slope
-        H[begin:end, begin:end] += weight * each.information
-    return H, g, cost
-
-
-def _add_sighting(H: Matrix, g: Values, place: Indices, island: Island, s: int) -> None:
-    graph, state = island.graph, island.state
-    sighting, *nodes = graph.sightings[s]
-    a, b = (int(graph.offset[node]) for node in nodes)
-    r, jacobian = sighting_residual(state[a : a + 3], state[b : b + 3], sighting.measurement)
-    weighted = island.sighting_weight[s] * sighting.information
-    blocks = [(place[node], jacobian[:, 3 * i : 3 * i + 3]) for i, node in enumerate(nodes)]
-    for row, left in blocks:
-        if row < 0:
-            continue
-        g[row : row + 3] += dense.product(left.T, dense.product(weighted, r))
-        for column, right in blocks:
-            if column >= 0:
-                H[row : row + 3, column : column + 3] += dense.product(
-                    dense.product(left.T, weighted), right
-                )
+    return island.estimate.quadratic(union, *factors)
 
 
 def without_paths(
@@ -151,7 +103,7 @@ def _of_run(
     graph = island.graph
     submaps = np.zeros(len(graph.submaps), np.bool_)
     submaps[run] = True
-    seen = path[graph.sighting_factors.nodes].any(axis=1)
+    seen = np.array([path[a] or path[b] for _, a, b in graph.sightings], np.bool_)
     priors = path[np.array([each.node for each in graph.priors], np.int64)]
     return MarkedFactors(submaps, among.sightings & seen, among.priors & priors)
 

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from team import core
 from team.estimation import dense
-from team.estimation.dense_kernel import add_product
 from team.estimation.map_joining.condensed_factor import Resting, places
 from team.estimation.map_joining.gauss_newton import Island
 from team.estimation.map_joining.landmark_view import resting_of
-from team.estimation.map_joining.resting_kernel import between, upper_of
 from team.estimation.map_joining.submap_graph import Graph, with_landmarks
+from team.estimation.map_joining.upper_triangle import between, upper_of
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -97,13 +97,13 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
         means = means + dense.product(before.gain, old.moved(island.state, graph.boundary))
     on_out = np.ascontiguousarray(gain[:, parts.out][:, at_rest])
     gain = np.ascontiguousarray(gain[:, ~parts.out])
-    add_product(on_out, np.ascontiguousarray(parts.gain[at_rest]), gain, (0, 0), False, False)
+    core.add_product(on_out, np.ascontiguousarray(parts.gain[at_rest]), gain)
     root = dense.forward(parts.factor, np.eye(len(at_rest))[:, at_rest])
     covariance = dense.product(root.T, root)
     spread = dense.product(on_out, covariance)
     n, total = len(means), len(means) + 2 * len(nodes)
     upper = upper_of(before.upper, np.arange(n), total)
-    add_product(spread, np.ascontiguousarray(on_out.T), upper, (0, 0), True, False)
+    core.add_product(spread, np.ascontiguousarray(on_out.T), upper, upper=True)
     upper[:n, n:] = spread[:, rests[at_rest]]
     upper[n:, n:] = covariance[np.ix_(rests[at_rest], rests[at_rest])]
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
@@ -136,9 +136,9 @@ def woken(island: Island, ids: Collection[int]) -> Island:
     information = np.block([[0.5 * (own + own.T), -weighted.T], [-weighted, precision]])
     cross = between(rest.upper, left, out)
     share = dense.product(cross, precision)
-    add_product(-share, np.ascontiguousarray(gain), remaining, (0, 0), False, False)
+    core.add_product(-share, np.ascontiguousarray(gain), remaining)
     upper = upper_of(rest.upper, left, len(left))
-    add_product(-share, np.ascontiguousarray(cross.T), upper, (0, 0), True, False)
+    core.add_product(-share, np.ascontiguousarray(cross.T), upper, upper=True)
     points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.boundary))
     grown, nodes = with_landmarks(graph, rest.ids[wakes].tolist())
     condensed = replace(

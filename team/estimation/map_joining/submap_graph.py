@@ -17,15 +17,18 @@ from jaxtyping import Bool, Float, Int64
 
 from team import core
 from team.config import UNNAMED, Bias
-from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
+from team.estimation.contribution import (
+    RANGE_POWER,
+    Contribution,
+    InitialPoseFactor,
+    Key,
+    Stream,
+    named,
+)
 from team.estimation.inter_robot import InterRobotFactor
 from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
-from team.estimation.map_joining.inter_robot_kernel import InterRobotFactors
-from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, block_pattern
 from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
-from team.estimation.map_joining.priors_kernel import PriorFactors
 from team.estimation.se2 import compose, transformed
-from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
@@ -40,12 +43,6 @@ which all robots measure that landmark too far.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
-
-
-RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
-    {"bearing": 1, "range_offset": 0, "range_scale": 1, "forward_scale": NO_POWER}
-)
-"""The power of a landmark's range with which each bias moves it."""
 
 
 class Prior(NamedTuple):
@@ -64,15 +61,14 @@ class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
 
     biases: the error of each row of `sensitivity`; those with a node of the whole team stand last.
-    range_power: of each, `RANGE_POWER`. sensitivity: ∂mean/∂b, one row for each bias node: a
-    robot's own error and the team's common one add up. The row of a marker is that of the scale of
-    the ranges, restricted to that marker's landmark.
+    sensitivity: ∂mean/∂b, one row for each bias node: a robot's own error and the team's common one
+    add up. The row of a marker is that of the scale of the ranges, restricted to that marker's
+    landmark.
     """
 
     contribution: Contribution
     nodes: Indices
     biases: tuple[CommonError, ...]
-    range_power: Indices
     sensitivity: Float[np.ndarray, "B _"]
 
     @classmethod
@@ -81,8 +77,16 @@ class Joined(NamedTuple):
     ) -> "Joined":
         """Make a submap whose `common` errors have a node of the whole team."""
         biases = (*contribution.local.biases, *common)
-        powers = np.array([RANGE_POWER[_scaling(each)] for each in biases], np.int64)
-        return cls(contribution, nodes, biases, powers, _sensitivity(contribution.local, biases))
+        return cls(contribution, nodes, biases, _sensitivity(contribution.local, biases))
+
+    @property
+    def factor(self) -> core.SubmapFactor:
+        """The factor over the submap's nodes. Raises NotACovarianceError that names the submap."""
+        factor = self.contribution.factor
+        if len(self.biases) == len(self.contribution.local.biases):
+            return factor
+        powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
+        return factor.with_errors(self.sensitivity, np.array(powers, np.int64))
 
     @property
     def landmarks(self) -> Indices:
@@ -155,74 +159,22 @@ class Graph:
         return (*self.memory.submaps, *own)
 
     @cached_property
-    def factors(self) -> SubmapFactors:
-        """The submaps in flat arrays."""
-        submaps = [each.contribution for each in self.submaps]
-        return SubmapFactors(
-            member=np.concatenate([np.zeros(0, np.int64), *(each.nodes for each in self.submaps)]),
-            member_start=_starts([len(each.nodes) for each in self.submaps]),
-            mean=np.concatenate([np.zeros(0), *(each.local.mean for each in submaps)]),
-            mean_start=_starts([len(each.local.mean) for each in submaps]),
-            information=np.concatenate(
-                [np.zeros(0), *(each.information.ravel() for each in submaps)]
-            ),
-            information_start=_starts([each.information.size for each in submaps]),
-            sensitivity=np.concatenate(
-                [np.zeros(0), *(each.sensitivity.ravel() for each in self.submaps)]
-            ),
-            sensitivity_start=_starts([each.sensitivity.size for each in self.submaps]),
-            block=np.concatenate([np.zeros((0, 3)), *(each.blocks for each in submaps)]),
-            block_start=_starts([len(each.local.ids) for each in submaps]),
-            range_power=np.concatenate(
-                [np.zeros(0, np.int64), *(each.range_power for each in self.submaps)]
-            ),
-            row_start=_starts([len(each.biases) for each in self.submaps]),
-        )
-
-    @cached_property
-    def prior_factors(self) -> PriorFactors:
-        """The priors in flat arrays."""
-        sizes = np.array([len(each.mean) for each in self.priors], np.int64)
-        nodes = np.array([each.node for each in self.priors], np.int64)
-        means, information = np.zeros((len(sizes), 3)), np.zeros((len(sizes), 3, 3))
-        for k, (n, each) in enumerate(zip(sizes.tolist(), self.priors, strict=True)):
-            means[k, :n], information[k, :n, :n] = each.mean, each.information
-        return PriorFactors(nodes, self.offset[nodes], sizes, means, information)
-
-    @cached_property
-    def sighting_factors(self) -> InterRobotFactors:
-        """The inter-robot measurements in flat arrays; their entries follow those of the
-        submaps.
-        """
-        return InterRobotFactors(
-            np.array([[m.observer, m.teammate] for m in self.sightings], np.int64).reshape(-1, 2),
-            np.array([each.sighting.measurement for each in self.sightings]).reshape(-1, 2),
-            np.array([each.sighting.information for each in self.sightings]).reshape(-1, 2, 2),
-            int((core.squared(np.diff(self.factors.member_start))).sum()),
-        )
-
-    @cached_property
-    def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
-        factors, pairs = self.factors, self.sighting_factors.nodes
-        members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
-        old = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
-        ends = np.concatenate([factors.member_start, members])
-        column_start, rows, entry = block_pattern(
+    def factors(self) -> core.SubmapGraph:
+        """The factors, to compute with. Raises NotACovarianceError that names a submap."""
+        of_bias = self.of_bias.tolist()
+        return core.SubmapGraph(
+            self.offset,
             self.fixed,
-            np.concatenate([factors.member, pairs.ravel(), old]),
-            np.concatenate([ends, ends[-1:] + len(old)]) if len(old) else ends,
+            [(each.factor, each.nodes) for each in self.submaps],
+            [(a, b, each.measurement, each.information) for each, a, b in self.sightings],
+            [(*each, own) for each, own in zip(self.priors, of_bias, strict=True)],
+            None if self.condensed is None else self.condensed.quadratic,
         )
-        return Pattern(np.diff(self.offset), column_start, rows), entry
 
-    @property
-    def pattern(self) -> Pattern:
-        """Blocks of the normal equations: a block variable per node."""
-        return self._pattern_and_entry[0]
-
-    @property
-    def entry(self) -> Indices:
-        """Entry of the pattern for each pair of members of each factor (`block_pattern`)."""
-        return self._pattern_and_entry[1]
+    @cached_property
+    def pattern(self) -> core.Pattern:
+        """Blocks of the normal equations (a variable per node) and their places in the factor."""
+        return self.factors.pattern
 
     @cached_property
     def boundary(self) -> Indices:
@@ -230,21 +182,15 @@ class Graph:
         nodes = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
         return places(self.offset, nodes)
 
-    @property
-    def condensed_entry(self) -> Indices:
-        """The part of `entry` for the condensed factor's nodes."""
-        return self.entry[self.sighting_factors.first_pair + 4 * len(self.sightings) :]
-
     @cached_property
-    def analysis(self) -> Analysis:
-        """Order of elimination and places in the Cholesky factor."""
-        return analysed(self.pattern)
+    def landmark_start(self) -> Indices:
+        """The first landmark of each submap among those of all submaps, and their number."""
+        return _starts([len(each.contribution.local.ids) for each in self.submaps])
 
     @cached_property
     def dimensions(self) -> Indices:
         """Dimension of each submap."""
-        dimensions: Indices = np.diff(self.factors.mean_start)
-        return dimensions
+        return np.array([len(each.contribution.local.mean) for each in self.submaps], np.int64)
 
     @cached_property
     def of_bias(self) -> Bool[np.ndarray, " priors"]:

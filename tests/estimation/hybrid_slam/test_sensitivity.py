@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sim.world.config import SimulatedWorld
 from sim.world.simulator import simulated
-from team import translate
+from team import core, translate
 from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from team.estimation import dense, se2
 from team.estimation.consistency import nees
@@ -21,7 +21,6 @@ from team.estimation.hybrid_slam.arrow_kernel import solve_arrow
 from team.estimation.hybrid_slam.sensitivity_kernel import BIASES, carried_on
 from team.estimation.map_joining import joining, marginals
 from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
-from team.estimation.map_joining.submap_factor import biased_normal
 from team.estimation.models import increment_of
 from team.estimation.odometry import forward_column
 from team.estimation.randomness import generator
@@ -173,7 +172,9 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
     at = np.array(
         [0, 3, *(6 + 2 * k for k in range(count)), *range(len(state) - biases, len(state))]
     )
-    hessian, gradient, chi2 = biased_normal(state, at, mean, information, sensitivity)
+    powers = np.zeros(biases, np.int64)
+    factor = core.SubmapFactor(mean, information, np.zeros((count, 3)), sensitivity, powers)
+    hessian, gradient, chi2 = factor.normal(state, at)
     r = residual(state)
     tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
     assert chi2 == pytest.approx(r @ information @ r)
@@ -316,12 +317,12 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
         state[at] = prior.mean[0] + by
         return replace(island, state=state)
 
-    assert shifted(10.0 * sigma).prior_weight[k] == pytest.approx(1.0 / 101.0)
+    assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
-    assert plain.prior_weight[k] == 1.0
+    assert plain.estimate.prior_weights[k] == 1.0
     h, everyone = 1e-4 * sigma, np.ones(len(island.graph.priors), np.bool_)
     for by in (0.5 * sigma, 10.0 * sigma):
         above, below = (shifted(by + d)._prior_cost(everyone) for d in (h, -h))
         slope = (above - below) / (2.0 * h)
-        weighted = shifted(by).prior_weight[k] * prior.information[0, 0] * by
+        weighted = shifted(by).estimate.prior_weights[k] * prior.information[0, 0] * by
         assert slope == pytest.approx(2.0 * weighted, rel=1e-5)

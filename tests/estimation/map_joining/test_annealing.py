@@ -64,7 +64,7 @@ def off_m(island):
 def test_a_true_sighting_bends_the_chain_tick_by_tick_and_one_that_is_judged_at_once_does_not():
     annealed, mutant = (after(10, closed_loop(each)) for each in (ANNEALED, AT_ONCE))
     assert off_m(annealed) < 0.3
-    assert annealed.sighting_weight.min() > 0.5
+    assert annealed.estimate.sighting_weights.min() > 0.5
     assert off_m(mutant) > 2.0
     assert final_cost(annealed) < final_cost(mutant)
 

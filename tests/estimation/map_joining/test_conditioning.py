@@ -82,7 +82,7 @@ def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
         away = max(away, np.abs((found.map.mean - mean) / sigma).max())
         off = (found.map.covariance - covariance) / np.outer(sigma, sigma)
         away = max(away, np.abs(off).max())
-        assert found.cost == pytest.approx(island.chi2.sum(), rel=1e-9)
+        assert found.cost == pytest.approx(island.estimate.chi2.sum(), rel=1e-9)
         assert found.dof == int(graph.dimensions.sum()) - graph.unknowns
         beyond = np.concatenate(conditioning._beyond_gate(island))
         np.testing.assert_array_equal(found.landmark_chi2 > conditioning.GATE, beyond)

@@ -29,7 +29,7 @@ def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(
     free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
     away = np.random.default_rng(1).uniform(-0.01, 0.01, len(free))
     island = replace(island, state=np.where(free, island.state + away, island.state))
-    values, gradient = island.normal_equations
+    values, gradient = island.estimate.normal_equations
     hessian = dense(island.graph.pattern, values)
     damped = hessian + damping * np.diag(np.diag(hessian))
     expected = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
@@ -38,4 +38,4 @@ def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(
     np.testing.assert_array_equal(moved.state[~free], island.state[~free])
     assert largest == pytest.approx(np.abs(expected).max())
     assert eased == pytest.approx(0.0 if damping == LEAST_DAMPING else damping / 10.0)
-    assert island.cost_of(moved) < island.cost_of(island)
+    assert island.estimate.cost_of(moved.estimate) < island.estimate.cost_of(island.estimate)

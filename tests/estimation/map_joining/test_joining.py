@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
+from team import core
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
 from team.estimation.map_joining.joining import (
@@ -27,7 +28,6 @@ from team.estimation.map_joining.marginals import (
     prior_for,
     trajectory,
 )
-from team.estimation.map_joining.submap_factor import submap_normal
 from team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth, team, wrap
@@ -200,7 +200,9 @@ def test_the_factor_is_what_central_differences_of_its_residual_say(seed, count)
     jacobian[2] = 0.0
     jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
     at = np.array([0, 3, *(6 + 2 * k for k in range(count))])
-    hessian, gradient, chi2 = submap_normal(state, at, mean, information)
+    no_bias = np.zeros((0, len(mean))), np.zeros(0, np.int64)
+    factor = core.SubmapFactor(mean, information, np.zeros((count, 3)), *no_bias)
+    hessian, gradient, chi2 = factor.normal(state, at)
     r = residual(state)
     tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
     assert chi2 == pytest.approx(r @ information @ r)
@@ -212,7 +214,7 @@ def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():
     world = team(7, submaps=3)
     starts = [replace(start, covariance=0.1 * np.eye(3)) for start in world.starts]
     island = joined(world.submaps, starts, JoinSettings(robust_c=1.0)).main
-    gradient = island.normal_equations[1]
+    gradient = island.estimate.gradient
     for k in range(0, len(island.state), 5):
         shift = 1e-6 * np.eye(len(island.state))[k]
         up, down = (replace(island, state=island.state + s * shift).cost for s in (1, -1))

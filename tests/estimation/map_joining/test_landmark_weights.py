@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import joining_kernel
-from team.estimation.map_joining.gauss_newton import LEAST_WEIGHT
 from team.estimation.map_joining.joining import JoinSettings, converged
 from team.estimation.map_joining.marginals import joint_cost, landmark_map
 from tests.estimation.sighting_world import joined_with
@@ -69,15 +67,15 @@ def test_only_what_was_mistaken_is_discounted():
     world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
     submaps = mistaken(world, 4)
     island = fold_of(world, submaps, ROBUST).main
-    starts = island.graph.factors.block_start
+    starts = island.graph.landmark_start
     for f, joined in enumerate(island.graph.submaps):
         of = next(each for each in submaps if each.key == joined.contribution.key)
         true = next(each for each in world.submaps if each.key == of.key)
         wrong = (of.local.landmarks != true.local.landmarks).any(axis=1)
-        weight = island.landmark_weight[starts[f] : starts[f + 1]]
+        weight = island.estimate.landmark_weights[starts[f] : starts[f + 1]]
         assert (weight[wrong] < 0.2).all()
         assert (weight[~wrong] > 0.5).all()
-    assert (island.landmark_weight == 1.0).mean() > 0.85
+    assert (island.estimate.landmark_weights == 1.0).mean() > 0.85
 
 
 def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
@@ -93,34 +91,33 @@ def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
             r = np.array([place.real, place.imag]) - local.landmarks[k]
             block = local.covariance[3 + 2 * k : 5 + 2 * k, 3 + 2 * k : 5 + 2 * k]
             expected.append(min(1.0, ROBUST.landmark_gate / (r @ np.linalg.solve(block, r))))
-    np.testing.assert_allclose(island.landmark_weight, expected, rtol=1e-6)
+    np.testing.assert_allclose(island.estimate.landmark_weights, expected, rtol=1e-6)
     assert min(expected) < 0.2
     far = state.copy()
     far[graph.offset[min(graph.landmarks.values())]] += 1e6
-    assert replace(island, state=far).landmark_weight.min() == LEAST_WEIGHT
+    assert replace(island, state=far).estimate.landmark_weights.min() == 1e-6
 
 
 def test_without_a_robust_loss_every_landmark_counts():
     world = team(4)
     island = fold_of(world, mistaken(world, 4), JoinSettings()).main
-    assert (island.landmark_weight == 1.0).all()
-    assert island.factors is island.graph.factors
+    assert (island.estimate.landmark_weights == 1.0).all()
+    np.testing.assert_array_equal(island.estimate.whole_chi2, island.estimate.chi2)
 
 
 def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
     world = team(2)
     graph = fold_of(world, world.submaps, JoinSettings()).main.graph
-    factors, rng = graph.factors, np.random.default_rng(1)
-    weight = np.where(rng.random(len(factors.block)) < 0.4, rng.uniform(0.01, 1.0), 1.0)
-    information = joining_kernel.discounted_information(factors, weight)
-    for f, joined in enumerate(graph.submaps):
+    rng = np.random.default_rng(1)
+    for joined in graph.submaps:
         local = joined.contribution.local
-        P, first = local.covariance.copy(), factors.block_start[f]
-        for k in range(len(local.ids)):
+        count = len(local.ids)
+        weight = np.where(rng.random(count) < 0.4, rng.uniform(0.01, 1.0, count), 1.0)
+        P = local.covariance.copy()
+        for k in range(count):
             at = slice(3 + 2 * k, 5 + 2 * k)
-            P[at, at] /= weight[first + k]
-        begin, end = factors.information_start[f : f + 2]
-        found = information[begin:end].reshape(P.shape)
+            P[at, at] /= weight[k]
+        found = joined.factor.discounted(weight).information
         np.testing.assert_allclose(found @ P, np.eye(len(P)), atol=1e-8)
 
 
@@ -135,16 +132,15 @@ def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much
     exactly = replace(ROBUST, step_tolerance=1e-11)
     told = fold_of(world, submaps, replace(exactly, covariance_factor=6.0))
     meant = fold_of(world, larger, exactly)
-    weight = meant.main.landmark_weight
+    weight = meant.main.estimate.landmark_weights
     assert (weight < 0.5).any()
-    np.testing.assert_allclose(told.main.landmark_weight, weight, rtol=1e-6)
-    unscaled = replace(told.main, settings=exactly).landmark_weight
+    np.testing.assert_allclose(told.main.estimate.landmark_weights, weight, rtol=1e-6)
+    unscaled = replace(told.main, settings=exactly).estimate.landmark_weights
     assert (unscaled[weight < 0.5] < 0.3 * weight[weight < 0.5]).all(), "the factor matters"
     np.testing.assert_allclose(told.main.state, meant.main.state, atol=1e-6)
-    for name in ("dimensions", "chi2", "whole_chi2", "counted_chi2", "weight", "cost"):
-        np.testing.assert_allclose(
-            getattr(told.main, name), getattr(meant.main, name), rtol=1e-5, atol=1e-9, err_msg=name
-        )
+    for name in ("dimensions", "chi2", "whole_chi2", "counted_chi2", "weights", "cost"):
+        one, other = (getattr(each.main.estimate, name) for each in (told, meant))
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-9, err_msg=name)
     found, expected = landmark_map(told), landmark_map(meant)
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-5, atol=1e-9)
     one, other = joint_cost(told), joint_cost(meant)
@@ -155,7 +151,7 @@ def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much
 def test_the_cost_of_an_iteration_falls_with_the_robust_cost():
     world = team(5, robots=2, submaps=12, landmarks=10)
     island = fold_of(world, mistaken(world, 5), ROBUST).main
-    assert (island.landmark_weight < 1.0).any()
+    assert (island.estimate.landmark_weights < 1.0).any()
     rng = np.random.default_rng(0)
     for _ in range(20):
         state = island.state + 1e-3 * rng.normal(size=len(island.state))
@@ -164,7 +160,9 @@ def test_the_cost_of_an_iteration_falls_with_the_robust_cost():
         ]
         other = replace(island, state=state)
         assert other.cost - island.cost == pytest.approx(
-            island.cost_of(other) - island.cost_of(island), rel=0.3, abs=0.05
+            island.estimate.cost_of(other.estimate) - island.estimate.cost_of(island.estimate),
+            rel=0.3,
+            abs=0.05,
         )
 
 

@@ -52,10 +52,10 @@ def test_a_number_is_held_where_the_rest_has_the_least_cost():
     at = int(island.graph.offset[start_node(fold)]) + 2
     found = solved_with_fixed(island, at, 0.3, 12)
     assert found.state[at] - island.state[at] == pytest.approx(0.3)
-    gradient = found.normal_equations[1]
+    gradient = found.estimate.gradient
     assert abs(gradient[at]) > 0.1
     others = np.delete(gradient, at)
-    scale = np.sqrt(np.delete(found.normal_equations[0][found.graph.pattern.diagonal], at))
+    scale = np.sqrt(np.delete(found.estimate.normal_equations[0][found.graph.pattern.diagonal], at))
     assert np.abs(others / scale).max() < 1e-3, "no other number could lower the cost"
 
 

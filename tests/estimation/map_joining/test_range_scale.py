@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from team import core
 from team.association import AssociationProfile
 from team.config import UNNAMED
 from team.estimation.contribution import Contribution, InitialPoseFactor
 from team.estimation.gaussian import packed, unpacked
-from team.estimation.map_joining import joining_kernel as kernel
 from team.estimation.map_joining import marginals
 from team.estimation.map_joining.condensing import Limits, condense_submaps
 from team.estimation.map_joining.gauss_newton import settled
@@ -88,10 +88,10 @@ def test_at_joined_ranges_errors_are_times_the_ratio_of_distances_and_columns_th
     submaps = [_with_offset(each) for each in submaps]
     sigma = SIGMA | {"range_offset": 0.1}
     island = fold_of(submaps, starts, JoinSettings(bias_sigma=sigma)).main
-    graph, factors = island.graph, island.graph.factors
-    scaled = kernel.with_joined_ranges(island.state, graph.offset, factors)
-    for f, each in enumerate(graph.submaps):
+    graph = island.graph
+    for each in graph.submaps:
         local, at = each.contribution.local, graph.offset[each.nodes]
+        scaled = each.factor.at_joined_ranges(island.state, at)
         start = island.state[at[0] : at[0] + 3]
         middle = local.end_pose[:2] / 2.0
         seen_from = compose(start, np.append(middle, 0.0))[:2]
@@ -105,19 +105,14 @@ def test_at_joined_ranges_errors_are_times_the_ratio_of_distances_and_columns_th
             ahead, across = np.cos(turn), np.sin(turn)
             T[at_k, at_k] = q * np.array([[ahead, -across], [across, ahead]])
             block = (T @ local.covariance @ T.T)[at_k, at_k]
-            own = scaled.block[factors.block_start[f] + k]
+            own = scaled.landmarks[k]
             np.testing.assert_allclose(own, block[[0, 0, 1], [0, 1, 1]], rtol=1e-9, atol=1e-12)
-        begin = factors.information_start[f]
-        metric = scaled.information[begin : begin + 169].reshape(13, 13)
-        np.testing.assert_allclose(
-            metric, np.linalg.inv(T @ local.covariance @ T.T), rtol=1e-9, atol=1e-7
-        )
-        begin = factors.sensitivity_start[f]
-        offset, scale = scaled.sensitivity[begin : begin + 26].reshape(2, 13)
+        metric = np.linalg.inv(T @ local.covariance @ T.T)
+        np.testing.assert_allclose(scaled.information, metric, rtol=1e-9, atol=1e-7)
+        offset, scale = scaled.sensitivity
         np.testing.assert_allclose(scale, np.append(np.zeros(3), -there), atol=1e-12)
         unit = there / np.linalg.norm(there, axis=1, keepdims=True)
         np.testing.assert_allclose(offset, np.append(np.zeros(3), -unit), atol=1e-12)
-    np.testing.assert_array_equal(factors.information, graph.factors.information)
 
 
 def _with_offset(submap):
@@ -133,12 +128,12 @@ def _with_offset(submap):
 def test_an_outlier_does_not_grow_with_its_distance():
     submaps, starts, _ = carts(2, robots=1, submaps=1)
     island = fold_of(submaps, starts, JoinSettings(bias_sigma=SIGMA)).main
-    factors = island.graph.factors
+    (submap,) = island.graph.submaps
     far = island.state.copy()
     far[island.graph.offset[island.graph.landmarks[1]]] += 1000.0
-    scaled = kernel.with_joined_ranges(far, island.graph.offset, factors)
-    (xx, xy, yy), (own_xx, own_xy, own_yy) = scaled.block[0], factors.block[0]
-    q2 = kernel.LARGEST_RATIO**2
+    scaled = submap.factor.at_joined_ranges(far, island.graph.offset[submap.nodes])
+    (xx, xy, yy), (own_xx, own_xy, own_yy) = scaled.landmarks[0], submap.factor.landmarks[0]
+    q2 = core.LARGEST_RATIO**2
     assert xx + yy == pytest.approx(q2 * (own_xx + own_yy))
     assert xx * yy - xy**2 == pytest.approx(q2**2 * (own_xx * own_yy - own_xy**2))
 

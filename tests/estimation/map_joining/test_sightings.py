@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from team.config import Sensor
+from team.core import linearise_sighting
 from team.estimation.consistency import nees
 from team.estimation.inter_robot import CarriedPoint, carried_back, carried_on, point_seen, reduced
 from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.inter_robot_kernel import sighting_residual
 from team.estimation.map_joining.joining import converged
 from team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
 from team.estimation.models import Increment
@@ -35,7 +35,7 @@ def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distan
     if np.hypot(*(b - a)[:2]) < 0.1:
         return
     measurement = np.array([distance, bearing])
-    r, jacobian = sighting_residual(a, b, measurement)
+    r, jacobian = linearise_sighting(a, b, measurement)
     np.testing.assert_allclose(wrap(r - residual(a, b, measurement)), 0.0, atol=1e-9)
     h = 1e-6
     both = np.concatenate([a, b])
@@ -51,7 +51,7 @@ def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised(
         world.submaps, world.starts, world.sightings, JoinSettings(robust_c=1.0)
     ).main
     assert len(island.graph.sightings) == len(world.sightings) == 12
-    gradient = island.normal_equations[1]
+    gradient = island.estimate.gradient
     for k in range(0, len(island.state), 4):
         shift = 1e-6 * np.eye(len(island.state))[k]
         up, down = (replace(island, state=island.state + s * shift).cost for s in (1, -1))
@@ -64,7 +64,7 @@ def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised(
         if expected:
             # The parabola that an iteration lowers touches the robust cost here.
             others = (replace(island, state=island.state + s * shift) for s in (1, -1))
-            up, down = map(island.cost_of, others)
+            up, down = (island.estimate.cost_of(each.estimate) for each in others)
             assert (up - down) / 4e-6 == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 

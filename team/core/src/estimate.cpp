@@ -1,0 +1,438 @@
+#include "estimate.hpp"
+
+namespace teamslam::graph {
+
+namespace {
+
+using linalg::pairwise_sum;
+
+template <class T, class F>
+const T& once(std::optional<T>& kept, F&& make) {
+  if (!kept) kept = make();
+  return *kept;
+}
+
+double squared(double x) { return x * x; }
+
+// Σ value(k) over k < count, of those that are chosen, in the order of NumPy.
+template <class Chosen, class F>
+double sum(std::size_t count, Chosen&& is_chosen, F&& value) {
+  Numbers terms;
+  for (std::size_t k = 0; k < count; k++)
+    if (is_chosen(k)) terms.push_back(value(k));
+  return pairwise_sum(terms);
+}
+
+const auto ALL = [](std::size_t) { return true; };
+
+double weighted_sum(const Numbers& weights, const Numbers& chi2) {
+  return sum(chi2.size(), ALL, [&](std::size_t k) { return weights[k] * chi2[k]; });
+}
+
+// scale log(1 + χ²/scale), Cauchy's loss.
+double loss_of(double chi2, double scale) { return scale * elementary::log1p(chi2 / scale); }
+
+}  // namespace
+
+Estimate::Estimate(std::shared_ptr<const Graph> graph, Numbers state, Numbers scale, Numbers sighting_scale, Loss loss)
+    : graph_(std::move(graph)),
+      state_(std::move(state)),
+      scale_(std::move(scale)),
+      sighting_scale_(std::move(sighting_scale)),
+      loss_(loss) {
+  if (state_.size() != graph_->unknowns()) throw std::invalid_argument("the state has not the size of the graph");
+  if (scale_.size() != graph_->submaps.size() || sighting_scale_.size() != graph_->sightings.size())
+    throw std::invalid_argument("a submap or inter-robot measurement has no robust scale");
+}
+
+const Estimate::Submaps& Estimate::submaps() const {
+  return once(submaps_, [&] {
+    Submaps found;
+    for (const Joined& each : graph_->submaps)
+      found.push_back(loss_.has_joined_ranges
+                          ? std::make_shared<const Submap>(each.submap->at_joined_ranges(state_, each.at))
+                          : each.submap);
+    return found;
+  });
+}
+
+const std::pair<Numbers, Numbers>& Estimate::landmark_chi2_and_gate() const {
+  return once(landmark_chi2_, [&] {
+    const std::size_t count = graph_->landmarks();
+    if (!loss_.robust_c) return std::pair{Numbers(count), Numbers(count, 1.0)};
+    std::pair<Numbers, Numbers> found{Numbers(count), {}};
+    for (std::size_t f = 0; f < submaps().size(); f++) {
+      const Submap& each = *submaps()[f];
+      each.landmark_chi2(state_, graph_->submaps[f].at, loss_.covariance_factor,
+                         std::span(found.first).subspan(graph_->landmark_start[f], each.landmarks.size()));
+      found.second.insert(found.second.end(), each.landmarks.size(),
+                          loss_.landmark_gate * squared(scale_[f] / *loss_.robust_c));
+    }
+    return found;
+  });
+}
+
+const Numbers& Estimate::landmark_weights() const {
+  return once(weights_, [&] {
+    const auto& [chi2, gate] = landmark_chi2_and_gate();
+    Numbers found(chi2.size(), 1.0);
+    for (std::size_t l = 0; l < found.size(); l++)
+      if (chi2[l] > gate[l]) found[l] = pack::max(gate[l] / chi2[l], LEAST_WEIGHT);
+    return found;
+  });
+}
+
+Estimate::Submaps Estimate::discounted_by(const Numbers& weights) const {
+  Submaps found = submaps();
+  for (std::size_t f = 0; f < found.size(); f++) {
+    const Values own = Values(weights).subspan(graph_->landmark_start[f], found[f]->landmarks.size());
+    bool is_discounted = false;
+    for (const double weight : own) is_discounted |= weight < 1.0;
+    if (is_discounted) found[f] = std::make_shared<const Submap>(found[f]->discounted(own));
+  }
+  return found;
+}
+
+const Estimate::Submaps& Estimate::discounted() const {
+  return once(discounted_, [&] { return discounted_by(landmark_weights()); });
+}
+
+Numbers Estimate::dimensions() const {
+  Numbers found;
+  for (std::size_t f = 0; f < graph_->submaps.size(); f++) {
+    double lost = 0.0;
+    for (std::size_t l = graph_->landmark_start[f]; l < graph_->landmark_start[f + 1]; l++)
+      lost += 2.0 * (1.0 - landmark_weights()[l]);
+    found.push_back(double(graph_->submaps[f].submap->size()) - lost);
+  }
+  return found;
+}
+
+Numbers Estimate::costs(const Submaps& submaps, const Numbers& state) const {
+  Numbers found;
+  for (std::size_t f = 0; f < submaps.size(); f++)
+    found.push_back(chi2_ && &state == &state_ && submaps[f] == discounted()[f]
+                        ? (*chi2_)[f]
+                        : submaps[f]->chi2(state, graph_->submaps[f].at) / loss_.covariance_factor);
+  return found;
+}
+
+const Numbers& Estimate::chi2() const {
+  return once(chi2_, [&] { return costs(discounted(), state_); });
+}
+
+Numbers Estimate::whole_chi2() const { return costs(submaps(), state_); }
+
+Numbers Estimate::counted_chi2() const {
+  Numbers squares = landmark_weights();
+  for (double& weight : squares) weight = squared(weight);
+  return costs(discounted_by(squares), state_);
+}
+
+std::vector<double> Estimate::squared_scales() const {
+  Numbers found;
+  for (std::size_t f = 0; f < scale_.size(); f++)
+    found.push_back(double(graph_->submaps[f].submap->size()) * squared(scale_[f]));
+  return found;
+}
+
+Numbers Estimate::weights() const {
+  Numbers found = squared_scales();
+  for (std::size_t f = 0; f < found.size(); f++) found[f] = 1.0 / (1.0 + chi2()[f] / found[f]);
+  return found;
+}
+
+const Numbers& Estimate::sighting_chi2() const {
+  return once(sighting_chi2_, [&] {
+    Numbers found;
+    for (const Sighting& each : graph_->sightings) found.push_back(each.chi2(linear(each)));
+    return found;
+  });
+}
+
+Numbers Estimate::sighting_weights() const {
+  Numbers found = sighting_chi2();
+  for (std::size_t s = 0; s < found.size(); s++) found[s] = 1.0 / (1.0 + found[s] / (2.0 * squared(sighting_scale_[s])));
+  return found;
+}
+
+const std::vector<Prior::Terms>& Estimate::prior_terms() const {
+  return once(prior_terms_, [&] {
+    std::vector<Prior::Terms> found;
+    for (const Prior& each : graph_->priors) found.push_back(each.terms(&state_[graph_->offset[each.node]]));
+    return found;
+  });
+}
+
+Numbers Estimate::prior_chi2() const {
+  Numbers found;
+  for (const Prior::Terms& each : prior_terms()) found.push_back(each.chi2);
+  return found;
+}
+
+// Cauchy's for a robot's own bias, 1 for all others. A sensor changed since its calibration is one
+// robot's: its prior is an outlier, and must not draw the other robots' biases away through the common
+// errors. Markers do not change; the error of a marker seen from one side only is distinguished from its
+// landmark's position by its prior alone.
+Numbers Estimate::prior_weights() const {
+  Numbers found(graph_->priors.size(), 1.0);
+  if (loss_.robust_c)
+    for (std::size_t k = 0; k < found.size(); k++)
+      if (graph_->priors[k].is_of_bias) found[k] = 1.0 / (1.0 + prior_terms()[k].chi2 / squared(*loss_.robust_c));
+  return found;
+}
+
+const Quadratic::Terms& Estimate::condensed_terms() const {
+  return once(condensed_terms_, [&] {
+    return graph_->condensed ? graph_->condensed->terms(state_, graph_->boundary()) : Quadratic::Terms{};
+  });
+}
+
+double Estimate::cost_of(const Estimate& other) const {
+  const bool are_equal = &other == this || (!loss_.robust_c && !loss_.has_joined_ranges);
+  const double chi2 = weighted_sum(weights(), are_equal ? other.chi2() : costs(discounted(), other.state_));
+  double seen = weighted_sum(sighting_weights(), other.sighting_chi2());
+  seen += weighted_sum(prior_weights(), other.prior_chi2());
+  return chi2 + seen + other.condensed_terms().cost;
+}
+
+double Estimate::cost() const {
+  return cost_of_factors({std::vector<bool>(graph_->submaps.size(), true),
+                          std::vector<bool>(graph_->sightings.size(), true),
+                          std::vector<bool>(graph_->priors.size(), true)}) +
+         condensed_terms().cost;
+}
+
+double Estimate::cost_of_factors(const Marked& marked) const {
+  const Numbers of_priors = prior_chi2();
+  const std::size_t submaps = scale_.size(), sightings = sighting_scale_.size(), priors = of_priors.size();
+  const auto is_submap = [&](std::size_t f) { return marked.submaps[f]; };
+  const auto is_sighting = [&](std::size_t s) { return marked.sightings[s]; };
+  if (!loss_.robust_c) {
+    const double cost = sum(submaps, is_submap, [&](std::size_t f) { return chi2()[f]; }) +
+                        sum(priors, [&](std::size_t k) { return marked.priors[k]; }, [&](std::size_t k) { return of_priors[k]; });
+    return cost + sum(sightings, is_sighting, [&](std::size_t s) { return sighting_chi2()[s]; });
+  }
+  const Numbers scales = squared_scales(), weights = prior_weights();
+  double cost = sum(submaps, is_submap, [&](std::size_t f) { return loss_of(chi2()[f], scales[f]); });
+  const double c2 = squared(*loss_.robust_c);
+  const double of_biases = sum(priors, [&](std::size_t k) { return weights[k] < 1.0 && marked.priors[k]; },
+                               [&](std::size_t k) { return loss_of(of_priors[k], c2); });
+  cost += of_biases + sum(priors, [&](std::size_t k) { return !(weights[k] < 1.0) && marked.priors[k]; },
+                          [&](std::size_t k) { return of_priors[k]; });
+  const auto& [own, gate] = landmark_chi2_and_gate();
+  Numbers beyond;
+  for (std::size_t f = 0; f < submaps; f++)
+    for (std::size_t l = graph_->landmark_start[f]; l < graph_->landmark_start[f + 1]; l++)
+      if (marked.submaps[f] && own[l] > gate[l]) beyond.push_back(gate[l] * elementary::log(own[l] / gate[l]));
+  cost += pairwise_sum(beyond);
+  return cost + sum(sightings, is_sighting,
+                    [&](std::size_t s) { return loss_of(sighting_chi2()[s], 2.0 * squared(sighting_scale_[s])); });
+}
+
+const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
+  return once(normal_, [&] {
+    const Graph& graph = *graph_;
+    std::pair made{Numbers(std::size_t(graph.pattern()->numbers())), Numbers(state_.size())};
+    auto& [values, gradient] = made;
+    for (std::size_t node = 0; node < graph.nodes(); node++)
+      if (graph.fixed[node])
+        for (std::size_t p = 0, size = graph.size_of(Index(node)); p < size; p++)
+          values[graph.diagonal_of(Index(node)) + p * size + p] = 1.0;
+    for (std::size_t f = 0; f < graph.submaps.size(); f++) {
+      const Joined& at = graph.submaps[f];
+      const Normal normal = discounted()[f]->normal(state_, at.at);
+      const double chi2 = normal.chi2 / loss_.covariance_factor;
+      const double weight = robust_weight(chi2, double(at.submap->size()), scale_[f]) / loss_.covariance_factor;
+      std::size_t row = 0;
+      for (std::size_t a = 0; a < at.nodes.size(); a++)
+        for (std::size_t p = 0, size = graph.size_of(at.nodes[a]); p < size; p++, row++)
+          if (!graph.fixed[at.nodes[a]]) gradient[at.at[a] + p] += weight * normal.gradient[row];
+      graph.add(f, at.nodes, normal.hessian, weight, values);
+    }
+    for (std::size_t s = 0; s < graph.sightings.size(); s++) {
+      const Sighting& each = graph.sightings[s];
+      const Sighting::Linear at = linear(each);
+      const auto& W = each.information;
+      double slope[2];
+      for (std::size_t i = 0; i < 2; i++) slope[i] = W[i][0] * at.residual[0] + W[i][1] * at.residual[1];
+      const double chi2 = at.residual[0] * slope[0] + at.residual[1] * slope[1];
+      const double weight = robust_weight(chi2, 2.0, sighting_scale_[s]);
+      const Index nodes[] = {each.observer, each.teammate};
+      for (std::size_t i = 0; i < 2; i++)
+        for (std::size_t p = 0; p < 3; p++)
+          for (std::size_t k = 0; k < 2; k++)
+            if (!graph.fixed[nodes[i]]) gradient[graph.offset[nodes[i]] + p] += weight * at.jacobian[k][3 * i + p] * slope[k];
+      graph.add(graph.of_sighting(s), nodes, each.hessian(at), weight, values);
+    }
+    if (graph.condensed) {
+      for (std::size_t i = 0; i < graph.boundary().size(); i++)
+        gradient[graph.boundary()[i]] += condensed_terms().slope[i];
+      graph.add(graph.of_condensed(), graph.condensed->nodes, graph.condensed->information, 1.0, values);
+    }
+    const Numbers weights = prior_weights();
+    for (std::size_t k = 0; k < weights.size(); k++) {
+      const Prior& each = graph.priors[k];
+      const std::size_t size = each.mean.size(), at = graph.diagonal_of(each.node);
+      for (std::size_t i = 0; i < size; i++) {
+        gradient[graph.offset[each.node] + i] += weights[k] * prior_terms()[k].slope[i];
+        for (std::size_t j = 0; j < size; j++) values[at + i * size + j] += weights[k] * each.information[i][j];
+      }
+    }
+    return made;
+  });
+}
+
+const std::shared_ptr<const sparse::Cholesky>& Estimate::posterior() const {
+  if (!posterior_) posterior_ = std::make_shared<const sparse::Cholesky>(graph_->pattern(), normal_equations().first);
+  return posterior_;
+}
+
+const Numbers& Estimate::step() const {
+  return once(step_, [&] {
+    Numbers found = posterior()->solve(normal_equations().second);
+    for (double& x : found) x = -x;
+    return found;
+  });
+}
+
+const Numbers& Estimate::selected_covariance() const {
+  return once(covariance_, [&] { return posterior()->selected_inverse(); });
+}
+
+// state + share · step, headings wrapped.
+Numbers Estimate::moved(const Numbers& step, double share) const {
+  Numbers moved = state_;
+  for (std::size_t i = 0; i < moved.size(); i++) moved[i] += share * step[i];
+  for (std::size_t node = 0; node < graph_->nodes(); node++)
+    if (graph_->size_of(Index(node)) == 3) {
+      double& heading = moved[graph_->offset[node] + 2];
+      heading = se2::wrapped(heading);
+    }
+  return moved;
+}
+
+Step Estimate::take_step(double damping) const {
+  const double before = cost_of(*this);
+  std::optional<double> refused;
+  while (damping < MOST_DAMPING) {
+    Numbers step;
+    if (damping != 0.0) {
+      auto [damped, gradient] = normal_equations();
+      for (const Index i : graph_->pattern()->diagonal()) damped[i] *= 1.0 + damping;
+      step = sparse::Cholesky(graph_->pattern(), damped).solve(Values(gradient));
+      for (double& x : step) x = -x;
+    } else {
+      step = this->step();
+    }
+    double largest = 0.0;
+    for (const double x : step)
+      if (largest == largest && !(std::fabs(x) <= largest)) largest = std::fabs(x);  // NaN stays
+    for (const double share : SHARES) {
+      if (damping != 0.0 && share < 1.0) break;
+      const Estimate after(graph_, moved(step, share), scale_, sighting_scale_, loss_);
+      if (cost_of(after) <= before * (1.0 + ROUNDING) + ROUNDING)
+        return {after.state_, damping > LEAST_DAMPING ? damping / 10.0 : 0.0, largest};
+    }
+    if (!refused) refused = largest;
+    damping = pack::max(10.0 * damping, LEAST_DAMPING);
+  }
+  return {{}, elementary::INF, refused.value_or(elementary::INF)};
+}
+
+Numbers Estimate::explained() const {
+  Numbers found;
+  for (std::size_t f = 0; f < graph_->submaps.size(); f++) {
+    const Joined& at = graph_->submaps[f];
+    const Normal normal = discounted()[f]->normal(state_, at.at);
+    found.push_back(graph_->trace(f, at.nodes, normal.hessian, selected_covariance()) / loss_.covariance_factor);
+  }
+  return found;
+}
+
+Numbers Estimate::explained_by_sightings() const {
+  Numbers found;
+  for (std::size_t s = 0; s < graph_->sightings.size(); s++) {
+    const Sighting& each = graph_->sightings[s];
+    const Index nodes[] = {each.observer, each.teammate};
+    found.push_back(graph_->trace(graph_->of_sighting(s), nodes, each.hessian(linear(each)), selected_covariance()));
+  }
+  return found;
+}
+
+Numbers Estimate::explained_by_priors() const {
+  Numbers found;
+  for (const Prior& each : graph_->priors) {
+    const std::size_t size = each.mean.size(), at = graph_->diagonal_of(each.node);
+    Numbers terms(size * size);
+    for (std::size_t i = 0; i < size * size; i++)
+      terms[i] = graph_->fixed[each.node] ? 0.0 : each.information[i / size][i % size] * selected_covariance()[at + i];
+    found.push_back(pairwise_sum(terms));
+  }
+  return found;
+}
+
+Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
+  const Graph& graph = *graph_;
+  std::vector<std::ptrdiff_t> place(graph.nodes(), -1);
+  std::size_t total = 0;
+  for (const Index node : nodes) {
+    place[node] = std::ptrdiff_t(total);
+    total += graph.size_of(node);
+  }
+  Summed sum{dense::Matrix(total, total), Numbers(total), condensed_terms().cost + cost_of_factors(marked)};
+  dense::Matrix& H = sum.information;
+  Numbers& g = sum.slope;
+  // Calls do_number with the number in the sum and the number in the factor.
+  const auto each_number = [&](Indices of, auto&& do_number) {
+    std::size_t row = 0;
+    for (const Index node : of)
+      for (std::size_t p = 0, size = graph.size_of(node); p < size; p++, row++)
+        if (place[node] >= 0) do_number(std::size_t(place[node]) + p, row);
+  };
+  const auto add_matrix = [&](Indices of, double weight, dense::Const hessian) {
+    each_number(of, [&](std::size_t i, std::size_t row) {
+      each_number(of, [&](std::size_t j, std::size_t column) { H[i][j] += weight * hessian[row][column]; });
+    });
+  };
+  if (graph.condensed) {
+    const Quadratic& old = *graph.condensed;
+    each_number(old.nodes, [&](std::size_t i, std::size_t row) { g[i] += condensed_terms().slope[row]; });
+    add_matrix(old.nodes, 1.0, old.information);
+  }
+  const Numbers weights = this->weights(), seen_weights = sighting_weights(), prior_weights = this->prior_weights();
+  for (std::size_t f = 0; f < graph.submaps.size(); f++) {
+    if (!marked.submaps[f]) continue;
+    const Joined& at = graph.submaps[f];
+    const Normal normal = discounted()[f]->normal(state_, at.at);
+    const double weight = weights[f] / loss_.covariance_factor;
+    each_number(at.nodes, [&](std::size_t i, std::size_t row) { g[i] += weight * normal.gradient[row]; });
+    add_matrix(at.nodes, weight, normal.hessian);
+  }
+  for (std::size_t s = 0; s < graph.sightings.size(); s++) {
+    if (!marked.sightings[s]) continue;
+    const Sighting& each = graph.sightings[s];
+    const Sighting::Linear at = linear(each);
+    dense::Matrix transposed(6, 2), weighted(2, 2);
+    for (std::size_t k = 0; k < 2; k++) {
+      for (std::size_t p = 0; p < 6; p++) transposed[p][k] = at.jacobian[k][p];
+      for (std::size_t l = 0; l < 2; l++) weighted[k][l] = seen_weights[s] * each.information[k][l];
+    }
+    const Numbers slope = dense::product(transposed, dense::product(weighted, at.residual));
+    const dense::Const jacobian{at.jacobian[0], 2, 6, 6};
+    const dense::Matrix hessian = dense::product(dense::product(transposed, weighted), jacobian);
+    const Index of[] = {each.observer, each.teammate};
+    each_number(of, [&](std::size_t i, std::size_t row) { g[i] += slope[row]; });
+    add_matrix(of, 1.0, hessian);
+  }
+  for (std::size_t k = 0; k < graph.priors.size(); k++) {
+    if (!marked.priors[k]) continue;
+    const Prior& each = graph.priors[k];
+    const Index of[] = {each.node};
+    each_number(of, [&](std::size_t i, std::size_t row) { g[i] += prior_weights[k] * prior_terms()[k].slope[row]; });
+    add_matrix(of, prior_weights[k], each.information);
+  }
+  return sum;
+}
+
+}  // namespace teamslam::graph

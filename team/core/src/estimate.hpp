@@ -1,0 +1,123 @@
+// A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
+//
+// Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ρ(prior) + condensed factor, where ρ is
+// the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting; of the priors only
+// those of biases have a loss. With a loss each landmark of a submap has a weight of its own as well:
+// beyond the gate g its χ² counts g (1 + log(χ²/g)), whose slope, the weight, is g/χ².
+#pragma once
+
+#include "graph.hpp"
+
+namespace teamslam::graph {
+
+inline constexpr double LEAST_WEIGHT = 1e-6;  // of a landmark, so that each stays determined
+// A step's shares that are tried before damping: in the long curved valleys of odometry damped steps
+// are very short.
+inline constexpr double SHARES[] = {1.0, 0.5, 0.25, 0.125, 0.0625};
+inline constexpr double LEAST_DAMPING = 1e-4, MOST_DAMPING = 1e8;
+inline constexpr double ROUNDING = 1e-10;  // the relative rise of the cost that is rounding near the minimum
+
+struct Loss {
+  std::optional<double> robust_c;  // Cauchy's scale; none for least squares
+  double landmark_gate;            // χ² of two numbers from which a landmark is discounted
+  double covariance_factor;
+  bool has_joined_ranges;          // whether errors of ranges are proportional to those of the joined map
+};
+
+// Marks of factors, in the graph's order.
+struct Marked {
+  std::vector<bool> submaps, sightings, priors;
+};
+
+// cost + 2 slopeᵀ d + dᵀ information d over some nodes.
+struct Summed {
+  dense::Matrix information;
+  Numbers slope;
+  double cost;
+};
+
+// state: empty where no step lowers the cost; then the damping is infinite. change: the largest change
+// of a number by the full step.
+struct Step {
+  Numbers state;
+  double damping, change;
+};
+
+class Estimate {
+ public:
+  // scale, sighting_scale: the robust c of each submap and inter-robot measurement, which narrows.
+  Estimate(std::shared_ptr<const Graph> graph, Numbers state, Numbers scale, Numbers sighting_scale, Loss loss);
+
+  const Graph& graph() const { return *graph_; }
+  const Numbers& state() const { return state_; }
+
+  const Numbers& landmark_weights() const;  // of each landmark of each submap
+  Numbers dimensions() const;               // of each submap, a discounted landmark counting by its weight
+  const Numbers& chi2() const;              // rᵀ(f P)⁻¹r of each submap, with discounted landmarks
+  Numbers whole_chi2() const;               // without discounting
+  Numbers counted_chi2() const;             // with each landmark's share w χ² counting w times
+  Numbers weights() const;                  // of the submaps
+  const Numbers& sighting_chi2() const;
+  Numbers sighting_weights() const;
+  Numbers prior_chi2() const;
+  Numbers prior_weights() const;
+
+  // Σ w χ² of another state with the weights and noise of this one, which an iteration lowers. The
+  // robust cost then falls too, since each loss lies below its parabola.
+  double cost_of(const Estimate& other) const;
+  // The minimised cost, at the present robust scales: of all factors, or of the marked ones and never of
+  // the condensed one.
+  double cost() const;
+  double cost_of_factors(const Marked& marked) const;
+
+  // A = Σ w JᵀP⁻¹J on the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r. A fixed node has an
+  // identity block without couplings and a zero gradient, so that its step is zero.
+  const std::pair<Numbers, Numbers>& normal_equations() const;
+  // Throw sparse::NotPositiveDefinite.
+  const std::shared_ptr<const sparse::Cholesky>& posterior() const;
+  const Numbers& step() const;  // −A⁻¹g
+  const Numbers& selected_covariance() const;
+
+  // The step −(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a
+  // more damped one.
+  Step take_step(double damping) const;
+
+  // tr(JᵀP⁻¹J Σ) of each factor: the part of its numbers that the solution absorbs. For a solution with
+  // these weights the sum over all factors is the number of unknowns.
+  Numbers explained() const;
+  Numbers explained_by_sightings() const;
+  Numbers explained_by_priors() const;
+
+  // The marked factors and the condensed one as one quadratic at this state, over these nodes,
+  // ascending; the factors' other nodes are constants.
+  Summed quadratic(Indices nodes, const Marked& marked) const;
+
+ private:
+  using Submaps = std::vector<std::shared_ptr<const Submap>>;
+
+  const Submaps& submaps() const;  // with the noise of this state, without discounting
+  const Submaps& discounted() const;
+  Submaps discounted_by(const Numbers& weights) const;
+  Numbers costs(const Submaps& submaps, const Numbers& state) const;
+  const std::pair<Numbers, Numbers>& landmark_chi2_and_gate() const;
+  const std::vector<Prior::Terms>& prior_terms() const;
+  const Quadratic::Terms& condensed_terms() const;
+  std::vector<double> squared_scales() const;  // c² dim of each submap
+  Numbers moved(const Numbers& step, double share) const;
+  Sighting::Linear linear(const Sighting& sighting) const {
+    return sighting.linear(&state_[graph_->offset[sighting.observer]], &state_[graph_->offset[sighting.teammate]]);
+  }
+
+  std::shared_ptr<const Graph> graph_;
+  Numbers state_, scale_, sighting_scale_;
+  Loss loss_;
+  // Made when they are first needed.
+  mutable std::optional<Submaps> submaps_, discounted_;
+  mutable std::optional<Numbers> weights_, chi2_, sighting_chi2_, step_, covariance_;
+  mutable std::optional<std::pair<Numbers, Numbers>> landmark_chi2_, normal_;
+  mutable std::optional<std::vector<Prior::Terms>> prior_terms_;
+  mutable std::optional<Quadratic::Terms> condensed_terms_;
+  mutable std::shared_ptr<const sparse::Cholesky> posterior_;
+};
+
+}  // namespace teamslam::graph
