@@ -101,7 +101,8 @@ std::optional<Matrix> inverse(const Matrix& S) {
 // Iterates the EKF update by the constraints; returns whether S is positive definite.
 //
 // mean: (t, θ, a₁, a₂, …); seen: (b₁, b₂, …), the same landmarks in the submap.
-bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, const Matrix& of_seen, Constraints& found) {
+bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, const Matrix& of_seen,
+         Constraints& found) {
   const std::size_t m = seen.size();
   Numbers state = mean, local = seen, y(m);
   found.lever.resize(m);
@@ -323,7 +324,8 @@ TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate) {
   put(gain.view().part(0, 0, 3, m), of_map(found.covariance.view().part(0, 0, 3, 3 + m), found.tie.lever));
   put(gain.view().part(3, 0, 3, m),
       of_submap(part(submap.covariance, up_to(3), found.sights), found.tie.sine, found.tie.cosine));
-  const double before[6] = {found.mean[0], found.mean[1], found.mean[2], submap.mean[0], submap.mean[1], submap.mean[2]};
+  Numbers before(found.mean.begin(), found.mean.begin() + 3);
+  before.insert(before.end(), submap.mean.begin(), submap.mean.begin() + 3);
   const Numbers state = moved(before, gain, z);
   put(joint.view().part(0, 0, 3, 3), found.covariance.view().part(0, 0, 3, 3));
   put(joint.view().part(3, 3, 3, 3), submap.covariance.part(0, 0, 3, 3));
