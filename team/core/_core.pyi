@@ -23,6 +23,45 @@ class NotFiniteError(ValueError):
 class MotionError(ValueError):
     pass
 
+def check_finite(data: bytes, what: str, count: int | None = None) -> None:
+    """Raise ValueError unless there are `count` float64, all finite."""
+
+def check_angles(data: bytes, what: str, count: int) -> None:
+    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
+
+def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
+    """
+    Raise ValueError unless there are `count` finite float64, none negative.
+    """
+
+def check_named(data: bytes, what: str) -> None:
+    """
+    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
+
+    A window assigns these numbers itself, so they would collide.
+    """
+
+def check_ascending(data: bytes, what: str) -> None:
+    """Raise ValueError unless the ids are strictly ascending."""
+
+def check_pose_covariance(data: bytes, what: str) -> None:
+    """
+    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
+
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the
+    rounding error of a matrix with a unit diagonal.
+    """
+
+def check_packed_covariance(data: bytes, n: int, what: str) -> None:
+    """
+    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
+    """
+
+def check_blocks(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
+    """
+
 class Consensus:
     """
     The measurements of a window, and which of them agree: those that no others confirm are outliers.
@@ -218,456 +257,6 @@ def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
 
 @overload
 def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
-
-class Calibration:
-    """What corrects a raw measurement of range and bearing, or refuses it."""
-class WholeMap:
-    """
-    N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.
-    """
-
-    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
-
-    @property
-    def ids(self) -> NDArray[numpy.uint32]:
-        """The landmarks' ids (L,), ascending; read-only."""
-
-    @property
-    def mean(self) -> NDArray[numpy.float64]:
-        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
-
-    @property
-    def covariance(self) -> NDArray[numpy.float64]:
-        """(n, n); read-only."""
-
-    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """Copy mean (3,) and covariance (3, 3) of the pose."""
-
-    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
-        """
-        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
-
-        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
-        is as it was.
-        """
-
-    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
-        """
-        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
-
-        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
-        of `joined`, 2 where a single landmark's innovation is singular.
-        """
-
-def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
-    """
-
-class Chain:
-    """
-    A prior and the submaps after it, each beginning at the end of the one before.
-    """
-
-    def __init__(self, prior: WholeMap) -> None: ...
-
-    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
-        """Append the next submap, without pose nodes."""
-
-    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
-        """
-        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
-
-        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
-        """
-
-class ChainSolution:
-    """The least-squares solution of a prior and the submaps after it."""
-
-    @property
-    def map(self) -> WholeMap:
-        """The last end pose and all landmarks."""
-
-    @property
-    def cost(self) -> float:
-        """Chi-squared of all maps, in `dof` degrees of freedom."""
-
-    @property
-    def dof(self) -> int: ...
-
-    @property
-    def known(self) -> NDArray[numpy.int64]:
-        """
-        For each submap, the number of its landmarks that another map has, too.
-        """
-
-    @property
-    def landmark_chi2(self) -> NDArray[numpy.float64]:
-        """Chi-squared of each landmark of the submaps by its own covariance."""
-
-    @property
-    def fault(self) -> int:
-        """
-        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
-        """
-
-    @property
-    def at(self) -> int:
-        """The map without covariance; 0 is the prior."""
-
-def check_finite(data: bytes, what: str, count: int | None = None) -> None:
-    """Raise ValueError unless there are `count` float64, all finite."""
-
-def check_angles(data: bytes, what: str, count: int) -> None:
-    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
-
-def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
-    """
-    Raise ValueError unless there are `count` finite float64, none negative.
-    """
-
-def check_named(data: bytes, what: str) -> None:
-    """
-    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
-
-    A window assigns these numbers itself, so they would collide.
-    """
-
-def check_ascending(data: bytes, what: str) -> None:
-    """Raise ValueError unless the ids are strictly ascending."""
-
-def check_pose_covariance(data: bytes, what: str) -> None:
-    """
-    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
-
-    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding
-    error of a matrix with a unit diagonal.
-    """
-
-def check_packed_covariance(data: bytes, n: int, what: str) -> None:
-    """
-    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
-    """
-
-def check_blocks(data: bytes, count: int, what: str) -> None:
-    """
-    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
-    """
-
-def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
-
-    def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
-        """
-        lens: coefficients of the bearing's error b (l0 + l1 b + l2 b^2); optical_axis [rad]: of a camera whose
-        range is a depth along it; ranges: (least, most) of raw ranges [m]; half_field: half of the field of view [rad].
-        """
-
-    def correct(self, ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64]) -> tuple[NDArray[numpy.bool_], NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """
-        Return which raw measurements are accepted, and all of them corrected: ((r - range_offset)/range_scale,
-        b - bearing_offset - lens(b)).
-
-        A depth is divided by cos(b - optical_axis), too, and NaN where that is below 0.17. Accepted are those
-        in the ranges and the field of view whose corrected range is positive.
-        """
-
-NEAREST_M: float
-
-def predicted(pose: NDArray[numpy.float64], landmark: NDArray[numpy.float64]) -> tuple[float, float]:
-    """
-    Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
-
-    range = max(|landmark - (x, y)|, NEAREST_M), bearing = atan2(dy, dx) - heading in (-pi, pi].
-    """
-
-def predict(pose: NDArray[numpy.float64], landmarks: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Predict the measurements h (L, 2) of landmarks (L, 2), with dh/dxi (L, 2, 3) of h(pose o Exp(xi), landmark) at
-    xi = 0 and dh/dlandmark (L, 2, 2).
-    """
-
-def located(pose: NDArray[numpy.float64], range: float, bearing: float) -> NDArray[numpy.float64]:
-    """
-    Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.
-    """
-
-def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], noise: Sequence[float], own: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
-
-    noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
-    """
-
-def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], poses: NDArray[numpy.float64]) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.
-
-    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
-    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
-    """
-
-class MotionModel:
-    """The parameters of a motion model, as of `team.config.MotionModel`."""
-
-    def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
-        """
-        Noises are (per_s, per_m, per_rad); wheels: their distance, and the noise of the left and of the right one.
-        """
-
-    def increment(self, duration_s: float, forward: float, yaw_rate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """
-        Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
-
-        With v = forward_scale forward (slow_scale forward where |forward| < slow_below),
-        w = clip(yaw_scale yaw_rate, +-yaw_rate_limit), the path length d = sign(v) max(|v| - turn_drag |w|, 0) t,
-        the turn p = w t + veer d and the noises a (forward, on d), b (turn, on p), c (final turn), l (lateral), the
-        motion is
-
-        - "turn-then-drive": turn p + b, drive d + a, then (0, l, c): the thesis, section 4.3.1;
-        - all others: Exp(d + a, 0, p + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma eq. 1-4.
-
-        Returns mean and covariance.
-        """
-
-    def part(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, duration_s: float, share: float, rest: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """
-        Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.
-
-        covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is
-        the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.
-        """
-
-    def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
-        """
-        Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
-        times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.
-        """
-
-def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.
-    """
-
-def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], mount: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
-    """
-
-def shift_after(shift: NDArray[numpy.float64], motion: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.
-    """
-
-class Odometry:
-    """
-    Odometry integrated since the places that matter to a window.
-
-    With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an
-    inter-robot measurement are the base's. A motion is (mean, covariance).
-    """
-
-    def __init__(self, model: MotionModel, mount: Sequence[float] | None) -> None:
-        """
-        mount: the sensor's pose on the base; None where it is at the base's origin.
-        """
-
-    def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
-        """
-        Go on by a part of an interval whose speeds were measured.
-
-        added: variances per second, in addition to the noise.
-        """
-
-    def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
-        """
-        Go on by a part of an interval whose motion was measured, as `MotionModel.part`.
-        """
-
-    def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
-        """
-        End the motion since the last keyframe here.
-
-        Returns it, its shift by an error of the scale of speed, and the motion since the last scan without
-        identities, if there was one.
-        """
-
-    def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """
-        Return the motion since the last scan without identities or keyframe; this is such a scan.
-        """
-
-    def mark_scan(self) -> None:
-        """A scan of a keyframe of several scans is here."""
-
-    def end_scans(self) -> NDArray[numpy.float64]:
-        """
-        Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.
-        """
-
-    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """The motion since the last pose node."""
-
-    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
-        """
-        This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.
-        """
-
-    def mark_sighting(self) -> None:
-        """An inter-robot measurement that waits for the next pose node is here."""
-
-    def forget_sightings(self) -> None:
-        """Forget the marked sightings."""
-
-def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
-
-def inverse(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """b_from_a."""
-
-def between(a_from_b: NDArray[numpy.float64], a_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b."""
-
-def transformed(a_from_b: NDArray[numpy.float64], point_in_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The point's coordinates in frame a."""
-
-def exponential(xi: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Exp: R^3 -> SE(2), the motion at the constant twist xi = (forward, left, turn) for unit time.
-    """
-
-def logarithm(pose: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Log: SE(2) -> R^3, the inverse of `exponential` for |heading| < pi."""
-
-def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Ad with T o Exp(xi) = Exp(Ad_T xi) o T: carries a perturbation from the right to the left.
-    """
-
-def tangent(heading: float) -> NDArray[numpy.float64]:
-    """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
-
-class Random:
-    """
-    Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
-    of the count of numbers drawn before.
-    """
-
-    def __init__(self, key: bytes) -> None:
-        """Begin at the first number of a key of 16 bytes."""
-
-    def uniform(self) -> float:
-        """Draw a number in [0, 1)."""
-
-    def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
-        """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
-class NotPositiveDefiniteError(ValueError):
-    """
-    A pivot of the factorisation is not positive: the block `variable` is undetermined.
-    """
-
-    variable: int = -1
-
-class Pattern:
-    """
-    The stored blocks of the lower triangle of a symmetric matrix, and their places in its factor.
-
-    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1] is
-    block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block.
-    The numbers of a matrix are one flat array: block e row by row from value_start[e] on, diagonal
-    blocks as full squares. Each property makes a new array.
-    """
-
-    def __init__(self, sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> None:
-        """
-        Analyse a pattern: order of elimination, structure of the factor. Raises ValueError for no pattern.
-        """
-
-    @property
-    def sizes(self) -> NDArray[numpy.int64]:
-        """Unknowns of each variable."""
-
-    @property
-    def offset(self) -> NDArray[numpy.int64]:
-        """
-        Index of each variable's first unknown; the last one is the number of unknowns.
-        """
-
-    @property
-    def column_start(self) -> NDArray[numpy.int64]:
-        """
-        Index of each column's first entry; the last one is the number of entries.
-        """
-
-    @property
-    def rows(self) -> NDArray[numpy.int64]:
-        """Row of each entry."""
-
-    @property
-    def columns(self) -> NDArray[numpy.int64]:
-        """Column of each entry."""
-
-    @property
-    def value_start(self) -> NDArray[numpy.int64]:
-        """Index of each entry's first number; the last one is the total length."""
-
-    @property
-    def diagonal(self) -> NDArray[numpy.int64]:
-        """Indices of the diagonal among the numbers of a matrix."""
-
-    @property
-    def panels(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64]]:
-        """Number of columns and of rows of each dense panel of the factor."""
-
-    @property
-    def has_big_panel(self) -> bool:
-        """Whether a panel is factorised by blocks."""
-
-    def block(self, values: NDArray[numpy.float64], row: int, column: int) -> NDArray[numpy.float64]:
-        """
-        Block (row, column) of a symmetric matrix on this pattern; zero where none is stored.
-        """
-
-    def quadratic(self, values: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> float:
-        """Compute xᵀ A x of a matrix on this pattern."""
-
-class Cholesky:
-    """
-    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
-    """
-
-    def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
-        """
-        Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
-        rounding noise of its diagonal entry counts as zero.
-        """
-
-    def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-        """Solve A X = right, (n,) or (n, k)."""
-
-    def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
-        """
-        Compute columns of A⁻¹, (n, k): the covariance of all unknowns with some.
-        """
-
-    def inverse_block(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
-        """
-        Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.
-        """
-
-    def selected_inverse(self) -> NDArray[numpy.float64]:
-        """
-        Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
-        """
-
-def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
-    """
-    Find the elimination order of a pattern's variables by minimum degree, in postorder.
-
-    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
-    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
-    """
 
 class SubmapFactor:
     """
@@ -883,6 +472,415 @@ class Estimate:
         Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,
         ascending; other nodes are constants.
         """
+
+class WholeMap:
+    """
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]:
+        """The landmarks' ids (L,), ascending; read-only."""
+
+    @property
+    def mean(self) -> NDArray[numpy.float64]:
+        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
+
+    @property
+    def covariance(self) -> NDArray[numpy.float64]:
+        """(n, n); read-only."""
+
+    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Copy mean (3,) and covariance (3, 3) of the pose."""
+
+    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
+        """
+        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
+
+        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
+        is as it was.
+        """
+
+    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+        """
+        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
+
+        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
+        of `joined`, 2 where a single landmark's innovation is singular.
+        """
+
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    """
+
+class Chain:
+    """
+    A prior and the submaps after it, each beginning at the end of the one before.
+    """
+
+    def __init__(self, prior: WholeMap) -> None: ...
+
+    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
+        """Append the next submap, without pose nodes."""
+
+    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
+        """
+        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
+
+        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
+        """
+
+class ChainSolution:
+    """The least-squares solution of a prior and the submaps after it."""
+
+    @property
+    def map(self) -> WholeMap:
+        """The last end pose and all landmarks."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared of all maps, in `dof` degrees of freedom."""
+
+    @property
+    def dof(self) -> int: ...
+
+    @property
+    def known(self) -> NDArray[numpy.int64]:
+        """
+        For each submap, the number of its landmarks that another map has, too.
+        """
+
+    @property
+    def landmark_chi2(self) -> NDArray[numpy.float64]:
+        """Chi-squared of each landmark of the submaps by its own covariance."""
+
+    @property
+    def fault(self) -> int:
+        """
+        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
+        """
+
+    @property
+    def at(self) -> int:
+        """The map without covariance; 0 is the prior."""
+
+class Calibration:
+    """What corrects a raw measurement of range and bearing, or refuses it."""
+
+    def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
+        """
+        lens: coefficients of the bearing's error b (l0 + l1 b + l2 b^2); optical_axis [rad]: of a camera whose
+        range is a depth along it; ranges: (least, most) of raw ranges [m]; half_field: half of the field of view [rad].
+        """
+
+    def correct(self, ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64]) -> tuple[NDArray[numpy.bool_], NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return which raw measurements are accepted, and all of them corrected: ((r - range_offset)/range_scale,
+        b - bearing_offset - lens(b)).
+
+        A depth is divided by cos(b - optical_axis), too, and NaN where that is below 0.17. Accepted are those
+        in the ranges and the field of view whose corrected range is positive.
+        """
+
+NEAREST_M: float
+
+def predicted(pose: NDArray[numpy.float64], landmark: NDArray[numpy.float64]) -> tuple[float, float]:
+    """
+    Predict range [m] and bearing [rad] of a point landmark from a pose, both in the map frame.
+
+    range = max(|landmark - (x, y)|, NEAREST_M), bearing = atan2(dy, dx) - heading in (-pi, pi].
+    """
+
+def predict(pose: NDArray[numpy.float64], landmarks: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Predict the measurements h (L, 2) of landmarks (L, 2), with dh/dxi (L, 2, 3) of h(pose o Exp(xi), landmark) at
+    xi = 0 and dh/dlandmark (L, 2, 2).
+    """
+
+def located(pose: NDArray[numpy.float64], range: float, bearing: float) -> NDArray[numpy.float64]:
+    """
+    Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.
+    """
+
+def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], noise: Sequence[float], own: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
+
+    noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
+    """
+
+def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], poses: NDArray[numpy.float64]) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.
+
+    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
+    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
+    """
+
+class MotionModel:
+    """The parameters of a motion model, as of `team.config.MotionModel`."""
+
+    def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
+        """
+        Noises are (per_s, per_m, per_rad); wheels: their distance, and the noise of the left and of the right one.
+        """
+
+    def increment(self, duration_s: float, forward: float, yaw_rate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
+
+        With v = forward_scale forward (slow_scale forward where |forward| < slow_below),
+        w = clip(yaw_scale yaw_rate, +-yaw_rate_limit), the path length d = sign(v) max(|v| - turn_drag |w|, 0) t,
+        the turn p = w t + veer d and the noises a (forward, on d), b (turn, on p), c (final turn), l (lateral), the
+        motion is
+
+        - "turn-then-drive": turn p + b, drive d + a, then (0, l, c): the thesis, section 4.3.1;
+        - all others: Exp(d + a, 0, p + b), then (0, l, c): the arc of Thrun et al. table 5.3 and Ma & Ma eq. 1-4.
+
+        Returns mean and covariance.
+        """
+
+    def part(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, duration_s: float, share: float, rest: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.
+
+        covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is
+        the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.
+        """
+
+    def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
+        """
+        Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
+        times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.
+        """
+
+def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.
+    """
+
+def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], mount: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
+    """
+
+def shift_after(shift: NDArray[numpy.float64], motion: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.
+    """
+
+class Odometry:
+    """
+    Odometry integrated since the places that matter to a window.
+
+    With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an
+    inter-robot measurement are the base's. A motion is (mean, covariance).
+    """
+
+    def __init__(self, model: MotionModel, mount: Sequence[float] | None) -> None:
+        """
+        mount: the sensor's pose on the base; None where it is at the base's origin.
+        """
+
+    def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose speeds were measured.
+
+        added: variances per second, in addition to the noise.
+        """
+
+    def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
+        """
+        Go on by a part of an interval whose motion was measured, as `MotionModel.part`.
+        """
+
+    def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
+        """
+        End the motion since the last keyframe here.
+
+        Returns it, its shift by an error of the scale of speed, and the motion since the last scan without
+        identities, if there was one.
+        """
+
+    def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Return the motion since the last scan without identities or keyframe; this is such a scan.
+        """
+
+    def mark_scan(self) -> None:
+        """A scan of a keyframe of several scans is here."""
+
+    def end_scans(self) -> NDArray[numpy.float64]:
+        """
+        Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.
+        """
+
+    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """The motion since the last pose node."""
+
+    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
+        """
+        This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.
+        """
+
+    def mark_sighting(self) -> None:
+        """An inter-robot measurement that waits for the next pose node is here."""
+
+    def forget_sightings(self) -> None:
+        """Forget the marked sightings."""
+
+class Random:
+    """
+    Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
+    of the count of numbers drawn before.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        """Begin at the first number of a key of 16 bytes."""
+
+    def uniform(self) -> float:
+        """Draw a number in [0, 1)."""
+
+    def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
+        """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
+
+def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
+
+def inverse(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_a."""
+
+def between(a_from_b: NDArray[numpy.float64], a_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b."""
+
+def transformed(a_from_b: NDArray[numpy.float64], point_in_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The point's coordinates in frame a."""
+
+def exponential(xi: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Exp: R^3 -> SE(2), the motion at the constant twist xi = (forward, left, turn) for unit time.
+    """
+
+def logarithm(pose: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Log: SE(2) -> R^3, the inverse of `exponential` for |heading| < pi."""
+
+def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Ad with T o Exp(xi) = Exp(Ad_T xi) o T: carries a perturbation from the right to the left.
+    """
+
+def tangent(heading: float) -> NDArray[numpy.float64]:
+    """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
+
+class NotPositiveDefiniteError(ValueError):
+    """
+    A pivot of the factorisation is not positive: the block `variable` is undetermined.
+    """
+
+    variable: int = -1
+
+class Pattern:
+    """
+    The stored blocks of the lower triangle of a symmetric matrix, and their places in its factor.
+
+    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1] is
+    block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block.
+    The numbers of a matrix are one flat array: block e row by row from value_start[e] on, diagonal
+    blocks as full squares. Each property makes a new array.
+    """
+
+    def __init__(self, sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> None:
+        """
+        Analyse a pattern: order of elimination, structure of the factor. Raises ValueError for no pattern.
+        """
+
+    @property
+    def sizes(self) -> NDArray[numpy.int64]:
+        """Unknowns of each variable."""
+
+    @property
+    def offset(self) -> NDArray[numpy.int64]:
+        """
+        Index of each variable's first unknown; the last one is the number of unknowns.
+        """
+
+    @property
+    def column_start(self) -> NDArray[numpy.int64]:
+        """
+        Index of each column's first entry; the last one is the number of entries.
+        """
+
+    @property
+    def rows(self) -> NDArray[numpy.int64]:
+        """Row of each entry."""
+
+    @property
+    def columns(self) -> NDArray[numpy.int64]:
+        """Column of each entry."""
+
+    @property
+    def value_start(self) -> NDArray[numpy.int64]:
+        """Index of each entry's first number; the last one is the total length."""
+
+    @property
+    def diagonal(self) -> NDArray[numpy.int64]:
+        """Indices of the diagonal among the numbers of a matrix."""
+
+    @property
+    def panels(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64]]:
+        """Number of columns and of rows of each dense panel of the factor."""
+
+    @property
+    def has_big_panel(self) -> bool:
+        """Whether a panel is factorised by blocks."""
+
+    def block(self, values: NDArray[numpy.float64], row: int, column: int) -> NDArray[numpy.float64]:
+        """
+        Block (row, column) of a symmetric matrix on this pattern; zero where none is stored.
+        """
+
+    def quadratic(self, values: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> float:
+        """Compute xᵀ A x of a matrix on this pattern."""
+
+class Cholesky:
+    """
+    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
+    """
+
+    def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
+        """
+        Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
+        rounding noise of its diagonal entry counts as zero.
+        """
+
+    def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+        """Solve A X = right, (n,) or (n, k)."""
+
+    def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute columns of A⁻¹, (n, k): the covariance of all unknowns with some.
+        """
+
+    def inverse_block(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.
+        """
+
+    def selected_inverse(self) -> NDArray[numpy.float64]:
+        """
+        Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
+        """
+
+def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
+    """
+    Find the elimination order of a pattern's variables by minimum degree, in postorder.
+
+    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
+    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
+    """
 
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""

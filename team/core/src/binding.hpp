@@ -225,17 +225,15 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
 }
 
 // One function for each file of bindings.
-void bind_consensus(nb::module_& m);
-void bind_dense(nb::module_& m);
-void bind_elementary(nb::module_& m);
-void bind_random(nb::module_& m);
-void bind_models(nb::module_& m);
-void bind_motion(nb::module_& m);
 void bind_checks(nb::module_& m);
+void bind_consensus(nb::module_& m);
 void bind_dense(nb::module_& m);
 void bind_elementary(nb::module_& m);
 void bind_graph(nb::module_& m);
 void bind_maps(nb::module_& m);
+void bind_models(nb::module_& m);
+void bind_motion(nb::module_& m);
+void bind_random(nb::module_& m);
 void bind_se2(nb::module_& m);
 void bind_sparse(nb::module_& m);
 void bind_window(nb::module_& m);

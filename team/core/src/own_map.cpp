@@ -43,6 +43,12 @@ void put(View to, Const from) {
   for (std::size_t i = 0; i < from.rows; i++) std::copy(from[i], from[i] + from.columns, to[i]);
 }
 
+Matrix negative(Matrix A) {
+  for (std::size_t i = 0; i < A.rows(); i++)
+    for (std::size_t j = 0; j < A.columns(); j++) A[i][j] = -A[i][j];
+  return A;
+}
+
 // Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ.
 Matrix of_map(Const P, const Numbers& lever) {
   Matrix U(P.rows, lever.size());
@@ -273,7 +279,7 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   Matrix whole = map.covariance, local(submap.covariance);
   subtract(whole, dense::product(map_gain, Ut));
   subtract(local, dense::product(gain, Vt));
-  const Matrix cross = dense::product(dense::negative(map_gain), Vt);
+  const Matrix cross = dense::product(negative(map_gain), Vt);
   // The new pose and the new landmarks are made of (pose, submap).
   Matrix own(3 + m, 3 + m), with_old(old, 3 + m);
   put(own.view().part(0, 0, 3, 3), whole.view().part(0, 0, 3, 3));
