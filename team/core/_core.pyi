@@ -446,10 +446,10 @@ class Estimate:
     def boundary_covariance(self) -> NDArray[numpy.float64]:
         """The joint covariance of the condensed factor's nodes."""
 
-    def take_step(self, damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
+    def take_step(self, damping: float, halvings: int, most_damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
         """
-        Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a more
-        damped one. Returns the next state, the next damping and the full step's largest change; where no damping
+        Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on; else a
+        more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest change; where no damping
         helps the state is None, the damping infinite and the change that of the first step.
         """
 

@@ -141,7 +141,9 @@ void bind_graph(nb::module_& m) {
            },
            "weights"_a,
            "Make the same submap with each landmark's own covariance enlarged by its weight: P + blkdiag(0, (1/w - 1) P_ll).")
-      .def_prop_ro("information", [](const Submap& self) { return made_matrix(dense::Matrix(self.information)); }, nb::rv_policy::move, "P⁻¹.")
+      .def_prop_ro("information",
+                   [](const Submap& self) { return made_matrix(dense::Matrix(self.information)); },
+                   nb::rv_policy::move, "P⁻¹.")
       .def_prop_ro("sensitivity", [](const Submap& self) { return made_matrix(dense::Matrix(self.sensitivity)); },
                    nb::rv_policy::move, "∂mean/∂b, a row per bias.")
       .def_prop_ro("landmarks",
@@ -244,13 +246,17 @@ void bind_graph(nb::module_& m) {
                    "Weight of each landmark of each submap: 1 up to its gate or without a robust loss.")
       .def_prop_ro("dimensions", made_by(&Estimate::dimensions), nb::rv_policy::move,
                    "Dimension of each submap, a discounted landmark counting by its weight.")
-      .def_prop_ro("chi2", copied(&Estimate::chi2), nb::rv_policy::move, "rᵀ(f P)⁻¹r of each submap, with discounted landmarks.")
-      .def_prop_ro("whole_chi2", made_by(&Estimate::whole_chi2), nb::rv_policy::move, "rᵀ(f P)⁻¹r of each submap, without discounting.")
+      .def_prop_ro("chi2", copied(&Estimate::chi2), nb::rv_policy::move,
+                   "rᵀ(f P)⁻¹r of each submap, with discounted landmarks.")
+      .def_prop_ro("whole_chi2", made_by(&Estimate::whole_chi2), nb::rv_policy::move,
+                   "rᵀ(f P)⁻¹r of each submap, without discounting.")
       .def_prop_ro("counted_chi2", made_by(&Estimate::counted_chi2), nb::rv_policy::move,
                    "χ² of each submap in which each landmark's share w χ² counts w times.")
       .def_prop_ro("weights", made_by(&Estimate::weights), nb::rv_policy::move, "Robust weight of each submap.")
-      .def_prop_ro("sighting_chi2", copied(&Estimate::sighting_chi2), nb::rv_policy::move, "rᵀR⁻¹r of each inter-robot measurement.")
-      .def_prop_ro("sighting_weights", made_by(&Estimate::sighting_weights), nb::rv_policy::move, "Robust weight of each inter-robot measurement.")
+      .def_prop_ro("sighting_chi2", copied(&Estimate::sighting_chi2), nb::rv_policy::move,
+                   "rᵀR⁻¹r of each inter-robot measurement.")
+      .def_prop_ro("sighting_weights", made_by(&Estimate::sighting_weights), nb::rv_policy::move,
+                   "Robust weight of each inter-robot measurement.")
       .def_prop_ro("prior_chi2", made_by(&Estimate::prior_chi2), nb::rv_policy::move, "χ² of each prior.")
       .def_prop_ro("prior_weights", made_by(&Estimate::prior_weights), nb::rv_policy::move,
                    "Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.")
@@ -282,21 +288,23 @@ void bind_graph(nb::module_& m) {
                    [](const Estimate& self) { return made_matrix(self.graph().among_boundary(self.selected_covariance())); },
                    nb::rv_policy::move, "The joint covariance of the condensed factor's nodes.")
       .def("take_step",
-           [](const Estimate& self, double damping) {
-             graph::Step step = self.take_step(damping);
+           [](const Estimate& self, double damping, int halvings, double most_damping) {
+             check(damping >= 0.0, "the damping must not be negative");
+             graph::Step step = self.take_step(damping, halvings, most_damping);
              std::optional<MadeNumbers> state;
              if (!step.state.empty()) state = made_numbers(std::move(step.state));
              return std::tuple(std::move(state), step.damping, step.change);
            },
-           "damping"_a,
-           "Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a more\n"
-           "damped one. Returns the next state, the next damping and the full step's largest change; where no damping\n"
+           "damping"_a, "halvings"_a, "most_damping"_a,
+           "Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on; else a\n"
+           "more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest change; where no damping\n"
            "helps the state is None, the damping infinite and the change that of the first step.")
       .def_prop_ro("explained", made_by(&Estimate::explained), nb::rv_policy::move,
                    "tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.")
       .def_prop_ro("explained_by_sightings", made_by(&Estimate::explained_by_sightings), nb::rv_policy::move,
                    "tr(JᵀR⁻¹J Σ) of each inter-robot measurement.")
-      .def_prop_ro("explained_by_priors", made_by(&Estimate::explained_by_priors), nb::rv_policy::move, "tr(P⁻¹ Σ) of each prior.")
+      .def_prop_ro("explained_by_priors", made_by(&Estimate::explained_by_priors), nb::rv_policy::move,
+                   "tr(P⁻¹ Σ) of each prior.")
       .def("quadratic",
            [](const Estimate& self, const IndexArray& nodes, const Marks& submaps, const Marks& sightings, const Marks& priors) {
              for (std::size_t k = 0; k < nodes.size(); k++)

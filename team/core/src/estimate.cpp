@@ -312,10 +312,10 @@ Numbers Estimate::moved(const Numbers& step, double share) const {
   return moved;
 }
 
-Step Estimate::take_step(double damping) const {
+Step Estimate::take_step(double damping, int halvings, double most_damping) const {
   const double before = cost_of(*this);
   std::optional<double> refused;
-  while (damping < MOST_DAMPING) {
+  while (damping < most_damping) {
     Numbers step;
     if (damping != 0.0) {
       auto [damped, gradient] = normal_equations();
@@ -328,8 +328,8 @@ Step Estimate::take_step(double damping) const {
     double largest = 0.0;
     for (const double x : step)
       if (largest == largest && !(std::fabs(x) <= largest)) largest = std::fabs(x);  // NaN stays
-    for (const double share : SHARES) {
-      if (damping != 0.0 && share < 1.0) break;
+    double share = 1.0;
+    for (int k = 0; k <= (damping != 0.0 ? 0 : halvings); k++, share *= 0.5) {
       const Estimate after(graph_, moved(step, share), scale_, sighting_scale_, loss_);
       if (cost_of(after) <= before * (1.0 + ROUNDING) + ROUNDING)
         return {after.state_, damping > LEAST_DAMPING ? damping / 10.0 : 0.0, largest};

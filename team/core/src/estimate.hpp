@@ -11,10 +11,7 @@
 namespace teamslam::graph {
 
 inline constexpr double LEAST_WEIGHT = 1e-6;  // of a landmark, so that each stays determined
-// A step's shares that are tried before damping: in the long curved valleys of odometry damped steps
-// are very short.
-inline constexpr double SHARES[] = {1.0, 0.5, 0.25, 0.125, 0.0625};
-inline constexpr double LEAST_DAMPING = 1e-4, MOST_DAMPING = 1e8;
+inline constexpr double LEAST_DAMPING = 1e-4;
 inline constexpr double ROUNDING = 1e-10;  // the relative rise of the cost that is rounding near the minimum
 
 struct Loss {
@@ -78,9 +75,9 @@ class Estimate {
   const Numbers& step() const;  // −A⁻¹g
   const Numbers& selected_covariance() const;
 
-  // The step −(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, a share of it; else a
-  // more damped one.
-  Step take_step(double damping) const;
+  // The step −(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on;
+  // else a more damped one, up to most_damping.
+  Step take_step(double damping, int halvings, double most_damping) const;
 
   // tr(JᵀP⁻¹J Σ) of each factor: the part of its numbers that the solution absorbs. For a solution with
   // these weights the sum over all factors is the number of unknowns.

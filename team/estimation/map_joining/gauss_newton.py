@@ -28,6 +28,8 @@ from team.config import Bias
 from team.estimation import dense
 from team.estimation.gaussian import NotACovarianceError
 from team.estimation.map_joining.least_squares import (
+    HALVINGS,
+    MOST_DAMPING,
     STUCK,
     Values,
     robust_scale,
@@ -279,7 +281,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
     change of the first step.
     """
     with island.determined():
-        state, damping, change = island.estimate.take_step(damping)
+        state, damping, change = island.estimate.take_step(damping, HALVINGS, MOST_DAMPING)
     if state is None:
         return island, Iteration(STUCK, change)
     older = replace(aged(island, 1), state=state)

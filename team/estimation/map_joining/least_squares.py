@@ -12,16 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 Values = Float[np.ndarray, " _"]
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Shares of an undamped step that are tried before damping: in the long curved valleys of odometry
-damped steps are very short.
+HALVINGS = 4
+"""Number of times that an undamped step is halved before damping: in the long curved valleys of
+odometry damped steps are very short.
 """
-LEAST_DAMPING = 1e-4
 MOST_DAMPING = 1e8
 STUCK = math.inf
 """Damping of a point from which no step lowers the cost."""
-ROUNDING = 1e-10
-"""Relative rise of the cost accepted as rounding near the minimum."""
 
 
 def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:

@@ -7,7 +7,7 @@ Indices = Int64[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 
 
-def upper_of(upper: Matrix, chosen: Indices, size: int) -> Matrix:
+def upper_of(upper: Matrix, chosen: Indices, size: int) -> Float[np.ndarray, "m m"]:
     """Return the upper triangle among these ascending numbers, at the corner of a larger matrix."""
     result = np.zeros((size, size))
     for a, row in enumerate(chosen.tolist()):

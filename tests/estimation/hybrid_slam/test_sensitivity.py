@@ -413,9 +413,15 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
     assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
     assert plain.estimate.prior_weights[k] == 1.0
-    h, everyone = 1e-4 * sigma, np.ones(len(island.graph.priors), np.bool_)
+    graph, h = island.graph, 1e-4 * sigma
+    counts = len(graph.submaps), len(graph.sightings), len(graph.priors)
+    marks = [np.full(count, k == 2) for k, count in enumerate(counts)]
+    nodes = np.unique([each.node for each in graph.priors])
+
+    def prior_cost(by):
+        return shifted(by).estimate.quadratic(nodes, *marks)[2]
+
     for by in (0.5 * sigma, 10.0 * sigma):
-        above, below = (shifted(by + d)._prior_cost(everyone) for d in (h, -h))
-        slope = (above - below) / (2.0 * h)
+        slope = (prior_cost(by + h) - prior_cost(by - h)) / (2.0 * h)
         weighted = shifted(by).estimate.prior_weights[k] * prior.information[0, 0] * by
         assert slope == pytest.approx(2.0 * weighted, rel=1e-5)
