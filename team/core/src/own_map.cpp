@@ -270,10 +270,10 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   // The covariance of (map, submap) after the update: P less P Hᵀ S⁻¹ H P.
   const Matrix map_gain = dense::product(U, found.tie.inverse), gain = dense::product(V, found.tie.inverse);
   const Matrix Ut = dense::transposed(U), Vt = dense::transposed(V);
-  Matrix whole = map.covariance, local(submap.covariance);
+  Matrix whole = map.covariance, local(submap.covariance), cross(n, m);
   subtract(whole, dense::product(map_gain, Ut));
   subtract(local, dense::product(gain, Vt));
-  const Matrix cross = dense::product(dense::negative(map_gain), Vt);
+  subtract(cross, dense::product(map_gain, Vt));
   // The new pose and the new landmarks are made of (pose, submap).
   Matrix own(3 + m, 3 + m), with_old(old, 3 + m);
   put(own.view().part(0, 0, 3, 3), whole.view().part(0, 0, 3, 3));
