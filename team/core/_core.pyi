@@ -258,6 +258,326 @@ def hypot(x: NDArray[numpy.float64], y: float) -> NDArray[numpy.float64]: ...
 @overload
 def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
+class WholeMap:
+    """
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]:
+        """The landmarks' ids (L,), ascending; read-only."""
+
+    @property
+    def mean(self) -> NDArray[numpy.float64]:
+        """(x, y, theta, x1, y1, ...), n = 3 + 2 L numbers; read-only."""
+
+    @property
+    def covariance(self) -> NDArray[numpy.float64]:
+        """(n, n); read-only."""
+
+    def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Copy mean (3,) and covariance (3, 3) of the pose."""
+
+    def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
+        """
+        Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
+
+        Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map
+        is as it was.
+        """
+
+    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+        """
+        Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
+
+        Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as
+        of `joined`, 2 where a single landmark's innovation is singular.
+        """
+
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+    """
+    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    """
+
+class Chain:
+    """
+    A prior and the submaps after it, each beginning at the end of the one before.
+    """
+
+    def __init__(self, prior: WholeMap) -> None: ...
+
+    def append(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None:
+        """Append the next submap, without pose nodes."""
+
+    def solve(self, iterations: int, tolerance: float) -> ChainSolution:
+        """
+        Minimise the squares over all poses and landmarks by damped Gauss-Newton.
+
+        tolerance: the largest change of a number, of an undamped step, at which the iterations stop.
+        """
+
+class ChainSolution:
+    """The least-squares solution of a prior and the submaps after it."""
+
+    @property
+    def map(self) -> WholeMap:
+        """The last end pose and all landmarks."""
+
+    @property
+    def cost(self) -> float:
+        """Chi-squared of all maps, in `dof` degrees of freedom."""
+
+    @property
+    def dof(self) -> int: ...
+
+    @property
+    def known(self) -> NDArray[numpy.int64]:
+        """
+        For each submap, the number of its landmarks that another map has, too.
+        """
+
+    @property
+    def landmark_chi2(self) -> NDArray[numpy.float64]:
+        """Chi-squared of each landmark of the submaps by its own covariance."""
+
+    @property
+    def fault(self) -> int:
+        """
+        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
+        """
+
+    @property
+    def at(self) -> int:
+        """The map without covariance; 0 is the prior."""
+
+def check_finite(data: bytes, what: str, count: int | None = None) -> None:
+    """Raise ValueError unless there are `count` float64, all finite."""
+
+def check_angles(data: bytes, what: str, count: int) -> None:
+    """Raise ValueError unless there are `count` angles in [-pi, pi]."""
+
+def check_ranges(data: bytes, what: str, count: int | None = None) -> None:
+    """
+    Raise ValueError unless there are `count` finite float64, none negative.
+    """
+
+def check_named(data: bytes, what: str) -> None:
+    """
+    Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.
+
+    A window assigns these numbers itself, so they would collide.
+    """
+
+def check_ascending(data: bytes, what: str) -> None:
+    """Raise ValueError unless the ids are strictly ascending."""
+
+def check_pose_covariance(data: bytes, what: str) -> None:
+    """
+    Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
+
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the
+    rounding error of a matrix with a unit diagonal.
+    """
+
+def check_packed_covariance(data: bytes, n: int, what: str) -> None:
+    """
+    Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.
+    """
+
+def check_blocks(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` packed 2 x 2 covariances (3 float64 each).
+    """
+
+def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
+
+    Raises ValueError where A has not as many columns as B has rows.
+    """
+
+def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
+
+    Raises LinAlgError where A is singular.
+    """
+
+def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
+    """
+
+def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the lower L with L L^T = A from the lower triangle of A.
+
+    Raises LinAlgError where A is not positive definite.
+    """
+
+def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute (L L^T)^-1 of a lower triangular L, exactly symmetric."""
+
+def forward(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Compute L^-1 B of a lower triangular L; B is a vector or a matrix."""
+
+def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute (L L^T)^-1 B of a lower triangular L; B is a vector or a matrix.
+    """
+
+def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
+    """
+    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
+    """
+
+def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    """
+
+def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
+    """
+
+def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
+
+def inverse(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_a."""
+
+def between(a_from_b: NDArray[numpy.float64], a_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b."""
+
+def transformed(a_from_b: NDArray[numpy.float64], point_in_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """The point's coordinates in frame a."""
+
+def exponential(xi: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Exp: R^3 -> SE(2), the motion at the constant twist xi = (forward, left, turn) for unit time.
+    """
+
+def logarithm(pose: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Log: SE(2) -> R^3, the inverse of `exponential` for |heading| < pi."""
+
+def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Ad with T o Exp(xi) = Exp(Ad_T xi) o T: carries a perturbation from the right to the left.
+    """
+
+def tangent(heading: float) -> NDArray[numpy.float64]:
+    """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
+
+class NotPositiveDefiniteError(ValueError):
+    """
+    A pivot of the factorisation is not positive: the block `variable` is undetermined.
+    """
+
+    variable: int = -1
+
+class Pattern:
+    """
+    The stored blocks of the lower triangle of a symmetric matrix, and their places in its factor.
+
+    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1] is
+    block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block.
+    The numbers of a matrix are one flat array: block e row by row from value_start[e] on, diagonal
+    blocks as full squares. Each property makes a new array.
+    """
+
+    def __init__(self, sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> None:
+        """
+        Analyse a pattern: order of elimination, structure of the factor. Raises ValueError for no pattern.
+        """
+
+    @property
+    def sizes(self) -> NDArray[numpy.int64]:
+        """Unknowns of each variable."""
+
+    @property
+    def offset(self) -> NDArray[numpy.int64]:
+        """
+        Index of each variable's first unknown; the last one is the number of unknowns.
+        """
+
+    @property
+    def column_start(self) -> NDArray[numpy.int64]:
+        """
+        Index of each column's first entry; the last one is the number of entries.
+        """
+
+    @property
+    def rows(self) -> NDArray[numpy.int64]:
+        """Row of each entry."""
+
+    @property
+    def columns(self) -> NDArray[numpy.int64]:
+        """Column of each entry."""
+
+    @property
+    def value_start(self) -> NDArray[numpy.int64]:
+        """Index of each entry's first number; the last one is the total length."""
+
+    @property
+    def diagonal(self) -> NDArray[numpy.int64]:
+        """Indices of the diagonal among the numbers of a matrix."""
+
+    @property
+    def panels(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64]]:
+        """Number of columns and of rows of each dense panel of the factor."""
+
+    @property
+    def has_big_panel(self) -> bool:
+        """Whether a panel is factorised by blocks."""
+
+    def block(self, values: NDArray[numpy.float64], row: int, column: int) -> NDArray[numpy.float64]:
+        """
+        Block (row, column) of a symmetric matrix on this pattern; zero where none is stored.
+        """
+
+    def quadratic(self, values: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> float:
+        """Compute xᵀ A x of a matrix on this pattern."""
+
+class Cholesky:
+    """
+    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
+    """
+
+    def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
+        """
+        Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
+        rounding noise of its diagonal entry counts as zero.
+        """
+
+    def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+        """Solve A X = right, (n,) or (n, k)."""
+
+    def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute columns of A⁻¹, (n, k): the covariance of all unknowns with some.
+        """
+
+    def inverse_block(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.
+        """
+
+    def selected_inverse(self) -> NDArray[numpy.float64]:
+        """
+        Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
+        """
+
+def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
+    """
+    Find the elimination order of a pattern's variables by minimum degree, in postorder.
+
+    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
+    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
+    """
+
 class SubmapFactor:
     """
     A submap as a factor between its start pose, its other poses, its landmarks and its biases.

@@ -43,12 +43,6 @@ void put(View to, Const from) {
   for (std::size_t i = 0; i < from.rows; i++) std::copy(from[i], from[i] + from.columns, to[i]);
 }
 
-Matrix negative(Matrix A) {
-  for (std::size_t i = 0; i < A.rows(); i++)
-    for (std::size_t j = 0; j < A.columns(); j++) A[i][j] = -A[i][j];
-  return A;
-}
-
 // Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ.
 Matrix of_map(Const P, const Numbers& lever) {
   Matrix U(P.rows, lever.size());
@@ -276,10 +270,10 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   // The covariance of (map, submap) after the update: P less P Hᵀ S⁻¹ H P.
   const Matrix map_gain = dense::product(U, found.tie.inverse), gain = dense::product(V, found.tie.inverse);
   const Matrix Ut = dense::transposed(U), Vt = dense::transposed(V);
-  Matrix whole = map.covariance, local(submap.covariance);
+  Matrix whole = map.covariance, local(submap.covariance), cross(n, m);
   subtract(whole, dense::product(map_gain, Ut));
   subtract(local, dense::product(gain, Vt));
-  const Matrix cross = dense::product(negative(map_gain), Vt);
+  subtract(cross, dense::product(map_gain, Vt));
   // The new pose and the new landmarks are made of (pose, submap).
   Matrix own(3 + m, 3 + m), with_old(old, 3 + m);
   put(own.view().part(0, 0, 3, 3), whole.view().part(0, 0, 3, 3));
