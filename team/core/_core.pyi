@@ -412,6 +412,113 @@ def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
 def tangent(heading: float) -> NDArray[numpy.float64]:
     """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
 
+class NotPositiveDefiniteError(ValueError):
+    """
+    A pivot of the factorisation is not positive: the block `variable` is undetermined.
+    """
+
+    variable: int = -1
+
+class Pattern:
+    """
+    The stored blocks of the lower triangle of a symmetric matrix, and their places in its factor.
+
+    sizes: unknowns of each block variable. Entry e with column_start[j] ≤ e < column_start[j + 1] is
+    block (rows[e], j), rows[e] ≥ j; the first entry of each column is its diagonal block.
+    The numbers of a matrix are one flat array: block e row by row from value_start[e] on, diagonal
+    blocks as full squares. Each property makes a new array.
+    """
+
+    def __init__(self, sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> None:
+        """
+        Analyse a pattern: order of elimination, structure of the factor. Raises ValueError for no pattern.
+        """
+
+    @property
+    def sizes(self) -> NDArray[numpy.int64]:
+        """Unknowns of each variable."""
+
+    @property
+    def offset(self) -> NDArray[numpy.int64]:
+        """
+        Index of each variable's first unknown; the last one is the number of unknowns.
+        """
+
+    @property
+    def column_start(self) -> NDArray[numpy.int64]:
+        """
+        Index of each column's first entry; the last one is the number of entries.
+        """
+
+    @property
+    def rows(self) -> NDArray[numpy.int64]:
+        """Row of each entry."""
+
+    @property
+    def columns(self) -> NDArray[numpy.int64]:
+        """Column of each entry."""
+
+    @property
+    def value_start(self) -> NDArray[numpy.int64]:
+        """Index of each entry's first number; the last one is the total length."""
+
+    @property
+    def diagonal(self) -> NDArray[numpy.int64]:
+        """Indices of the diagonal among the numbers of a matrix."""
+
+    @property
+    def panels(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64]]:
+        """Number of columns and of rows of each dense panel of the factor."""
+
+    @property
+    def has_big_panel(self) -> bool:
+        """Whether a panel is factorised by blocks."""
+
+    def block(self, values: NDArray[numpy.float64], row: int, column: int) -> NDArray[numpy.float64]:
+        """
+        Block (row, column) of a symmetric matrix on this pattern; zero where none is stored.
+        """
+
+    def quadratic(self, values: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> float:
+        """Compute xᵀ A x of a matrix on this pattern."""
+
+class Cholesky:
+    """
+    The Cholesky factor L of a matrix on a pattern: L Lᵀ = A, permuted. Its numbers are finite.
+    """
+
+    def __init__(self, pattern: Pattern, values: NDArray[numpy.float64]) -> None:
+        """
+        Factorise A. Raises NotPositiveDefiniteError, which names the variable of the pivot; a pivot that is
+        rounding noise of its diagonal entry counts as zero.
+        """
+
+    def solve(self, right: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+        """Solve A X = right, (n,) or (n, k)."""
+
+    def inverse_columns(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute columns of A⁻¹, (n, k): the covariance of all unknowns with some.
+        """
+
+    def inverse_block(self, unknowns: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.
+        """
+
+    def selected_inverse(self) -> NDArray[numpy.float64]:
+        """
+        Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
+        """
+
+def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
+    """
+    Find the elimination order of a pattern's variables by minimum degree, in postorder.
+
+    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
+    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
+    """
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 

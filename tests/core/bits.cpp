@@ -1,18 +1,20 @@
-// Hash of all results of made-up windows: one number for every compiler and processor.
+// Hashes of all results of made-up windows, their smoothers and sparse systems: the same for every compiler and processor.
 //
 // Built by tests/core/test_bits.py together with the sources of team/core. Its inputs come from a
 // generator of its own, since those of the standard library differ between libraries.
 #include <cstdint>
 #include <cstdio>
 
-#include "window.hpp"
+#include "consensus.hpp"
+#include "sensitivity.hpp"
+#include "sparse.hpp"
 
 using namespace teamslam;
 using window::Rows;
 
 namespace {
 
-std::uint64_t state = 20210917, hash = 1469598103934665603u;
+std::uint64_t state = 20210917, hash;
 
 double uniform() {  // Knuth's MMIX generator
   state = state * 6364136223846793005u + 1442695040888963407u;
@@ -86,9 +88,82 @@ void run_window(int number) {
   add(run.of_base().path());
 }
 
+// Every second system is dense enough for a panel that is factored by blocks.
+void run_sparse(int number) {
+  const sparse::Index variables = number % 2 ? 160 : 1 + sparse::Index(40 * uniform());
+  const double share = number % 2 ? 0.8 : 0.3 * uniform();
+  std::vector<sparse::Index> sizes, start = {0}, rows;
+  for (sparse::Index j = 0; j < variables; j++) {
+    sizes.push_back(1 + sparse::Index(3 * uniform()));
+    rows.push_back(j);
+    for (sparse::Index i = j + 1; i < variables; i++)
+      if (uniform() < share) rows.push_back(i);
+    start.push_back(sparse::Index(rows.size()));
+  }
+  const auto pattern = std::make_shared<const sparse::Pattern>(sizes, start, rows);
+  std::vector<double> values(pattern->numbers());
+  for (double& each : values) each = normal();
+  for (const sparse::Index each : pattern->diagonal()) values[each] = 2000.0 + 1000.0 * uniform();
+  const sparse::Cholesky factor(pattern, values);
+  std::vector<sparse::Index> some;
+  for (sparse::Index k = 0; k < pattern->unknowns(); k += 1 + number % 3) some.push_back(pattern->unknowns() - 1 - k);
+  for (const std::size_t columns : {1, 2, 5, 70}) {
+    dense::Matrix right(pattern->unknowns(), columns);
+    for (std::size_t i = 0; i < right.rows(); i++)
+      for (std::size_t c = 0; c < columns; c++) right[i][c] = normal();
+    add(factor.solve(right).numbers());
+  }
+  add(factor.inverse_columns(some).numbers());
+  add(factor.inverse_block(some).numbers());
+  add(factor.selected_inverse());
+}
+
+// A drive along an arc among five landmarks; every fourth measurement is an outlier.
+void run_smoother(int number) {
+  const models::Noise noise = {0.01, number % 3 ? 0.0 : 0.002, number % 5 ? 1.0 : 0.6, 0.0004, 1.0};
+  window::Window run({3, true, noise, number % 4 == 1 ? se2::Mount(0.3, -0.2, 0.5) : se2::Mount()});
+  window::Consensus consensus(noise, 30.0, elementary::TWO_PI, number % 2 ? 0.3 : 0.01);
+  const motion::Increment step = {{1.0, 0.05, 0.15}, {{{0.01, 0.0, 0.001}, {0.0, 0.002, 0.0}, {0.001, 0.0, 0.0009}}}};
+  se2::Pose<double> pose{};
+  for (int k = 0; k < 10; k++) {
+    pose = se2::compose(pose, step.mean);
+    std::vector<std::uint32_t> ids;
+    std::vector<double> ranges, bearings, normals;
+    std::vector<models::Claim> claims;
+    for (int n = k == 3 ? 0 : int(6 * uniform()); n > 0; n--) {
+      const std::uint32_t id = std::uint32_t(5 * uniform());
+      const models::Polar seen = models::polar(pose, {3.0 * id - 1.0, id % 2 ? 4.0 : -5.0});
+      const double off = uniform() < 0.25 ? 3.0 : 0.1;
+      ids.push_back(id);
+      ranges.push_back(std::fabs(seen.range + off * normal()));
+      bearings.push_back(seen.bearing + 0.2 * off * normal());
+      claims.push_back({0.02, 0.0003, 0.0005, double(int(3.0 * uniform()) - 1)});
+    }
+    if (number % 2) claims.clear();
+    for (int i = 0; i < 9; i++) normals.push_back(normal());
+    const window::Increment increment = {{step.mean.x, step.mean.y, step.mean.heading},
+                                         std::span<const double, 9>(step.covariance[0], 9),
+                                         {normal(), normal(), 0.1 * normal()}};
+    run.advance(increment, {ids, ranges, bearings, claims}, window::NO_RESAMPLING, normals);
+    consensus.add(step, {ids, ranges, bearings, claims});
+    for (const bool each : consensus.agreeing()) add(each);
+    if (k % 4 == 2) run.mark();
+    if (k == 9 && number % 2) run.move(increment, normals);
+  }
+  for (const bool each : consensus.confirmed()) add(each);
+  window::Sensitivity found = window::sensitivity_of(run, run.close().mean, true);
+  add(std::move(found.rows).numbers());
+  add(double(int(found.fault)));
+}
+
+std::uint64_t hash_of(void (*run)(int)) {
+  hash = 1469598103934665603u;
+  for (int number = 0; number < 40; number++) run(number);
+  return hash;
+}
+
 }  // namespace
 
 int main() {
-  for (int number = 0; number < 40; number++) run_window(number);
-  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+  for (const auto run : {run_window, run_sparse, run_smoother}) std::printf("%016llx\n", static_cast<unsigned long long>(hash_of(run)));
 }

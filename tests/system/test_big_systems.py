@@ -9,10 +9,7 @@ from tests.support import ROOT
 DIGESTS = """
 import hashlib
 import numpy as np
-from team.estimation.sparse_cholesky.sparse import (
-    Pattern, analysed, factorised, inverse_block, selected_inverse,
-)
-from team.estimation.sparse_cholesky.sparse_kernel import has_big_panel
+from team.core import Cholesky, Pattern
 
 n, root = 700, 600
 tied = np.ones((n, n), dtype=bool)
@@ -22,9 +19,10 @@ starts = np.cumsum([0, *(len(rows) for rows in columns)])
 pattern = Pattern(np.ones(n, dtype=np.int64), starts, np.concatenate(columns))
 values = np.random.default_rng(0).normal(size=len(pattern.rows))
 values[starts[:-1]] = 1000.0
-cholesky = factorised(analysed(pattern), values)
-assert has_big_panel(cholesky.analysis.structure)
-for found in (cholesky.panels, selected_inverse(cholesky), inverse_block(cholesky, np.arange(99))):
+cholesky = Cholesky(pattern, values)
+assert pattern.has_big_panel
+solution = cholesky.solve(np.ones(n))
+for found in (solution, cholesky.selected_inverse(), cholesky.inverse_block(np.arange(99))):
     print(hashlib.sha256(found.tobytes()).hexdigest())
 """
 

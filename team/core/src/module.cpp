@@ -18,5 +18,6 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_models(m);
   binding::bind_motion(m);
   binding::bind_se2(m);
+  binding::bind_sparse(m);
   binding::bind_window(m);
 }

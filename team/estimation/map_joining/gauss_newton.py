@@ -42,7 +42,6 @@ from team.estimation.map_joining.least_squares import (
 from team.estimation.map_joining.priors_kernel import add_priors, prior_terms
 from team.estimation.map_joining.resting_kernel import own_blocks, symmetric_of
 from team.estimation.map_joining.submap_graph import CommonBias, Graph
-from team.estimation.sparse_cholesky import sparse
 
 LEAST_WEIGHT = 1e-6
 """Lower bound of a landmark's weight, so that each landmark stays determined."""
@@ -346,18 +345,18 @@ class Island:
     @cached_property
     def step(self) -> Values:
         """The full step, −A⁻¹g."""
-        return -sparse.solved(self.posterior, self.normal_equations[1][:, None])[:, 0]
+        return -self.posterior.solve(self.normal_equations[1])
 
     @cached_property
-    def posterior(self) -> sparse.Cholesky:
+    def posterior(self) -> core.Cholesky:
         """Cholesky factor of the information matrix at this state."""
         return self.factorised(self.normal_equations[0])
 
-    def factorised(self, values: Values) -> sparse.Cholesky:
+    def factorised(self, values: Values) -> core.Cholesky:
         """Factorise a matrix in the layout of the graph's pattern."""
         try:
-            return sparse.factorised(self.graph.analysis, values)
-        except sparse.NotPositiveDefiniteError as error:
+            return core.Cholesky(self.graph.pattern, values)
+        except core.NotPositiveDefiniteError as error:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
     def moved(self, step: Values, older: int = 1) -> "Island":
@@ -373,7 +372,7 @@ class Island:
     @cached_property
     def selected_covariance(self) -> Values:
         """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
-        return sparse.selected_inverse(self.posterior)
+        return self.posterior.selected_inverse()
 
     @cached_property
     def resting_points(self) -> Float[np.ndarray, "L 2"]:
@@ -437,17 +436,15 @@ def final_cost(island: Island) -> float:
 def is_solvable(island: Island) -> bool:
     """Whether the island has a solution: finite numbers, every unknown determined.
 
-    The pivots of the factorisation are judged by their diagonal entries (`sparse_kernel`), so units
+    The pivots of the factorisation are judged by their diagonal entries (`core.Cholesky`), so units
     and the size of covariances have no influence.
     """
     try:
         with np.errstate(all="ignore"):
-            factor, cost = island.posterior, island.cost
+            _, cost = island.posterior, island.cost
     except UNSOLVABLE:
         return False
-    return bool(np.isfinite(island.state).all() and np.isfinite(factor.panels).all()) and (
-        math.isfinite(cost)
-    )
+    return bool(np.isfinite(island.state).all()) and math.isfinite(cost)
 
 
 def iterated(island: Island) -> Island:
@@ -499,7 +496,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
         if damping:
             damped = values.copy()
             damped[island.graph.pattern.diagonal] *= 1.0 + damping
-            step = -sparse.solved(island.factorised(damped), gradient[:, None])[:, 0]
+            step = -island.factorised(damped).solve(gradient)
         else:
             step = island.step
         for share in (1.0,) if damping else SHARES:
@@ -555,7 +552,7 @@ def solved_with_fixed(
         gradient = island.normal_equations[1]
         right = np.column_stack([-gradient, np.zeros(len(island.state))])
         right[unknown, 1] = 1.0
-        p, q = sparse.solved(island.posterior, right).T
+        p, q = island.posterior.solve(right).T
         force = (missing - p[unknown]) / q[unknown]
         step = p + force * q
         squared = float(force * step[unknown] - dense.product(gradient, step))
@@ -570,7 +567,7 @@ def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
-    covariance = sparse.inverse_block(island.posterior, unknowns)
+    covariance = island.posterior.inverse_block(unknowns)
     constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
     covariance[constant] = 0.0
     covariance[:, constant] = 0.0

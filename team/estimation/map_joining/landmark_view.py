@@ -14,7 +14,6 @@ from team.estimation import dense
 from team.estimation.map_joining.condensed_factor import Resting, nobody_rests, places
 from team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from team.estimation.map_joining.resting_kernel import between
-from team.estimation.sparse_cholesky import sparse
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -125,7 +124,7 @@ def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.n
     offset = graph.offset
     at, boundary = places(offset, nodes), places(offset, old.nodes)
     outside = np.repeat(~in_boundary, np.diff(offset)[nodes])
-    columns = sparse.inverse_columns(island.posterior, at[outside])
+    columns = island.posterior.inverse_columns(at[outside])
     columns[:, graph.fixed[nodes[~in_boundary]].repeat(np.diff(offset)[nodes[~in_boundary]])] = 0.0
     within = np.searchsorted(boundary, at[~outside])
     covariance = np.empty((len(at), len(at)))

@@ -328,7 +328,7 @@ def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
 def _own_marginal(
     island: Island, node: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    block = island.graph.pattern.diagonal_block(island.selected_covariance, node)
+    block = island.graph.pattern.block(island.selected_covariance, node, node)
     fixed = bool(island.graph.fixed[node])
     return _mean(island, node), np.zeros_like(block) if fixed else block
 

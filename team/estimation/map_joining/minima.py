@@ -33,7 +33,6 @@ from team.estimation.map_joining.nonlinearity import (
 )
 from team.estimation.map_joining.relaxation import relaxed
 from team.estimation.se2 import wrapped
-from team.estimation.sparse_cholesky import sparse_kernel
 
 Values = Float[np.ndarray, " _"]
 
@@ -257,9 +256,7 @@ def _difference(one: Island, other: Island) -> Values:
 def _quadratic(island: Island, x: Values) -> float:
     """xᵀAx with the information A of the island at its state."""
     values, _ = island.normal_equations
-    pattern = island.graph.pattern
-    entries = pattern.rows, pattern.columns, pattern.value_start
-    return sparse_kernel.quadratic(values, *entries, island.graph.offset, x)
+    return island.graph.pattern.quadratic(values, x)
 
 
 def warnings(search: Search) -> list[str]:

@@ -61,7 +61,7 @@ def heading_sigma(island: Island, node: int) -> float:
     graph = island.graph
     if graph.fixed[node]:
         return 0.0
-    return deviation(graph.pattern.diagonal_block(island.selected_covariance, node)[2, 2])
+    return deviation(graph.pattern.block(island.selected_covariance, node, node)[2, 2])
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:

@@ -19,13 +19,6 @@ from jaxtyping import Bool, Float, Int64
 
 from team import core
 from team.estimation.map_joining.submap_graph import Graph
-from team.estimation.sparse_cholesky.sparse import (
-    NotPositiveDefiniteError,
-    Pattern,
-    analysed,
-    factorised,
-    solved,
-)
 
 Values = Float[np.ndarray, " _"]
 Indices = Int64[np.ndarray, " _"]
@@ -89,12 +82,12 @@ def _least_squares(
     if (normal.diagonal() == 0.0).any():
         return None
     try:
-        pattern = Pattern(sizes, normal.indptr.astype(np.int64), indices)
-        factor = factorised(analysed(pattern), normal.data)
-    except NotPositiveDefiniteError:
+        pattern = core.Pattern(sizes, normal.indptr.astype(np.int64), indices)
+        factor = core.Cholesky(pattern, normal.data)
+    except core.NotPositiveDefiniteError:
         return None
     found = numbers.copy()
-    found[free] = solved(factor, (B.T @ right)[:, None])[:, 0]
+    found[free] = factor.solve(B.T @ right)
     return found if np.isfinite(found).all() else None
 
 

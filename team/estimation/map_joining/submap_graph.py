@@ -25,7 +25,6 @@ from team.estimation.map_joining.joining_kernel import NO_POWER, SubmapFactors, 
 from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from team.estimation.map_joining.priors_kernel import PriorFactors
 from team.estimation.se2 import compose, transformed
-from team.estimation.sparse_cholesky.sparse import Analysis, Pattern, analysed
 from team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
@@ -202,7 +201,7 @@ class Graph:
         )
 
     @cached_property
-    def _pattern_and_entry(self) -> tuple[Pattern, Indices]:
+    def _pattern_and_entry(self) -> tuple[core.Pattern, Indices]:
         factors, pairs = self.factors, self.sighting_factors.nodes
         members = factors.member_start[-1] + 2 * np.arange(1, len(pairs) + 1)
         old = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
@@ -212,11 +211,11 @@ class Graph:
             np.concatenate([factors.member, pairs.ravel(), old]),
             np.concatenate([ends, ends[-1:] + len(old)]) if len(old) else ends,
         )
-        return Pattern(np.diff(self.offset), column_start, rows), entry
+        return core.Pattern(np.diff(self.offset), column_start, rows), entry
 
     @property
-    def pattern(self) -> Pattern:
-        """Blocks of the normal equations: a block variable per node."""
+    def pattern(self) -> core.Pattern:
+        """Blocks of the normal equations (a variable per node) and their places in the factor."""
         return self._pattern_and_entry[0]
 
     @property
@@ -234,11 +233,6 @@ class Graph:
     def condensed_entry(self) -> Indices:
         """The part of `entry` for the condensed factor's nodes."""
         return self.entry[self.sighting_factors.first_pair + 4 * len(self.sightings) :]
-
-    @cached_property
-    def analysis(self) -> Analysis:
-        """Order of elimination and places in the Cholesky factor."""
-        return analysed(self.pattern)
 
     @cached_property
     def dimensions(self) -> Indices:

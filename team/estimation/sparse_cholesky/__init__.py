@@ -1,1 +1,0 @@
-"""A sparse Cholesky factorisation with its solves and the entries of the inverse."""
