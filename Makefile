@@ -1,9 +1,8 @@
-# Needs make, a Python of 3.11 or newer and a C++20 compiler (without one that of the ziglang wheel is
-# fetched); everything else goes into .venv, at pinned versions.
+# Needs make, a Python of 3.11 or newer with its headers and a C++20 compiler (without one that of the
+# ziglang wheel is fetched); everything else goes into .venv, at pinned versions.
 #
 #   make run        a team maps a random place; what `make test` needs is not installed for it
 #   make test       all tests
-#   make bounds     extreme messages at every node, the kernels compiled once more with checked indices
 #   make check      format, lint, strict types, the direction of imports
 #   make core       builds the native core anew where a source of it has changed
 #   make check-core the core's tests in a build with sanitizers and bounds checks
@@ -24,8 +23,8 @@ LISTED := install --require-hashes --no-deps --requirement
 # The core is built without build isolation, by these.
 BUILDING := cmake nanobind ninja scikit-build-core
 CORE := $(wildcard team/core/src/* team/core/building/* team/core/CMakeLists.txt)
-COMPILER := $(if $(filter environment,$(origin CXX)),$(CXX),$(shell command -v c++ || command -v g++ || command -v clang++))
-NEEDS_ZIG = $(if $(COMPILER),,@echo "No C++ compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt)
+NEEDS_ZIG = @$(BIN)/python team/core/building/backend.py --find > /dev/null || { \
+  echo "No C++20 compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt; }
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
 # One BLAS thread per process: same bits everywhere, and robots do not take each other's cores.
@@ -40,7 +39,7 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .DEFAULT_GOAL := run
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: run test bounds check core check-core bench docs setup constraints clean
+.PHONY: run test check core check-core bench docs setup constraints clean
 
 run: $(VENV)/.runtime $(VENV)/.core
 	$(BIN)/teamslam launch waypoints --speed 20
@@ -50,11 +49,6 @@ test: $(VENV)/.dev $(VENV)/.core
 	tests/get-chromium
 	$(BIN)/pytest --numprocesses 3
 
-# Of their own folder, since a kernel's cached code does not name the option; some ten minutes at first.
-bounds: $(VENV)/.dev $(VENV)/.core
-	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/bounds TEAMSLAM_STORM=20 \
-	  $(BIN)/pytest -o faulthandler_timeout=0 --numprocesses 3 tests/hostile
-
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -62,7 +56,7 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 # The libraries of the sanitizers come before Python, which does not know them; memory that Python
-# keeps until it ends is no leak. CORE_TESTS adds tests of what is above the core.
+# keeps until it ends is no leak. CORE_TESTS adds tests of what is above the core, as tests/hostile.
 check-core: $(VENV)/.dev
 	$(BIN)/python team/core/building/backend.py --checked
 	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libstdc++.so)" \

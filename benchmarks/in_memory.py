@@ -24,7 +24,6 @@ import msgspec
 from benchmarks.baseline import worse
 from central.desk.verification.verification import verify
 from sim.in_memory.team import final_map, run_team
-from sim.launch.warm_up import run_small_team
 from sim.scenarios.scenario import Scenario, load, with_options
 from sim.scenarios.source import streams_of
 from sim.world.config import SimulatedWorld
@@ -54,7 +53,6 @@ def scaled(robots: int, steps: int) -> Scenario:
 
 
 def run(robots: int, steps: int) -> dict[str, float]:
-    run_small_team("hybrid", "join")
     scenario = scaled(robots, steps)
     began = time.process_time()
     streams = streams_of(scenario)

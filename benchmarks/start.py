@@ -1,12 +1,12 @@
-"""Measure the cost of a launch's processes: forked from the warm template, and from scratch.
+"""Measure the cost of a launch's processes, and of processes that are started by hand.
 
     python -m benchmarks.start [--scenario waypoints] [--robots N] [--json FILE]
 
-The same team is launched twice, without views. first_s: from the start of the template to the first
-measurement on the bus; command_first_s: from the start of `launch`, the least of three. cpu_s,
-pss_mb, peak_rss_mb: as in a launch's JSON. alone: resident memory, that without pages of files, and
-CPU of a router, recorder and robot started by hand, ready and idle. Only ratios of times have a
-baseline (benchmarks/start.json): both halves depend on the machine.
+A team is launched without views. command_first_s: from the start of `launch` to the first
+measurement on the bus, the least of three. cpu_s, pss_mb, peak_rss_mb: as in a launch's JSON.
+alone: resident memory, that without pages of files, and CPU of a router, recorder and robot started
+by hand, ready and idle. in_bare_starts: in CPU of a start of Python with NumPy, which holds on any
+machine.
 """
 
 import argparse
@@ -21,16 +21,15 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.baseline import concluded
-from sim.launch.ahead import PROGRAM
 from sim.launch.launch import launch
 from sim.launch.plan import Plan
-from sim.launch.processes import Starter
+from sim.launch.processes import PROGRAM, Starter
 from sim.scenarios.scenario import Scenario, load, with_options
 from team.recording.reader import open_log
 from team.wire.channels import SENSORS
 
 
-def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> dict[str, Any]:
+def launched(scenario: Scenario, folder: Path) -> dict[str, Any]:
     """Figures of one launch."""
     folder.mkdir()
     plan = Plan(
@@ -41,14 +40,10 @@ def launched(scenario: Scenario, folder: Path, warm: tuple[str, str] | None) -> 
         listen="tcp/127.0.0.1:0",
         views=False,
     )
-    began_ns = time.time_ns()
-    with Starter(began_ns, warm, folder / "template.log") as starter:
-        outcome = launch(plan, starter, lambda watch: None)
+    outcome = launch(plan, Starter(time.time_ns()), lambda watch: None)
     assert outcome.failures == [], outcome.failures
-    first = first_ns(plan.log)
     robots = [used for name, used in outcome.used.items() if name.startswith("robot-")]
     return {
-        "first_s": 1e-9 * (first - began_ns),
         "cpu_s": sum(used.cpu_s for used in outcome.used.values()),
         "robot_cpu_s": mean(used.cpu_s for used in robots),
         "robot_pss_mb": mean(used.pss_mb or 0.0 for used in robots),
@@ -124,37 +119,19 @@ def bare_cpu_s() -> float:
     return min(took)
 
 
-def bare_s() -> float:
-    """Least wall time of three starts of Python with NumPy."""
-    took = []
-    for _ in range(3):
-        began = time.monotonic()
-        subprocess.run([sys.executable, "-c", "import numpy"], check=True)
-        took.append(time.monotonic() - began)
-    return min(took)
-
-
 def measured(scenario: Scenario, words: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
-        pair = (scenario.estimator, scenario.fusion)
-        launched(scenario, Path(folder) / "first", pair)  # compiles what is not compiled yet
-        forked = launched(scenario, Path(folder) / "forked", pair)
-        scratch = launched(scenario, Path(folder) / "scratch", None)
+        team = launched(scenario, Path(folder) / "team")
         first_s = min(command_first_s(words, Path(folder) / f"command-{k}") for k in range(3))
-        bare = bare_s()
         by_hand = alone(Path(folder) / "alone")
+    bare = bare_cpu_s()
     return {
         "robots": len(scenario.robots),
-        "forked": forked,
-        "scratch": scratch,
+        "team": team,
         "command_first_s": first_s,
         "alone": by_hand,
         **{f"{name}_alone_mb": used["rss_mb"] for name, used in by_hand.items()},
-        "robot_alone_in_bare_starts": by_hand["robot"]["cpu_s"] / bare_cpu_s(),
-        "first_in_bare_starts": forked["first_s"] / bare,
-        "cpu_ratio": forked["cpu_s"] / scratch["cpu_s"],
-        "robot_cpu_ratio": forked["robot_cpu_s"] / scratch["robot_cpu_s"],
-        "robot_pss_ratio": forked["robot_pss_mb"] / scratch["robot_pss_mb"],
+        "robot_alone_in_bare_starts": by_hand["robot"]["cpu_s"] / bare,
     }
 
 

@@ -1,4 +1,4 @@
-"""`python -m sim` is `teamslam`; the template of `launch` begins here, too."""
+"""`python -m sim` is `teamslam`."""
 
 import sys
 
@@ -7,37 +7,14 @@ INTERRUPTED = 130
 
 
 def main() -> None:
-    """Run a command. Of `launch` the template is started before anything else is imported."""
+    """Run a command."""
     try:
-        if sys.argv[1:2] == ["launch"] and "--help" not in sys.argv:
-            _launch()
-        else:
-            _run()
+        from sim.cli.main import main as run
+
+        run()
     except KeyboardInterrupt:  # while modules are imported; later a command reports it
         sys.exit(INTERRUPTED)
 
 
-def _launch() -> None:
-    from sim.launch.ahead import end_ahead, start_ahead
-
-    start_ahead()
-    try:
-        _run()
-    finally:
-        end_ahead()
-
-
-def _run() -> None:
-    from sim.cli.main import main as run
-
-    run()
-
-
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["template"]:
-        from sim.cli.main import command
-        from sim.launch.template import become_a_process, end_by
-
-        become_a_process(command)  # returns in a forked process, with the words of its own command
-        end_by(_run)
     main()

@@ -4,8 +4,8 @@
     python -m tests.across --only thesis   the cases whose name begins so
 
 The measurements are made once. Each class of processors is a process that is told by its
-environment which one to take for its own: Numba's compiler, NumPy's loops, the C library and
-OpenBLAS all listen. A class that this processor has not got can not be tried.
+environment which one to take for its own: the core, NumPy's loops, the C library and OpenBLAS all
+listen. A class that this processor has not got can not be tried.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from tests import bits
 CLASSES: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
     "without AVX": {
+        "TEAMSLAM_CORE": "base",
         "NUMBA_CPU_NAME": "generic",
         "NUMBA_CPU_FEATURES": "",
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL",

@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the shell's convention."""
-COMPILING_S = 3.0
-"""Time [s] between lines on kernel compilation."""
 app = typer.Typer()
 
 
@@ -197,30 +195,19 @@ def launch(
 
 
 def _launched(plan: "Plan") -> "Outcome":
-    """Send the kernels' names to the template first: it loads them during this process's
-    imports.
-    """
+    from sim.launch.launch import LaunchError, launch
+    from sim.launch.live import shown
     from sim.launch.processes import Starter
 
     scenario = plan.scenario
-    warm = (scenario.estimator, scenario.fusion)
-    compiling = _Compiling()
-    with Starter(time.time_ns(), warm, plan.folder / "template.log", compiling.tell) as starter:
-        from sim.launch.launch import LaunchError, launch
-        from sim.launch.live import shown
-
-        if not starter.is_warm:
-            _compile(scenario)
-        try:
-            with shown(f"{scenario.name}, seed {scenario.seed}") as show:
-                outcome = launch(plan, starter, show)
-        except LaunchError as error:
-            fail(str(error), FAILED)
-        except KeyboardInterrupt:
-            recorded_note = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
-            fail(f"interrupted: every process of the team was ended{recorded_note}", FAILED)
-        outcome.compiling_s = compiling.took_s
-        return outcome
+    try:
+        with shown(f"{scenario.name}, seed {scenario.seed}") as show:
+            return launch(plan, Starter(time.time_ns()), show)
+    except LaunchError as error:
+        fail(str(error), FAILED)
+    except KeyboardInterrupt:
+        recorded_note = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
+        fail(f"interrupted: every process of the team was ended{recorded_note}", FAILED)
 
 
 def _keep_showing(url: str, log: Path) -> None:
@@ -321,46 +308,6 @@ def _keep_earlier(log: Path) -> None:
             part.rename(part_of(aside, number))
 
 
-KERNELS_TO_ESTIMATE = 5
-"""Number of first kernels, slower than most, before a time is estimated."""
-
-
-class _Compiling:
-    """Report the compilation of kernels, once per installation.
-
-    took_s: time since the first report [s].
-    """
-
-    def __init__(self) -> None:
-        self.took_s = 0.0
-        self._due = time.monotonic() + COMPILING_S
-        self._first: tuple[int, float] | None = None
-
-    def tell(self, done: int, of: int) -> None:
-        """Print the number of compiled kernels, the estimated total and time, periodically."""
-        now = time.monotonic()
-        self._first = self._first or (done, now)
-        self.took_s = now - self._first[1]
-        if now < self._due:
-            return
-        self._due = now + COMPILING_S
-        before, began = self._first
-        text = f"compiling the kernels, once per installation: {done} of about {of}"
-        if done - before >= KERNELS_TO_ESTIMATE:
-            left_s = (now - began) / (done - before) * max(0, of - done)
-            text += f", about {left_s:.0f} s left"
-        typer.echo(text, err=True)
-
-
-def _compile(scenario: Scenario) -> None:
-    """Compile the kernels here without a template; otherwise every process would."""
-    from sim.launch.warm_up import FORMS, warm_up
-    from team.estimation.compiling import compilations
-
-    with compilations(_Compiling().tell, FORMS):
-        warm_up(scenario.estimator, scenario.fusion)
-
-
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
@@ -436,8 +383,7 @@ def _conclude(
         text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
         console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
-    compiling = f", {outcome.compiling_s:.0f} s of it compiling" if outcome.compiling_s > 1 else ""
-    console.print(f"{outcome.wall_s:.1f} s of wall time of the run{compiling}", highlight=False)
+    console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
     if json_file is not None:
         _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
     if outcome.failures:

@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +55,8 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
         raise typer.Exit
 
 
-@cache
 def command() -> Callable[[], None]:
-    """All commands, built from their functions; a launch's template does it once for all."""
+    """Build all commands from their functions."""
     whole = typer.main.get_command(app)
     _convert_plainly(whole)
     return whole

@@ -37,8 +37,7 @@ class Outcome:
     """Result of a launch.
 
     deaths: processes killed at the end and not restarted; no failure if map and log are whole.
-    used: resources by process over all its lives. compiling_s: share of wall_s spent compiling
-    kernels.
+    used: resources by process over all its lives.
     """
 
     log: Path
@@ -50,7 +49,6 @@ class Outcome:
     restarts: dict[str, int] = field(default_factory=dict)
     given_up: list[str] = field(default_factory=list)
     used: dict[str, Used] = field(default_factory=dict)
-    compiling_s: float = 0.0
     end_reason: str = ""
 
 

@@ -1,29 +1,25 @@
-"""Start a team's processes, forked from the warm template or from scratch."""
+"""Start a team's processes, and measure the resources that they use."""
 
-import json
 import os
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
-from sim.launch.ahead import ONE_THREAD, PROGRAM, Template, taken
-from sim.launch.linux import adopt_orphans
 from team.shell import PARENT
 from team.the_end import SINCE
 
+# -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
+PROGRAM = (sys.executable, "-P", "-m", "sim")
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+"""Environment that gives linear algebra one thread."""
 LOOK_S = 0.005
 """Time [s] between checks of an ending process."""
-PATIENCE_S = 600.0
-"""Time [s] for a template's answer, which may include compiling all kernels."""
-_LARGEST_ANSWER = 64
-KERNELS = "kernels"
-"""First request of a template: `kernels ESTIMATOR RULE SINCE`, with the file for its errors."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +41,14 @@ class Used:
 
 
 class Process:
-    """Child of this process by id.
+    """Child of this process.
 
     exit: status (negative: signal), None while running. used: resources, with the last memory
     measurement.
     """
 
-    def __init__(self, pid: int, started: "subprocess.Popen[bytes] | None" = None) -> None:
-        self.pid = pid
+    def __init__(self, started: "subprocess.Popen[bytes]") -> None:
+        self.pid = started.pid
         self.exit: int | None = None
         self.used = Used()
         self._started = started
@@ -69,8 +65,7 @@ class Process:
                 cpu_s = used.ru_utime + used.ru_stime
                 peak_rss_mb = self.used.peak_rss_mb or most_mb
                 self.used = replace(self.used, cpu_s=cpu_s, peak_rss_mb=peak_rss_mb)
-                if self._started is not None:
-                    self._started.returncode = self.exit
+                self._started.returncode = self.exit
         return self.exit
 
     def measure(self) -> None:
@@ -101,93 +96,29 @@ class Process:
 
 
 class Starter:
-    """Start the processes of one run; a context that ends the template.
-
-    warm: estimator and rule whose kernels a template loads before forking. With None, without
-    orphan adoption, or after a template's death, processes start from scratch. log: file for the
-    template's errors. compiled: receives the number of compiled kernels and the estimated total.
-    """
-
-    def __init__(
-        self,
-        since_ns: int,
-        warm: tuple[str, str] | None,
-        log: Path,
-        compiled: Callable[[int, int], None] = lambda done, of: None,
-    ) -> None:
-        self._compiled, self._done = compiled, 0
-        self._environment = _environment(os.environ, since_ns)
-        self._template: Process | None = None
-        self._asks: socket.socket | None = None
-        if warm is not None and adopt_orphans():
-            self._use_template(warm, log, since_ns)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end_template()
-
-    @property
-    def is_warm(self) -> bool:
-        """Whether there is a template."""
-        return self._asks is not None
-
-    def start(self, words: Sequence[str], output: int) -> Process:
-        """Start `teamslam TEMPLATES`; output: descriptor of output and errors."""
-        if self._asks is not None:
-            try:
-                return Process(self._forked(self._asks, words, output))
-            except OSError:
-                self._end_template()
-        started = subprocess.Popen(  # noqa: S603 - our own program, no shell
-            [*PROGRAM, *words],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=self._environment,
-            start_new_session=True,
-        )
-        return Process(started.pid, started)
-
-    def _forked(self, asks: socket.socket, words: Sequence[str], output: int) -> int:
-        """Id of a process forked by the template; raises OSError without an answer."""
-        socket.send_fds(asks, [json.dumps(list(words)).encode()], [output])
-        while answer := asks.recv(_LARGEST_ANSWER):
-            match answer.decode().split():
-                case ["started", pid]:
-                    return int(pid)
-                case ["compiled", of]:
-                    self._done += 1
-                    self._compiled(self._done, max(self._done, int(of)))
-        raise ConnectionResetError("the template has ended")
-
-    def _use_template(self, warm: tuple[str, str], log: Path, since_ns: int) -> None:
-        with log.open("wb") as file:
-            template = taken() or Template(file.fileno())
-            self._template = Process(template.process.pid, template.process)
-            self._asks = template.asks
-            self._asks.settimeout(PATIENCE_S)
-            words = [KERNELS, *warm, str(since_ns)]
-            try:
-                socket.send_fds(self._asks, [json.dumps(words).encode()], [file.fileno()])
-            except OSError:
-                self._end_template()
-
-    def _end_template(self) -> None:
-        if self._asks is not None:
-            self._asks.close()
-            self._asks = None
-        if self._template is not None:
-            self._template.signal(9)
-            self._template.wait(PATIENCE_S)
-            self._template = None
-
-
-def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
-    """Child environment: one BLAS thread, bound to this process, unbuffered output.
+    """Start the processes of one run.
 
     since_ns: beginning of the run, for a child restarted after its end.
     """
+
+    def __init__(self, since_ns: int) -> None:
+        self._environment = _environment(os.environ, since_ns)
+
+    def start(self, words: Sequence[str], output: int) -> Process:
+        """Start `teamslam WORDS` in its own session; output: descriptor of output and errors."""
+        return Process(
+            subprocess.Popen(  # noqa: S603 - our own program, no shell
+                [*PROGRAM, *words],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,
+            )
+        )
+
+
+def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
+    """Child environment: one BLAS thread, bound to this process, unbuffered output."""
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
     return {**mine, **ONE_THREAD, **tied}

@@ -2,7 +2,7 @@
 
 Numba itself would first import all that it could compile, 30 MB and a quarter of a second, and
 parse each kernel's bit code, from which kernels that call it are compiled. Here this waits until
-something is compiled: docs/decisions/12.
+something is compiled: docs/decisions/31.
 """
 
 import ctypes
@@ -112,7 +112,7 @@ _MADV_DONTNEED = 4
 def _give_back() -> None:
     """Gives back the pages of the compiler's file that its start has read, on Linux.
 
-    They are 44 MB, of which loading more machine code reads 5 again: docs/decisions/12. Those
+    They are 44 MB, of which loading more machine code reads 5 again: docs/decisions/31. Those
     that the start has changed are no longer the file's and stay.
     """
     if sys.platform != "linux":

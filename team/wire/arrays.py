@@ -247,7 +247,7 @@ def _check_positive(scaled: "np.typing.NDArray[np.float64]", what: str) -> None:
         raise ValueError(f"not positive definite: {what}")
 
 
-def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> np.ndarray:
+def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> "np.ndarray":
     """The 2 × 2 covariance of each landmark [m²], (count, 2, 2).
 
     joint: the bytes are the packed upper triangle of all landmarks, else the packed blocks.

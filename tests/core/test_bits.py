@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,46 +16,71 @@ from team import core
 from tests.support import ROOT
 
 FOLDER = ROOT / "team" / "core"
-HASHES = ("8c51871c169fc457", "3659448349629494", "c23c826e90deb72d")
-"""Of the windows, the sparse systems and the smoothers of tests/core/bits.cpp."""
-SOURCES = (
-    *("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
-    *("ordering", "sparse_pattern", "sparse", "arrow", "consensus", "sensitivity", "motion"),
-)
+LIBRARIES = Path(core.__file__).parent
+"""Elsewhere than the sources where a wheel is tested."""
+PROGRAMS = {
+    "bits": (
+        "8c51871c169fc457 3659448349629494 c23c826e90deb72d",
+        (
+            *("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
+            *("ordering", "sparse_pattern", "sparse"),
+            *("arrow", "consensus", "sensitivity", "motion"),
+        ),
+    ),
+    "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
+}
+"""Hashes of all results of a program in this folder, equal to the bits of the Numba kernels before
+them; and the core's sources that it takes.
+"""
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 FUSED = re.compile(r"\s(?:vfn?m(?:add|sub)\w*|fn?m(?:add|sub)|fml[as])\s.*")
 
 
-def hashes_of(tmp_path: Path, *command: str) -> tuple[str, ...]:
-    program = tmp_path / "bits"
-    sources = [FOLDER / "src" / f"{name}.cpp" for name in SOURCES]
-    words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / "tests/core/bits.cpp"]
+def hash_of(name: str, tmp_path: Path, *command: str, runs_by: Sequence[str] = ()) -> str:
+    program = tmp_path / name
+    sources = [FOLDER / "src" / f"{each}.cpp" for each in PROGRAMS[name][1]]
+    words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / f"tests/core/{name}.cpp"]
     subprocess.run([*words, "-o", program], check=True, capture_output=True, timeout=900)
-    ended = subprocess.run([program], check=True, capture_output=True, text=True)
-    return tuple(ended.stdout.split())
+    ran = subprocess.run([*runs_by, program], check=True, capture_output=True, text=True)
+    return " ".join(ran.stdout.split())
 
 
 @pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
-def test_gcc_gives_the_same_bits_at_every_level(flags: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_gcc_gives_the_same_bits_at_every_level(
+    name: str, flags: tuple[str, ...], tmp_path: Path
+) -> None:
     if shutil.which("g++") is None:
         pytest.skip("g++ is not on the path")
     if "-mavx2" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2")
-    assert hashes_of(tmp_path, "g++", *flags) == HASHES
+    assert hash_of(name, tmp_path, "g++", *flags) == PROGRAMS[name][0]
 
 
-def test_clang_gives_the_bits_of_gcc(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_clang_gives_the_bits_of_gcc(name: str, tmp_path: Path) -> None:
     """clang comes from the ziglang wheel."""
     if find_spec("ziglang") is None:
         pytest.skip("ziglang is not installed: pip install --no-deps -r hashes-zig.txt")
-    zig = (sys.executable, "-m", "ziglang", "c++", "-O3", "-mcpu=x86_64_v2")
-    assert hashes_of(tmp_path, *zig) == HASHES
+    clang = (sys.executable, "-m", "ziglang", "c++")
+    found = hash_of(name, tmp_path, *clang, "-O3", "-mcpu=x86_64_v2")
+    assert found == PROGRAMS[name][0]
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_an_arm_processor_gives_the_bits_of_an_intel(name: str, tmp_path: Path) -> None:
+    """Debian: apt install g++-aarch64-linux-gnu qemu-user. Its base has fused multiply-add."""
+    compiler, emulator = map(shutil.which, ("aarch64-linux-gnu-g++", "qemu-aarch64"))
+    if compiler is None or emulator is None:
+        pytest.skip("a compiler for aarch64 and qemu-user are not on the path")
+    found = hash_of(name, tmp_path, compiler, "-O3", "-static", runs_by=[emulator])
+    assert found == PROGRAMS[name][0]
 
 
 def test_no_library_holds_a_fused_multiply_add() -> None:
     if shutil.which("objdump") is None:
         pytest.skip("objdump is not on the path")
-    built = sorted(FOLDER.glob("_core_*.so"))
+    built = sorted(LIBRARIES.glob("_core_*.so"))
     assert built
     for library in built:
         code = subprocess.run(

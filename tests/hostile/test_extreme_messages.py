@@ -2,7 +2,7 @@
 
 A message is decoded or refused by name; each node handles what its door lets in, within bounds of
 time and memory; what it answers is sound. TEAMSLAM_STORM=N draws N of each type for each channel;
-`make bounds` runs this file with the kernels' indices checked.
+`make check-core CORE_TESTS=tests/hostile` runs it with the core's indices checked.
 """
 
 import os

@@ -16,7 +16,8 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from team.recording.provenance import kernel_fingerprint, provenance
+from team import core
+from team.recording.provenance import estimation_digest, provenance
 from team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogError, open_log
 from team.recording.recorder import Recorder, RecorderError
 from team.recording.repair import repair_log
@@ -106,8 +107,9 @@ def test_metadata_names_team_and_provenance(path: Path) -> None:
     log = recorded(path, [], seed="7", **provenance())
     assert log.team == "t"
     assert log.metadata["seed"] == "7"
-    assert log.metadata["kernels"] == kernel_fingerprint()
-    for name in ("version.numpy", "version.eclipse-zenoh", "blas", "cpu.name", "git.commit"):
+    assert log.metadata["core"] == core.digest[:16]
+    assert log.metadata["estimation"] == estimation_digest()
+    for name in ("version.numpy", "version.eclipse-zenoh", "core.level", "cpu.name", "git.commit"):
         assert log.metadata[name]
 
 

@@ -159,7 +159,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
 
 async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
     launch, folder = await launched(team)
-    assert len(team.alive()) == 9, "the launch, its template, and seven that are forked from it"
+    assert len(team.alive()) == 8, "the launch and its seven processes"
     launch.signal(signal.SIGKILL)
     assert await launch.ended() == -signal.SIGKILL
     await team.none_left()

@@ -30,7 +30,7 @@ from tests.namespaces import NET, ip, network
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 
 PORT = 7447
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
 @dataclass

@@ -27,12 +27,9 @@ from team.wire import channels as ch
 from team.wire import messages as m
 from team.wire.codec import encoded
 
-PLATFORM = (
-    "kernels", "arithmetic",
-    "version.numpy", "version.scipy", "version.numba", "version.llvmlite",
-)  # fmt: skip
-"""Metadata that must be equal for equal bits; processor features are not among them:
-docs/decisions/32.
+PLATFORM = ("core", "estimation", "arithmetic", "version.numpy", "version.scipy")
+"""Metadata that must be equal for equal bits; neither the processor's features nor the core's level
+are among them: docs/decisions/32.
 """
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (

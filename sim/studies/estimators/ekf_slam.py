@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.estimators import ekf_kernel
+from sim.studies.estimators.ekf_step import step
 from team.config import Sensor
 from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from team.estimation.hybrid_slam.innovation import Innovation, joint_innovation, slots_of
@@ -55,7 +55,7 @@ def filter_step(
     known = len(state.mean)
     mean[:known] = state.mean
     P[:known, :known] = state.covariance
-    sound = ekf_kernel.step(
+    sound = step(
         mean,
         P,
         len(state.ids),

@@ -9,20 +9,19 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
+from jaxtyping import Float, UInt32
 
 from sim.studies.estimators.plain_fastslam import pose_moments
+from sim.studies.estimators.sight import see
+from team import core
 from team.config import Sensor
-from team.estimation import elementary
-from team.estimation.compiled import compiled
 from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.geometry import Pose, wrapped
 from team.estimation.hybrid_slam import fastslam
 from team.estimation.hybrid_slam import innovation as innovations
 from team.estimation.hybrid_slam.fastslam import Particles
 from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.landmark_kernel import Triple, seen
 from team.estimation.models import Increment, variances
+from team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,7 @@ def filter_step(
     log_weights = _weighed(
         cloud.log_weights,
         cloud.poses,
-        state.landmarks,
-        np.searchsorted(state.ids, ids[mapped]),
+        state.landmarks[np.searchsorted(state.ids, ids[mapped])],
         np.column_stack((ranges[mapped], bearings[mapped])),
         variances(sensor),
     )
@@ -133,26 +131,24 @@ def landmark_gaussian(state: Localisation) -> LandmarkGaussian:
     return LandmarkGaussian(state.ids, state.landmarks, np.zeros((n, n)))
 
 
-@compiled
 def _weighed(
     log_weights: Float[np.ndarray, " M"],
     poses: Float[np.ndarray, "M 3"],
-    landmarks: Float[np.ndarray, "L 2"],
-    slots: Int64[np.ndarray, " n"],
+    landmarks: Float[np.ndarray, "n 2"],
     measurements: Float[np.ndarray, "n 2"],
-    sensor: Triple,
+    sensor: tuple[float, float, float],
 ) -> Float[np.ndarray, " M"]:
     """Weights log w + Σ log N(z; h(pose, landmark), R), with R at the predicted range."""
-    weighed = log_weights.copy()
+    distance, ex, ey = see(poses[:, None], landmarks)
+    range_sigma = np.sqrt(sensor[0] + sensor[1] * distance * distance)
     bearing_sigma = math.sqrt(sensor[2])
-    for i in range(len(poses)):
-        pose = (poses[i, 0], poses[i, 1], poses[i, 2])
-        for k in range(len(slots)):
-            distance, ex, ey = seen(pose, landmarks[slots[k]])
-            range_sigma = math.sqrt(sensor[0] + sensor[1] * distance * distance)
-            of_range = (measurements[k, 0] - distance) / range_sigma
-            turn = wrapped(measurements[k, 1] + pose[2] - elementary.atan2(ey, ex))
-            of_bearing = turn / bearing_sigma
-            weighed[i] -= 0.5 * (of_range * of_range + of_bearing * of_bearing)
-            weighed[i] -= elementary.log(2.0 * math.pi * range_sigma * bearing_sigma)
+    of_range = (measurements[:, 0] - distance) / range_sigma
+    turn = core.wrapped(measurements[:, 1] + poses[:, 2:] - core.atan2(ey, ex))
+    of_bearing = turn / bearing_sigma
+    exponents = 0.5 * (of_range * of_range + of_bearing * of_bearing)
+    volumes = core.log(2.0 * math.pi * range_sigma * bearing_sigma)
+    weighed = log_weights.copy()
+    for k in range(len(landmarks)):  # the sum has one order on every processor
+        weighed -= exponents[:, k]
+        weighed -= volumes[:, k]
     return weighed

@@ -14,7 +14,7 @@ from team import core
 from team.sources import sources_of
 
 ROOTS = ("team", "central", "sim")
-LIBRARIES = ("numpy", "scipy", "numba", "gtsam")
+LIBRARIES = ("numpy", "scipy", "gtsam")
 """Libraries that results depend on."""
 
 

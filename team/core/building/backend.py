@@ -2,11 +2,12 @@
 
     python team/core/building/backend.py             build into team/core
     python team/core/building/backend.py --checked   with sanitizers (TEAMSLAM_CORE=checked)
+    python team/core/building/backend.py --find      name the C++ compiler; status 1: there is none
 
 Wheels are scikit-build-core's. An editable install builds into the source tree and adds that tree
 to the path, nothing else: no import hook stands before a second checkout on PYTHONPATH.
 
-Without a C++ compiler on the machine the build takes the one of the `ziglang` wheel.
+Without a C++20 compiler on the machine the build takes the one of the `ziglang` wheel.
 """
 
 import argparse
@@ -19,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -26,12 +28,29 @@ SOURCES = ROOT / "team" / "core"
 MODULES = "_core_*"
 ZIG = "ziglang>=0.13"
 COMPILERS = ("c++", "g++", "clang++")
+C20 = "#include <bit>\n#include <concepts>\n#include <span>\nstd::span<const double> numbers;\n"
+NO_COMPILER = """\
+Building the core needs a C++20 compiler (g++ 11, clang 14 or newer), and none is on the PATH.
+Install one (Debian and Ubuntu: apt install g++; Fedora: dnf install gcc-c++), name one by CXX, or
+install that of a wheel (pip install ziglang), which takes about four minutes, once.\
+"""
 Settings = dict[str, str | list[str]] | None
 
 
-def has_compiler() -> bool:
-    """Whether the machine has a C++ compiler, or names one by CXX."""
-    return bool(os.environ.get("CXX")) or any(map(shutil.which, COMPILERS))
+def find_compiler() -> str | None:
+    """Find the C++20 compiler of the machine: the one that CXX names, or the first that works."""
+    if named := os.environ.get("CXX"):
+        return named
+    return next(
+        (found for name in COMPILERS if (found := shutil.which(name)) and _works(found)), None
+    )
+
+
+def _works(compiler: str) -> bool:
+    """Whether the compiler and its library have what the core uses of C++20."""
+    command = [compiler, "-std=c++20", "-fsyntax-only", "-x", "c++", "-"]
+    tried = subprocess.run(command, input=C20.encode(), capture_output=True, check=False)  # noqa: S603
+    return not tried.returncode
 
 
 def compiler_options() -> list[str]:
@@ -40,10 +59,14 @@ def compiler_options() -> list[str]:
     Zig builds its C++ library anew for each target, so the options name one target for all levels
     and for CMake's trials.
     """
-    if has_compiler():
+    if os.environ.get("CXX"):
         return []
+    if compiler := find_compiler():
+        return [f"-DCMAKE_CXX_COMPILER={compiler}"]
+    if find_spec("ziglang") is None:
+        sys.exit(NO_COMPILER)
     print(
-        "No C++ compiler (c++, g++, clang++) is on the PATH: building with the one of the ziglang"
+        "No C++20 compiler (c++, g++, clang++) is on the PATH: building with the one of the ziglang"
         " wheel, which takes about four minutes, once.",
         file=sys.stderr,
         flush=True,
@@ -68,7 +91,7 @@ def compiler_options() -> list[str]:
 
 def build_in_place(*, checked: bool = False) -> None:
     """Build the core of this source tree into team/core, or a checked one beside it."""
-    kind = "checked" if checked else "own" if has_compiler() else "zig"
+    kind = "checked" if checked else "own" if find_compiler() else "zig"
     folder = ROOT / "build" / f"core-{sys.version_info[1]}-{kind}"
     _cmake(
         *("-S", str(SOURCES), "-B", str(folder), "-G", "Ninja"),
@@ -87,12 +110,12 @@ def build_in_place(*, checked: bool = False) -> None:
 def _cmake(*arguments: str) -> None:
     command = shutil.which("cmake", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     if command is None:
-        sys.exit("building the core needs cmake and ninja: pip install cmake ninja")
+        sys.exit("Building the core needs cmake and ninja: pip install cmake ninja")
     # Ninja of the same environment comes before the machine's.
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run([command, *arguments], env={**os.environ, "PATH": path}, check=False)  # noqa: S603
     if done.returncode:
-        sys.exit(f"building the core failed: cmake {' '.join(arguments)}")
+        sys.exit(f"Building the core failed, for the reason above: cmake {' '.join(arguments)}")
 
 
 # The hooks of PEP 517 and PEP 660.
@@ -117,7 +140,7 @@ def get_requires_for_build_wheel(config_settings: Settings = None) -> list[str]:
     from scikit_build_core import build
 
     needed = build.get_requires_for_build_wheel(config_settings)
-    return needed if has_compiler() else [*needed, ZIG]
+    return needed if find_compiler() else [*needed, ZIG]
 
 
 get_requires_for_build_editable = get_requires_for_build_wheel
@@ -170,4 +193,10 @@ def _digest(data: bytes) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Build the native core of this source tree.")
     parser.add_argument("--checked", action="store_true", help="with sanitizers and bounds checks")
-    build_in_place(checked=parser.parse_args().checked)
+    parser.add_argument("--find", action="store_true", help="name the C++ compiler")
+    options = parser.parse_args()
+    if options.find:
+        compiler = find_compiler()
+        print(compiler or "no C++20 compiler")
+        sys.exit(compiler is None)
+    build_in_place(checked=options.checked)

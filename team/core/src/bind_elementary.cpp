@@ -111,7 +111,8 @@ void bind_elementary(nb::module_& m) {
   def_of_one(m, "expm1", elementary::expm1, "x", "E to the power of x, less 1; x may be an array.");
   m.def("squared", [](const Number& x) { return x.value * x.value; }, "x"_a,
         "The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.");
-  m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a);
+  m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a,
+        nb::sig("def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]"));
   def_of_one(m, "normal_below", elementary::normal_below, "x",
              "The probability that a standard normal variable stays below x, to 1e-15; x may be an array.");
   def_of_one(m, "wrapped", se2::wrapped<double>, "angle", "The same direction in (-pi, pi]; angle may be an array.");

@@ -20,7 +20,7 @@ def test_the_peak_of_a_process_is_its_own_and_not_that_of_who_started_it() -> No
     assert started.stdin is not None
     assert started.stdout is not None
     with started.stdin, started.stdout:
-        process = Process(started.pid, started)
+        process = Process(started)
         assert started.stdout.readline() == b"ready\n"
         process.measure()
         started.stdin.write(b"\n")

@@ -204,9 +204,9 @@ def test_on_another_platform_numbers_are_compared_within_a_tolerance(
             lambda x: msgspec.structs.replace(x, means=from_floats(floats(x.means, "means") + by)),
         )
 
-    other = {"kernels": "those of another day"}
+    other = {"core": "that of another day"}
     near = verify(written(tmp_path / "near.mcap", moved(1e-8), other))
-    assert near.other_platform == ("kernels",)
+    assert near.other_platform == ("core",)
     assert near.first is None
     assert [c.close for c in near.channels if c.channel == "final_map"] == [1]
     far = verify(written(tmp_path / "far.mcap", moved(1e-3), other))
