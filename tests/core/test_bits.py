@@ -20,8 +20,11 @@ LIBRARIES = Path(core.__file__).parent
 """Elsewhere than the sources where a wheel is tested."""
 PROGRAMS = {
     "bits": (
-        "8c51871c169fc457",
-        ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
+        "8c51871c169fc457 c23c826e90deb72d",
+        (
+            *("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
+            *("arrow", "consensus", "sensitivity", "motion"),
+        ),
     ),
     "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
     "bits_maps": (
@@ -30,7 +33,7 @@ PROGRAMS = {
     ),
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
 }
-"""Hash of all results of a program in this folder, equal to the bits of the Numba kernels before
+"""Hashes of all results of a program in this folder, equal to the bits of the Numba kernels before
 them; and the core's sources that it takes.
 """
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
@@ -43,7 +46,7 @@ def hash_of(name: str, tmp_path: Path, *command: str, runs_by: Sequence[str] = (
     words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / f"tests/core/{name}.cpp"]
     subprocess.run([*words, "-o", program], check=True, capture_output=True, timeout=900)
     ran = subprocess.run([*runs_by, program], check=True, capture_output=True, text=True)
-    return ran.stdout.strip()
+    return " ".join(ran.stdout.split())
 
 
 @pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
