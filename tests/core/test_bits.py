@@ -24,6 +24,7 @@ PROGRAMS = {
         ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
     ),
     "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
+    "bits_odometry": ("ea6b9469b75f9ecd", ("motion", "odometry", "reduction")),
 }
 """Hash of all results of a program in this folder, equal to the bits of the Numba kernels before
 them; and the core's sources that it takes.

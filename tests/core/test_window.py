@@ -112,7 +112,12 @@ def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes() -> N
     window = core.Window(M, NOISE, mount=(0.3, 0.1, 0.7))
     window.advance(*KEYFRAME)
     based = window.of_base()
-    for use in (based.close, based.run, lambda: based.advance(*KEYFRAME)):
+    for use in (
+        based.close,
+        based.run,
+        lambda: based.sensitivity(np.zeros(7), False),
+        lambda: based.advance(*KEYFRAME),
+    ):
         with pytest.raises(ValueError, match="no measurements of its own"):
             use()
 

@@ -145,6 +145,7 @@ std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window)
 }  // namespace
 
 Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes) {
+  window.check_of_sensor();
   const Noise& noise = window.settings().noise;
   const se2::Mount& mount = window.settings().mount;
   const se2::Mount away = mount.inverse();

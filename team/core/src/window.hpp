@@ -89,8 +89,9 @@ class Window {
   Rows solved_landmarks() const;
 
   // Poses and landmarks in the frame of the base's start. The measurements stay the sensor's, so this
-  // window neither advances nor closes: it throws std::invalid_argument.
+  // window neither advances nor closes: `check_of_sensor` throws std::invalid_argument.
   Window of_base() const;
+  void check_of_sensor() const;
 
   // The weighted mean of the poses at each keyframe, headings on the circle.
   std::vector<se2::Pose<double>> mean_path() const;
@@ -108,7 +109,6 @@ class Window {
   double effective() const { return effective_; }
 
  private:
-  void check_of_sensor() const;
   Gaussian gaussian(bool with_nodes, Rows landmarks) const;
   void keep(const Increment& increment);
   double take(const Increment& increment, const Lower3& L, const Scan& scan, std::span<const Reading> readings,

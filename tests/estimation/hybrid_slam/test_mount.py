@@ -4,13 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from team import core
 from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from team.estimation.hybrid_slam.fastslam import noise_of
 from team.estimation.hybrid_slam.pipeline import HybridSlam
 from team.estimation.models import Increment, increment_of, predicted
 from team.estimation.mount import of_base, of_sensor
 from team.estimation.odometry import OdometryInterval
 from team.estimation.scans import polar_scan
-from team.estimation.se2 import compose, inverse
+from team.estimation.se2 import compose
 
 MOUNT = (3.78, 0.5, -0.6)
 SECOND = 1_000_000_000
@@ -52,9 +54,19 @@ def test_the_sensors_motion_is_the_bases_seen_from_the_sensor_and_back() -> None
     back = of_base(of_sensor(step, mount), mount)
     np.testing.assert_allclose(back.mean, step.mean, atol=1e-12)
     np.testing.assert_allclose(back.covariance, step.covariance, atol=1e-12)
-    pose = of_sensor(Increment(step.mean, np.zeros((3, 3))), mount).mean
-    of_base_again = compose(compose(mount, pose), inverse(mount))
-    np.testing.assert_allclose(of_base_again, step.mean, atol=1e-12)
+
+
+def test_a_window_of_the_base_has_the_bases_poses_and_landmarks() -> None:
+    still, unclaimed = np.zeros((3, 3)), np.empty((1, 0))
+    step, mount = increment_of(STEADY, 1.0, 1.0, 0.2).mean, np.array(MOUNT)
+    moved = of_sensor(Increment(step, still), mount).mean
+    r, b = predicted(compose(mount, moved), PLACES[0])
+    window = core.Window(1, noise_of(Sensor()), True, MOUNT)
+    seen = np.array([3], np.uint32), np.array([r]), np.array([b]), unclaimed
+    window.advance(moved, still, *seen, None, np.zeros((1, 3)))
+    poses, _, _, means, _ = window.of_base().particles()
+    np.testing.assert_allclose(poses[0], step, atol=1e-12)
+    np.testing.assert_allclose(means[0, 0], PLACES[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("mount", [MOUNT, (0.0, 0.0, 0.0)])

@@ -104,10 +104,10 @@ def test_columns_change_nothing_else():
     assert made[0].biases == ()
 
 
-def some_window(seed, sensor, mark=()):
+def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
     """A core's window of six random keyframes, and its motions' covariances and shifts."""
     rng = np.random.default_rng(seed)
-    window = core.Window(5, noise_of(sensor))
+    window = core.Window(5, noise_of(sensor), mount=mount)
     motions = []
     for k in range(6):
         step = increment_of(MOTION, 1.0, rng.uniform(0.5, 2.0), rng.normal(0.0, 0.3))
@@ -125,14 +125,13 @@ def some_window(seed, sensor, mark=()):
     return window, motions
 
 
-def stated(window, motions, mean, nodes):
-    """The smoother's poses and landmarks by each bias: dense, its Jacobians by differences.
+def stated(window, motions, points):
+    """The answers of the smoother to each bias: dense, its Jacobians by differences.
 
     Residuals are Log(motion⁻¹ ∘ x_{k−1}⁻¹ ∘ x_k) − shift b and h(x, landmark) + g b.
     """
     path, (keyframes, seen, _, own) = window.mean_path(), window.measurements()
     ids = np.sort(window.ids())
-    points = mean[3 + 3 * nodes :].reshape(-1, 2)
     steps = [se2.between(a, b) for a, b in zip([np.zeros(3), *path], path, strict=False)]
     white = noise_of(SMOOTHED)
     K, W, biased = len(path), [], []
@@ -175,20 +174,33 @@ def stated(window, motions, mean, nodes):
 SMOOTHED = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.02)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(seed):
-    nodes = (1, 4)
-    window, motions = some_window(seed, SMOOTHED, nodes)
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.8)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(seed, mount):
+    nodes, away = (1, 4), se2.inverse(np.array(mount))
+    window, motions = some_window(seed, SMOOTHED, nodes, mount)
     mean = window.close()[1]
     rows, fault = window.sensitivity(mean, True)
     assert fault == 0
-    answer = stated(window, motions, mean, len(nodes)).T
-    path = window.mean_path()
+    points = np.array([se2.transformed(away, p) for p in mean[9:].reshape(-1, 2)])
+    answer = stated(window, motions, points).T
+    path, turn = window.mean_path(), se2.tangent(mount[2])[:2, :2]
+
+    def of_base(pose):
+        return se2.compose(se2.compose(np.array(mount), pose), away)
+
     for at, k in enumerate((len(path) - 1, *nodes)):
-        turn = se2.tangent(path[k][2])
-        expected = answer[:, 3 * k : 3 * k + 3] @ turn.T
-        np.testing.assert_allclose(rows[:, 3 * at : 3 * at + 3], expected, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(rows[:, 9:], answer[:, 18:], rtol=1e-5, atol=1e-5)
+        for row, xi in zip(rows[:, 3 * at : 3 * at + 3], answer[:, 3 * k : 3 * k + 3], strict=True):
+            up, down = (
+                of_base(se2.compose(path[k], se2.exponential(h * xi))) for h in (1e-6, -1e-6)
+            )
+            np.testing.assert_allclose(row, wrap_pose(up - down) / 2e-6, rtol=1e-5, atol=1e-5)
+    expected = answer[:, 18:].reshape(4, -1, 2) @ turn.T
+    np.testing.assert_allclose(rows[:, 9:], expected.reshape(4, -1), rtol=1e-5, atol=1e-5)
+
+
+def wrap_pose(difference):
+    return np.array([*difference[:2], wrap(difference[2])])
 
 
 def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
