@@ -32,6 +32,7 @@ PROGRAMS = {
         ("own_map", "chain", "submap_factor", "dense", "gaussian"),
     ),
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
+    "bits_odometry": ("ea6b9469b75f9ecd", ("motion", "odometry", "reduction")),
 }
 """Hashes of all results of a program in this folder, equal to the bits of the Numba kernels before
 them; and the core's sources that it takes.

@@ -5,6 +5,7 @@
 using namespace teamslam;
 
 NB_MODULE(TEAMSLAM_MODULE, m) {
+  nb::set_leak_warnings(false);  // caches in Python hold objects until the interpreter ends
   m.doc() = "The numerical core: the state of a window, and functions with defined bits.";
   m.attr("level") = TEAMSLAM_LEVEL;
   m.attr("digest") = TEAMSLAM_DIGEST;
