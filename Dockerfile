@@ -17,8 +17,7 @@ RUN sed -n '/^\(pip\|cmake\|nanobind\|ninja\|packaging\|pathspec\|scikit-build-c
  && pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /dist .
 
 FROM ${BASE}
-# Kernels are compiled for the processor that they run on, so the cache is filled at the first start
-# and kept in a volume; the log's folder belongs to the user, too.
+# The log's folder and that of Matplotlib's cache belong to the user.
 RUN useradd --system --uid 10001 --no-create-home teamslam \
  && install --directory --owner teamslam /logs /var/cache/teamslam
 RUN --mount=type=bind,from=build,source=/dist,target=/dist \
@@ -28,7 +27,6 @@ RUN --mount=type=bind,from=build,source=/dist,target=/dist \
 ENV PYTHONUNBUFFERED=1 \
     OPENBLAS_NUM_THREADS=1 \
     OMP_NUM_THREADS=1 \
-    NUMBA_CACHE_DIR=/var/cache/teamslam/numba \
     MPLCONFIGDIR=/var/cache/teamslam/matplotlib
 USER teamslam
 WORKDIR /logs

@@ -40,7 +40,7 @@ DRIVEN, SCANNED = 600, 33
 def least(parts: list[Callable[[], None]], rounds: int) -> list[float]:
     """CPU seconds of each part, the least of all rounds; the parts alternate."""
     took = [[_cpu_s(part) for part in parts] for _ in range(rounds + 1)]
-    return np.min(took[1:], axis=0).tolist()  # the first round compiles or loads
+    return np.min(took[1:], axis=0).tolist()  # the first round loads
 
 
 def _cpu_s(part: Callable[[], None]) -> float:

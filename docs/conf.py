@@ -4,7 +4,6 @@ The pages are Markdown. The command reference is generated from the commands, th
 the docstrings, which are plain text with formulas and not reStructuredText.
 """
 
-import os
 import re
 import subprocess
 import sys
@@ -12,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, get_origin
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # kernels are then plain functions with docstrings
 HERE = Path(__file__).parent
 LEFT_OUT = ("sim/studies", "team/library.py")
 """Left out of the API reference: the studies, and the library, which has its own page."""

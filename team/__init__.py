@@ -17,7 +17,7 @@ _OF_DRIVER = ("Driver", "DriverError", "DriverWarning", "MeasurementError")
 def __getattr__(name: str) -> Any:
     """A name of the library, at its first use; our modules are left to the import system.
 
-    The library is no import statement here, or every kernel would count as made from it
+    The library is no import statement here, or every study would count as made from it
     (`team.sources`).
     """
     if not name.startswith("_") and find_spec(f"{__name__}.{name}") is None:

@@ -219,7 +219,7 @@ def place_of(trace: TracebackType | None) -> str:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether an interrupt caused an exception; a compiled kernel raises SystemError for it."""
+    """Whether an exception is an interrupt, or an interrupt caused it."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

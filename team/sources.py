@@ -1,4 +1,4 @@
-"""The sources of ours that a module depends on, and hence its results and compiled code."""
+"""The sources of ours that a module depends on, and hence its results."""
 
 import ast
 import re
@@ -11,10 +11,10 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 """A name in a table of `team.registry`."""
 
 
-def sources_of(module: str, packages: tuple[str, ...], *, places: bool = True) -> dict[str, bytes]:
+def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
     """The text of a module and of every module of these packages that it imports, transitively.
 
-    places: names in tables (`team.registry`) count as imports.
+    Names in tables (`team.registry`) count as imports.
     """
     found: dict[str, bytes] = {}
     waiting = [module]
@@ -27,12 +27,12 @@ def sources_of(module: str, packages: tuple[str, ...], *, places: bool = True) -
             continue
         found[name] = path.read_bytes()
         waiting.append(name.rpartition(".")[0])
-        waiting += _imported(found[name], places)
+        waiting += _imported(found[name])
     return found
 
 
 @lru_cache
-def _imported(source: bytes, places: bool) -> tuple[str, ...]:
+def _imported(source: bytes) -> tuple[str, ...]:
     """Modules that a source may use: `from a import b` may mean a.b, a text `a.b:c` means a.b."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
@@ -40,7 +40,7 @@ def _imported(source: bytes, places: bool) -> tuple[str, ...]:
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
             names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif places and isinstance(node, ast.Constant) and isinstance(node.value, str):
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             names += _PLACE.findall(node.value)
     return tuple(names)
 

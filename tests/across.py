@@ -27,15 +27,11 @@ CLASSES: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
     "without AVX": {
         "TEAMSLAM_CORE": "base",
-        "NUMBA_CPU_NAME": "generic",
-        "NUMBA_CPU_FEATURES": "",
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL",
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-FMA,-FMA4,-AVX512F,-AVX512VL,-AVX512DQ",
         "OPENBLAS_CORETYPE": "Prescott",
     },
     "AVX2": {
-        "NUMBA_CPU_NAME": "haswell",
-        "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+bmi,+bmi2,+sse4.2",
         "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL",
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512DQ",
         "OPENBLAS_CORETYPE": "Haswell",

@@ -44,9 +44,7 @@ FIRST = (
     *LAUNCHED, f"{SYSTEM}test_bad_input.py", SYSTEM,
     "tests/recording/", "tests/keys/", "tests/wire/", "tests/sim/",
 )  # fmt: skip
-"""The tests that start processes come first, they take longest; of them first a launch, which in a
-fresh clone compiles the kernels, beside it those that need few; long ones are not last.
-"""
+"""The tests that start processes come first, since they take longest; long ones are not last."""
 TEAMS = 2
 """So many workers run tests of processes at a time; the third has what they leave of the time."""
 BESIDE = 5

@@ -151,10 +151,7 @@ def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
 
 
 class Submaps(Mapping[str, list[m.Submap]]):
-    """Submaps of robots without a centre, computed when a test first uses them.
-
-    At import it would need kernels, which one worker would compile while the others wait for them.
-    """
+    """Submaps of robots without a centre, computed when a test first uses them."""
 
     def __init__(self, streams: Sequence[RobotStream]) -> None:
         self._streams = {each.robot: each for each in streams}

@@ -111,7 +111,7 @@ def test_no_path_of_a_machine_is_committed() -> None:
 
 
 def test_no_data_set_and_no_log_is_committed() -> None:
-    data = {".dat", ".zip", ".gz", ".mcap", ".npy", ".npz", ".nbi", ".nbc"}
+    data = {".dat", ".zip", ".gz", ".mcap", ".npy", ".npz"}
     assert [file for file in tracked() if file.suffix in data] == []
     assert [file for file in tracked() if file.stat().st_size > 1_000_000] == []
 

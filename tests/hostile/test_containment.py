@@ -284,8 +284,8 @@ def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(
     assert [s.key for s in sink.receive()] == ["robot/alpha/fault", "robot/alpha/submap"]
 
 
-def test_an_interrupt_within_a_compiled_kernel_ends_the_run_and_is_no_fault() -> None:
-    """Numba makes a SystemError of it: Ctrl-C was set aside as a fault, and the run went on."""
+def test_an_interrupt_within_native_code_ends_the_run_and_is_no_fault() -> None:
+    """A callback from native code turns it into a SystemError."""
 
     class Interrupted:
         def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:

@@ -47,10 +47,8 @@ async def endpoint_of(folder: Path, last: str = "world") -> str:
     """Where the router of the launch listens whose run's folder this is, once all are started.
 
     last: who is started as the last one; a live team has no world.
-
-    The router comes first; where kernels have to be compiled, the others a minute later.
     """
-    await until((folder / f"{last}.log").exists, f"the {last} is started", 600.0)
+    await until((folder / f"{last}.log").exists, f"the {last} is started")
     said = folder / "router.log"
     spoken = re.compile(r"^listening at (\S+)$", re.MULTILINE)
     await until(lambda: said.exists() and spoken.search(said.read_text()), "the router listens")

@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from numba.core.caching import _CacheLocator
-
 from team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.processes import Processes
@@ -15,7 +13,7 @@ from tests.system.scenarios import short
 
 PACKAGES = ("team", "central", "sim")
 PATIENCE_S = 300.0
-"""Time limit [s] of a command: the launch may have to compile the kernels."""
+"""Time limit [s] of a command."""
 REMOVABLE = ("sim/studies",)
 REMOVED = """import sys
 
@@ -35,23 +33,8 @@ a direct child of another, in the checkout.
 """
 
 
-def lend_kernels(sources: Path, folder: Path) -> None:
-    """Fill a folder with the kernels of these sources, where NUMBA_CACHE_DIR names one for ours.
-
-    There they are found by the path of their sources; otherwise they lie beside them.
-    """
-    folder.mkdir()
-    if "NUMBA_CACHE_DIR" in os.environ:
-        common = Path(os.environ["NUMBA_CACHE_DIR"])
-        place = _CacheLocator.get_suitable_cache_subpath
-        for each in (path.parent for path in sources.rglob("__init__.py")):
-            compiled = common / place(str(ROOT / each.relative_to(sources) / "_.py"))
-            if compiled.is_dir():
-                shutil.copytree(compiled, folder / place(str(each / "_.py")))
-
-
 def without_studies(folder: Path) -> Path:
-    """The sources without the removable folders; compiled kernels stay valid, as times do."""
+    """The sources without the removable folders."""
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package)
     for name in REMOVABLE:
@@ -64,9 +47,7 @@ async def done(
     team: Processes, sources: Path, name: str, words: Sequence[object], status: int = 0
 ) -> str:
     path = f"PYTHONPATH={sources}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    kernels = sources.parent / "kernels"
-    lent = [f"NUMBA_CACHE_DIR={kernels}"] if any(kernels.iterdir()) else []
-    program = ["env", path, *lent, sys.executable, "-P", "-m", "sim"]
+    program = ["env", path, sys.executable, "-P", "-m", "sim"]
     process = await team.run(name, [*program, *(str(word) for word in words)])
     assert await process.ended(PATIENCE_S) == status, process.said()
     return process.said()
@@ -76,7 +57,6 @@ async def test_the_product_launches_records_reruns_reports_and_shows_without_the
     team: Processes,
 ) -> None:
     sources = without_studies(team.folder / "sources")
-    lend_kernels(sources, team.folder / "kernels")
     scenario = short(team.folder, steps=30)
     await done(team, sources, "launch", ["launch", scenario, "--output", "run"])
     log = team.folder / "run" / "log.mcap"

@@ -38,7 +38,7 @@ from tests.hostile.drawing import OF_THE_RUN, PAIR, mutated, payloads
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 
 PATIENCE_S = 600.0
-"""Time [s] for a process to begin: kernels may have to be compiled."""
+"""Time [s] for a process to begin."""
 SUBMAPS = 1_500
 """Hostile submaps of a storm: the centre folds each of them that it does not refuse."""
 
