@@ -35,9 +35,11 @@ def _run() -> None:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["template"]:
-        from sim.cli.main import command
+        from sim.cli.main import prepare_commands
         from sim.launch.template import become_a_process, end_by
 
-        become_a_process(command)  # returns in a forked process, with the words of its own command
+        become_a_process(
+            prepare_commands
+        )  # returns in a forked process, with the words of its own command
         end_by(_run)
     main()

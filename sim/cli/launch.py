@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sim.cli.help import NETWORK, RARE, Command
 from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
     ANY_PORT,
@@ -57,7 +58,10 @@ COMPILING_S = 3.0
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog=("teamslam launch waypoints --view\nteamslam launch --dataset my_set -o runs/first"),
+)
 def launch(
     scenario: Annotated[
         str | None,
@@ -67,43 +71,39 @@ def launch(
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
-    pieces: Pieces = None,
-    identities: IdentitiesOption = None,
-    estimator: EstimatorOption = None,
-    fusion: FusionOption = None,
     seed: Seed = None,
     speed: SpeedText = "max",
-    record: Annotated[
-        Path | None, typer.Option(help="The log to write; default: log.mcap in the run's folder.")
-    ] = None,
-    json_file: JsonFile = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
+    ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The run's folder; default: a new one below runs/."),
-    ] = None,
-    listen: Annotated[
-        str, typer.Option(help="Where the router listens; port 0: any free one.")
-    ] = ANY_PORT,
-    keys: Keys = None,
-    insecure: Annotated[
-        bool, typer.Option(help="Without keys, admit everyone who reaches the router.")
-    ] = False,
-    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
-    views: Annotated[
-        bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
-    ] = True,
-    end_silent: Annotated[
-        float | None,
         typer.Option(
-            help="End a process that is silent for this many seconds, so that it is started "
-            "again; default: only name it.",
-            min=10.0,
+            "--output",
+            "-o",
+            help="The run's folder; default: a new one below runs/.",
+            metavar="DIR",
         ),
     ] = None,
-    peers: Peers = False,
+    identities: IdentitiesOption = None,
     without_centre: Annotated[
         bool, typer.Option("--without-centre", help="No central computer: robots are peers.")
     ] = False,
+    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
+    browser: Open = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="The log to write; default: log.mcap in the run's folder.",
+            metavar="FILE",
+            rich_help_panel=RARE,
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+    pieces: Pieces = None,
+    estimator: EstimatorOption = None,
+    fusion: FusionOption = None,
+    peers: Peers = False,
     comm_range: Annotated[
         float | None,
         typer.Option(
@@ -111,14 +111,42 @@ def launch(
             help="Peers reach each other within this true distance in metres.",
             metavar="M",
             min=0.001,
+            rich_help_panel=RARE,
         ),
     ] = None,
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
-    ] = False,
+    views: Annotated[
+        bool,
+        typer.Option(
+            help="Record what Foxglove, Lichtblick and Rerun draw, too.", rich_help_panel=RARE
+        ),
+    ] = True,
+    end_silent: Annotated[
+        float | None,
+        typer.Option(
+            help="End a process that is silent for this many seconds, so that it is started "
+            "again; default: only name it.",
+            min=10.0,
+            metavar="S",
+            rich_help_panel=RARE,
+        ),
+    ] = None,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
-    browser: Open = None,
+    listen: Annotated[
+        str,
+        typer.Option(
+            help="Where the router listens; port 0: any free one.",
+            metavar="ENDPOINT",
+            rich_help_panel=NETWORK,
+        ),
+    ] = ANY_PORT,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            help="Without keys, admit everyone who reaches the router.", rich_help_panel=NETWORK
+        ),
+    ] = False,
 ) -> None:
     """Launch a whole team, watch it, and end with a report and a log.
 

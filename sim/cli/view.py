@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import RARE, Command
 from sim.cli.options import (
     LOOPBACK,
     WRONG_USE,
@@ -30,10 +31,22 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("teamslam")
 Port = Annotated[
-    int, typer.Option(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
+    int,
+    typer.Option(
+        help="Where the page is served; 0: any free port.",
+        min=0,
+        metavar="PORT",
+        rich_help_panel=RARE,
+    ),
 ]
 FoxglovePort = Annotated[
-    int, typer.Option(help="Where Foxglove can connect; 0: any free port.", min=0, metavar="PORT")
+    int,
+    typer.Option(
+        help="Where Foxglove can connect; 0: any free port.",
+        min=0,
+        metavar="PORT",
+        rich_help_panel=RARE,
+    ),
 ]
 Open = Annotated[
     bool | None,
@@ -42,7 +55,7 @@ Open = Annotated[
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam viewer waypoints")
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
     """Publish views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
@@ -61,13 +74,18 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
         _LOG.info("published %d views", run_viewer(bus, stop, peers))
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam view runs/first")
 def view(
     log: LogArgument,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
     host: Annotated[
-        str, typer.Option(help="The address to serve at; others than 127.0.0.1 show it to others.")
+        str,
+        typer.Option(
+            help="The address to serve at; others than 127.0.0.1 show it to others.",
+            metavar="ADDRESS",
+            rich_help_panel=RARE,
+        ),
     ] = "127.0.0.1",
     browser: Open = None,
     follow: Annotated[
@@ -75,10 +93,14 @@ def view(
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option(help="Write the log with what other tools draw to this new file, and end."),
+        typer.Option(
+            help="Write the log with what other tools draw to this new file, and end.",
+            metavar="FILE",
+        ),
     ] = None,
     layout: Annotated[
-        Path | None, typer.Option(help="Write a Foxglove layout for this team's log, and end.")
+        Path | None,
+        typer.Option(help="Write a Foxglove layout for this team's log, and end.", metavar="FILE"),
     ] = None,
 ) -> None:
     """Show a log, or a running team by its log, on a page in a browser.

@@ -7,12 +7,15 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command, Group
 from sim.cli.options import FAILED, WRONG_USE, fail
 from sim.studies.experiments.catalogue import ENTRIES, Entry
 from team.extras import install_command
 
 app = typer.Typer(
     name="experiment",
+    cls=Group,
+    epilog="teamslam experiment accuracy --quick",
     help="Reproduce the sources' tables and figures, and measure the team's accuracy.",
     no_args_is_help=True,
 )
@@ -74,7 +77,7 @@ def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
         )
         _run(name, entries, chosen, asked)
 
-    app.command(name, help=summary)(run)
+    app.command(name, cls=Command, help=summary, epilog=f"teamslam experiment {name} --quick")(run)
 
 
 @dataclass(frozen=True, kw_only=True)
