@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from central.desk.names import data_set_name
 from sim.cli.help import NETWORK, RARE, Command
 from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
@@ -158,7 +159,7 @@ def launch(
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     if dataset is not None and is_foreign(dataset):
         output = output or _new_folder(dataset.stem or "bag")
-        dataset = imported_into(dataset, output / "dataset")
+        dataset = imported_into(dataset, output / (dataset.stem or "bag"))
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
@@ -188,7 +189,7 @@ def launch(
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
-    folder = output or _new_folder(f"{resolved.name}-{resolved.seed}")
+    folder = output or _new_folder(_name_of(resolved) or f"{resolved.name}-{resolved.seed}")
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
@@ -224,6 +225,12 @@ def launch(
             _keep_showing(at.url, log)
 
 
+def _name_of(scenario: Scenario) -> str:
+    """Name of the scenario's data set; empty for a simulated world or a live team."""
+    path = getattr(scenario.world, "path", "")
+    return data_set_name(Path(path).resolve()) if path else ""
+
+
 def _launched(plan: "Plan") -> "Outcome":
     """Send the kernels' names to the template first: it loads them during this process's
     imports.
@@ -240,7 +247,7 @@ def _launched(plan: "Plan") -> "Outcome":
         if not starter.is_warm:
             _compile(scenario)
         try:
-            with shown(f"{scenario.name}, seed {scenario.seed}") as show:
+            with shown(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
                 outcome = launch(plan, starter, show)
         except LaunchError as error:
             fail(str(error), FAILED)
@@ -293,9 +300,13 @@ def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
 
     found = moving_stretches(streams.streams)
     if found >= LEAST_SPANS:
+        command = f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}`"
+        if any(each.truth is not None for each in streams.streams):
+            return f"{command} learns your robots' own from the data"
         return (
-            f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}` learns your robots' "
-            "own from the data"
+            f"{command} learns the odometry's scales; without ground truth not the noise: write "
+            "what you know of it into that file, and change it as the report's covariance scale "
+            "advises (docs/faq.md)"
         )
     return (
         f"the data have {found} stretch{'es' * (found != 1)} of {SPAN_S:.0f} s with "
@@ -466,6 +477,7 @@ def _conclude(
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     compiling = f", {outcome.compiling_s:.0f} s of it compiling" if outcome.compiling_s > 1 else ""
     console.print(f"{outcome.wall_s:.1f} s of wall time of the run{compiling}", highlight=False)
+    console.print(f"show  teamslam view {outcome.log}", highlight=False, soft_wrap=True)
     if json_file is not None:
         _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
     if outcome.failures:

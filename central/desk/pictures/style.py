@@ -47,9 +47,6 @@ class Picture(StrEnum):
     MAP = "map"
     ERRORS = "errors"
     CONSISTENCY = "consistency"
-    TRAFFIC = "traffic"
-    LATENCY = "latency"
-    TIMELINE = "timeline"
 
 
 class Look(StrEnum):
@@ -145,7 +142,7 @@ def _resize(figure: "Figure", width_in: float | None) -> None:
                 label.xyann = tuple(scale * each for each in label.xyann)
         if is_column and panels and axis.get_title():
             axis.set_title("")
-        legend = axis.get_legend()
+        legend = axis.get_legend() if panels else next(iter(figure.legends), None)
         if legend is None or not (is_column or not panels):
             continue
         handles, labels = axis.get_legend_handles_labels()
