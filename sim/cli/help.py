@@ -90,7 +90,7 @@ def _parsed(parse: Any, command: Any, ctx: Any, args: list[str]) -> list[str]:
             known = [name for each in command.get_params(ctx) for name in each.opts]
             known += [name for each in command.get_params(ctx) for name in each.secondary_opts]
             error.message = f"No such option: {option}{close(option, known)}"
-            error.possibilities = None  # type: ignore[attr-defined] - of Typer's NoSuchOption
+            error.possibilities = None
         raise
     return parsed
 

@@ -12,6 +12,7 @@ import typer
 
 from sim.cli.help import RARE, Command
 from sim.cli.options import (
+    FAILED,
     LOOPBACK,
     WRONG_USE,
     Connect,
@@ -98,6 +99,12 @@ def view(
             metavar="FILE",
         ),
     ] = None,
+    export_video: Annotated[
+        Path | None,
+        typer.Option(
+            "--export-video", help="Write the run as an animated GIF, and end.", metavar="FILE"
+        ),
+    ] = None,
     layout: Annotated[
         Path | None,
         typer.Option(help="Write a Foxglove layout for this team's log, and end.", metavar="FILE"),
@@ -113,6 +120,9 @@ def view(
     from team.shell import process
 
     log = log_file(log)
+    if export_video is not None:
+        _write_video(log, export_video)
+        return
     if not follow or log.exists():
         opened = open_log(log)
         if not follow:
@@ -152,6 +162,24 @@ def _has_display() -> bool:
     """Whether a browser is visible; text browsers would occupy the terminal."""
     windows = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     return bool(windows) and sys.stdout.isatty()
+
+
+def _write_video(log: Path, path: Path) -> None:
+    from central.desk.evaluation.evaluation import evaluate
+    from central.desk.pictures.film import draw_film, maps_over_time
+    from team.recording.reader import open_log
+    from team.wire.channels import FINAL_MAP, FUSED_MAP
+    from team.wire.codec import decoded
+    from team.wire.messages import FusedMap
+
+    if path.suffix != ".gif" or not path.parent.is_dir():
+        fail(f"--export-video {path}: give a .gif in an existing folder", WRONG_USE)
+    opened = open_log(log)
+    warn_of_holes(opened)
+    maps = (decoded(s.payload, FusedMap) for s in opened.samples((FUSED_MAP, FINAL_MAP)))
+    if not draw_film(evaluate(opened.samples()), maps_over_time(maps), path):
+        fail(f"{log} has no final map or no poses to draw", FAILED)
+    typer.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def _write(log: "Log", export: Path | None, layout: Path | None) -> None:

@@ -57,7 +57,7 @@ def map_picture(
     """
     if evaluation.map is None and not evaluation.robots:
         return False
-    evaluation = _in_the_maps_frame(evaluation)
+    evaluation = in_the_maps_frame(evaluation)
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
@@ -91,7 +91,7 @@ def map_picture(
     return True
 
 
-def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
+def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
     """Move the truth into an arbitrary map frame by the map's alignment."""
     fused = evaluation.map
     if not evaluation.arbitrary_frame or fused is None or fused.errors is None:
@@ -211,7 +211,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     truth, fused = evaluation.true_landmarks, evaluation.map
     has_map = fused is not None and len(fused.ids) > 0
     blocks = landmark_blocks(fused.covariance) if fused is not None and has_map else None
-    times = 1 if fused is None or blocks is None else _magnification(evaluation, blocks)
+    times = 1 if fused is None or blocks is None else magnification(evaluation, blocks)
     if len(truth):
         drawn = truth if fused is None or times == 1 else _magnified_truth(truth, fused, times)
         axis.plot(
@@ -245,7 +245,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
             )
 
 
-def _magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) -> int:
+def magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) -> int:
     """Factor at which the median ellipse is visible on a map of this extent."""
     assert evaluation.map is not None
     paths = [each.smoothed_path.poses[:, :2] for each in evaluation.robots.values()]

@@ -136,6 +136,8 @@ def _resize(figure: "Figure", width_in: float | None) -> None:
         line.set_linewidth(line.get_linewidth() * scale)
     for axis in figure.axes:
         axis.tick_params(labelsize=PAPER_PT)
+        for patch in axis.patches:
+            patch.set_linewidth(patch.get_linewidth() * scale)
         for label in axis.texts:
             label.set_fontsize(POINT_PT)
             if isinstance(label, Annotation):

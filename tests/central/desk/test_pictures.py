@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from PIL import Image
 from rich.console import Console
 
 from central.desk.compare import compare_rows
@@ -19,6 +20,7 @@ from central.desk.drawing import (
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
+from central.desk.pictures import film
 from central.desk.pictures.run import (
     error_picture,
     map_picture,
@@ -28,6 +30,8 @@ from central.desk.report.page import write_pictures
 from central.desk.report.run import Run
 from central.desk.report.tables import summary_tables, team_rows
 from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import decoded
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -108,6 +112,23 @@ def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
     assert "r1" in labels
     assert "r2: not in this map" in labels
     assert not any("online" in label for label in labels)
+
+
+def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(
+    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film, "FRAMES", 3)
+    monkeypatch.setattr(film, "LAST_FRAMES", 1)
+    log = joined_log(scenario(robots=2), 0.1)
+    maps = [decoded(s.payload, m.FusedMap) for s in log if s.key == ch.FINAL_MAP.key()]
+    moving = {n: replace(r, online_path=r.smoothed_path) for n, r in run.robots.items()}
+    path = tmp_path / "team.gif"
+    assert film.draw_film(replace(run, robots=moving), film.maps_over_time(maps), path)
+    with Image.open(path) as drawn:
+        assert drawn.format == "GIF"
+        assert getattr(drawn, "n_frames", 1) > 1
+    assert not film.draw_film(evaluate([]), [], tmp_path / "none.gif")
+    assert not (tmp_path / "none.gif").exists()
 
 
 def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_factor(
