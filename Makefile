@@ -68,7 +68,7 @@ bench: $(VENV)/.dev $(VENV)/.core
 # The pictures are made once; `make clean` lets them be made anew.
 PICTURES := docs/generated
 RUNS := run hidden peers
-docs: $(VENV)/.dev $(VENV)/.core $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
+docs: $(VENV)/.dev $(VENV)/.core $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/without/maps.png $(PICTURES)/team.gif $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
   $(PICTURES)/benchmarks.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"
@@ -78,6 +78,13 @@ $(PICTURES)/peers/report.html: OPTIONS := --without-centre
 $(PICTURES)/%/report.html: | $(VENV)/.dev
 	rm -rf $(@D)
 	$(BIN)/teamslam launch waypoints --speed max $(OPTIONS) --output $(@D)
+
+$(PICTURES)/without/maps.png: $(PICTURES)/run/report.html
+	$(BIN)/teamslam rerun $(<D) --without r3 --output $(@D)
+
+# README shows a copy: docs/team.gif.
+$(PICTURES)/team.gif: $(PICTURES)/run/report.html
+	$(BIN)/teamslam view $(<D) --export-video $@
 
 $(PICTURES)/benchmarks.png: benchmarks/chart.py $(wildcard benchmarks/*.json) | $(VENV)/.dev
 	$(BIN)/python -m benchmarks.chart $(@D)

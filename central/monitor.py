@@ -71,7 +71,8 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     if ranges is not None:
         found.append(
             "odometry or range scale not calibrated, covariance not valid: by the odometry, the "
-            f"robots' ranges read {100.0 * ranges:+.1f} % long (see `teamslam calibrate`)"
+            f"robots' ranges read {100.0 * ranges:+.1f} % long; without ground truth `teamslam "
+            "calibrate` learns the odometry's scale, with it both"
         )
     ways = _mean_of(biases, "forward_scale")
     if ways is not None:
@@ -157,8 +158,8 @@ def _misscale(scale: Scale, limit: float) -> str:
         return ""
     wrong = f"{TOO_SMALL} {value:.1f}" if value > 1.0 else f"{TOO_LARGE} {1.0 / value:.1f}"
     return (
-        f"{wrong}, by the differences between submaps; learn the sensors' and odometry's noise by "
-        "`teamslam calibrate` of the log or the data"
+        f"{wrong}, by the differences between submaps; multiply the sigmas of sensor and odometry "
+        f"by {math.sqrt(value):.2g}, or with ground truth learn them by `teamslam calibrate`"
     )
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
+from pathlib import PurePath
 
 OUTSIDE = "not in the team's frame"
 """Replaces the error of poses outside the team map's frame."""
@@ -9,6 +10,16 @@ _DIGITS = re.compile("([0-9]+)")
 _NOT_JOINED = " not joined: "
 _FIRST_LIFE = " (incarnation 1)"
 _ROBOT = re.compile(r"(\S+) \(incarnation \d+\)")
+
+
+PACKED = (".zip", ".mcap", ".db3")
+"""Suffixes of data sets in one file."""
+
+
+def data_set_name(path: str | PurePath) -> str:
+    """Name of a data set's folder, or of its file without suffix; empty if the path has none."""
+    place = PurePath(path)
+    return place.stem if place.suffix in PACKED else place.name
 
 
 def in_order(names: Iterable[str]) -> list[str]:

@@ -5,12 +5,13 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
 
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam calibrate my_set -o my_set/scenario.toml")
 def calibrate(
     source: Annotated[
         list[Path],

@@ -6,13 +6,14 @@ from typing import Annotated
 import typer
 
 from central.desk.pictures.style import Form
+from sim.cli.help import Command
 from sim.cli.options import WRONG_USE, JsonFile, fail, warn_of_holes, write_json
 
 app = typer.Typer()
 FEWEST = 2
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam compare runs/first runs/second -o both.png")
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or their logs; two or more.")],
     output: Annotated[

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import NETWORK, RARE, Command
 from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, fail, over_tls, parsed_start
 
 if TYPE_CHECKING:
@@ -33,23 +34,31 @@ AT_ONCE = 500
 """Measurements processed between checks for new messages."""
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog="teamslam driver r1 --team lab --ros2 topics.toml --start 0,0,1.57",
+)
 def driver(
     robot: Annotated[str, typer.Argument(help="The robot's name, as r1.")],
     ros2: Annotated[Path, typer.Option(help="TOML file that assigns topics.", metavar="FILE")],
-    team: Annotated[str, typer.Option(help="The team's name: its scenario's.")],
+    team: Annotated[str, typer.Option(help="The team's name: its scenario's.", metavar="NAME")],
     connect: Connect = LOOPBACK,
     ros2_connect: Annotated[
         str | None,
         typer.Option(
             help="Where ROS 2 is on Zenoh (rmw_zenoh's router, or a bridge); default: --connect.",
             metavar="ENDPOINT",
+            rich_help_panel=NETWORK,
         ),
     ] = None,
     keys: Keys = None,
     file: Annotated[
         Path | None,
-        typer.Option(help="Where all measurements are kept; default: ROBOT.stream here."),
+        typer.Option(
+            help="Where all measurements are kept; default: ROBOT.stream here.",
+            metavar="FILE",
+            rich_help_panel=RARE,
+        ),
     ] = None,
     start: Annotated[
         str | None,
@@ -60,7 +69,12 @@ def driver(
     ] = None,
     latency: Annotated[
         float,
-        typer.Option(help="Seconds by which landmarks may arrive later than odometry.", min=0.0),
+        typer.Option(
+            help="Seconds by which landmarks may arrive later than odometry.",
+            min=0.0,
+            metavar="S",
+            rich_help_panel=RARE,
+        ),
     ] = 0.2,
     answers: Annotated[
         Back,

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
 
 app = typer.Typer()
@@ -18,7 +19,11 @@ HEAD = 64
 """Bytes that contain an MCAP file's profile."""
 
 
-@app.command(name="import")
+@app.command(
+    name="import",
+    cls=Command,
+    epilog="teamslam import odom.csv tags.csv --robot r1 --columns columns.toml -o my_set",
+)
 def import_(
     source: Annotated[
         list[Path],

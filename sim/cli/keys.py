@@ -5,13 +5,17 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import WRONG_USE, Robots, fail, scenario_of
 from sim.scenarios.scenario import with_options
 
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog="teamslam keys waypoints -o keys --scenario waypoints --router 192.168.1.5",
+)
 def keys(
     team: Annotated[str, typer.Argument(help="The team's name, as its scenario has it.")],
     output: Annotated[

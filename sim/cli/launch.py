@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from central.desk.names import data_set_name
+from sim.cli.help import NETWORK, RARE, Command
 from sim.cli.importing import imported_into, is_foreign
 from sim.cli.options import (
     ANY_PORT,
@@ -55,7 +57,10 @@ INTERRUPTED = 130
 app = typer.Typer()
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog=("teamslam launch waypoints --view\nteamslam launch --dataset my_set -o runs/first"),
+)
 def launch(
     scenario: Annotated[
         str | None,
@@ -65,43 +70,39 @@ def launch(
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
-    pieces: Pieces = None,
-    identities: IdentitiesOption = None,
-    estimator: EstimatorOption = None,
-    fusion: FusionOption = None,
     seed: Seed = None,
     speed: SpeedText = "max",
-    record: Annotated[
-        Path | None, typer.Option(help="The log to write; default: log.mcap in the run's folder.")
-    ] = None,
-    json_file: JsonFile = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
+    ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The run's folder; default: a new one below runs/."),
-    ] = None,
-    listen: Annotated[
-        str, typer.Option(help="Where the router listens; port 0: any free one.")
-    ] = ANY_PORT,
-    keys: Keys = None,
-    insecure: Annotated[
-        bool, typer.Option(help="Without keys, admit everyone who reaches the router.")
-    ] = False,
-    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
-    views: Annotated[
-        bool, typer.Option(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
-    ] = True,
-    end_silent: Annotated[
-        float | None,
         typer.Option(
-            help="End a process that is silent for this many seconds, so that it is started "
-            "again; default: only name it.",
-            min=10.0,
+            "--output",
+            "-o",
+            help="The run's folder; default: a new one below runs/.",
+            metavar="DIR",
         ),
     ] = None,
-    peers: Peers = False,
+    identities: IdentitiesOption = None,
     without_centre: Annotated[
         bool, typer.Option("--without-centre", help="No central computer: robots are peers.")
     ] = False,
+    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
+    browser: Open = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="The log to write; default: log.mcap in the run's folder.",
+            metavar="FILE",
+            rich_help_panel=RARE,
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+    pieces: Pieces = None,
+    estimator: EstimatorOption = None,
+    fusion: FusionOption = None,
+    peers: Peers = False,
     comm_range: Annotated[
         float | None,
         typer.Option(
@@ -109,14 +110,42 @@ def launch(
             help="Peers reach each other within this true distance in metres.",
             metavar="M",
             min=0.001,
+            rich_help_panel=RARE,
         ),
     ] = None,
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
-    ] = False,
+    views: Annotated[
+        bool,
+        typer.Option(
+            help="Record what Foxglove, Lichtblick and Rerun draw, too.", rich_help_panel=RARE
+        ),
+    ] = True,
+    end_silent: Annotated[
+        float | None,
+        typer.Option(
+            help="End a process that is silent for this many seconds, so that it is started "
+            "again; default: only name it.",
+            min=10.0,
+            metavar="S",
+            rich_help_panel=RARE,
+        ),
+    ] = None,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
-    browser: Open = None,
+    listen: Annotated[
+        str,
+        typer.Option(
+            help="Where the router listens; port 0: any free one.",
+            metavar="ENDPOINT",
+            rich_help_panel=NETWORK,
+        ),
+    ] = ANY_PORT,
+    keys: Keys = None,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            help="Without keys, admit everyone who reaches the router.", rich_help_panel=NETWORK
+        ),
+    ] = False,
 ) -> None:
     """Launch a whole team, watch it, and end with a report and a log.
 
@@ -128,7 +157,7 @@ def launch(
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     if dataset is not None and is_foreign(dataset):
         output = output or _new_folder(dataset.stem or "bag")
-        dataset = imported_into(dataset, output / "dataset")
+        dataset = imported_into(dataset, output / (dataset.stem or "bag"))
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
@@ -158,7 +187,7 @@ def launch(
         typer.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
-    folder = output or _new_folder(f"{resolved.name}-{resolved.seed}")
+    folder = output or _new_folder(_name_of(resolved) or f"{resolved.name}-{resolved.seed}")
     log = record or folder / "log.mcap"
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
@@ -194,6 +223,12 @@ def launch(
             _keep_showing(at.url, log)
 
 
+def _name_of(scenario: Scenario) -> str:
+    """Name of the scenario's data set; empty for a simulated world or a live team."""
+    path = getattr(scenario.world, "path", "")
+    return data_set_name(Path(path).resolve()) if path else ""
+
+
 def _launched(plan: "Plan") -> "Outcome":
     from sim.launch.launch import LaunchError, launch
     from sim.launch.live import shown
@@ -201,7 +236,7 @@ def _launched(plan: "Plan") -> "Outcome":
 
     scenario = plan.scenario
     try:
-        with shown(f"{scenario.name}, seed {scenario.seed}") as show:
+        with shown(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
             return launch(plan, Starter(time.time_ns()), show)
     except LaunchError as error:
         fail(str(error), FAILED)
@@ -252,9 +287,13 @@ def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
 
     found = moving_stretches(streams.streams)
     if found >= LEAST_SPANS:
+        command = f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}`"
+        if any(each.truth is not None for each in streams.streams):
+            return f"{command} learns your robots' own from the data"
         return (
-            f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}` learns your robots' "
-            "own from the data"
+            f"{command} learns the odometry's scales; without ground truth not the noise: write "
+            "what you know of it into that file, and change it as the report's covariance scale "
+            "advises (docs/faq.md)"
         )
     return (
         f"the data have {found} stretch{'es' * (found != 1)} of {SPAN_S:.0f} s with "
@@ -384,6 +423,7 @@ def _conclude(
         console.print(text, highlight=False)
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
+    console.print(f"show  teamslam view {outcome.log}", highlight=False, soft_wrap=True)
     if json_file is not None:
         _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
     if outcome.failures:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import Command, Group
 from sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -32,14 +33,19 @@ if TYPE_CHECKING:
     from team.recording.tables import Exported
     from team.wire.channels import Channel
 
-NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.")]
+NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.", metavar="FILE")]
 ChannelNames = Annotated[
     str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
 ]
 
 NOT_FINISHED = "not finished by its recorder"
-app = typer.Typer(name="log", help="Logs: info, check, repair, cut, merge, export.")
-app.command()(repair)
+app = typer.Typer(
+    name="log",
+    cls=Group,
+    help="Inspect, check, repair, cut, merge or export a log.",
+    no_args_is_help=True,
+)
+app.command(cls=Command, epilog="teamslam log repair team.mcap -o whole.mcap")(repair)
 
 
 class Format(StrEnum):
@@ -52,7 +58,7 @@ class Format(StrEnum):
     ROSBAG2 = "rosbag2"
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam log info runs/first")
 def info(
     log: LogArgument,
     keys: Annotated[bool, typer.Option("--keys", help="A row per key, not per channel.")] = False,
@@ -100,7 +106,7 @@ def info(
     write_json(json_file, figures)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam log check runs/first")
 def check(log: LogArgument) -> None:
     """Check that a log is whole and valid: checksums, schemas, counters, order, every message.
 
@@ -117,7 +123,7 @@ def check(log: LogArgument) -> None:
     typer.echo(f"{log}: nothing wrong")
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam log cut runs/first --from 60 --to 120 -o minute.mcap")
 def cut(
     log: LogArgument,
     output: NewLog,
@@ -149,7 +155,7 @@ def cut(
     typer.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam log merge r1.mcap r2.mcap -o team.mcap")
 def merge(
     logs: Annotated[list[Path], typer.Argument(help="Logs of one team: of robots, or parts.")],
     output: NewLog,
@@ -164,7 +170,7 @@ def merge(
     warn_of_holes(open_log(output))
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam log export runs/first -o paths --format tum")
 def export(
     log: LogArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="A new folder.")],

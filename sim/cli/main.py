@@ -2,8 +2,7 @@
 
 import os
 import sys
-from collections.abc import Callable
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 # Before NumPy: one BLAS thread per process, for equal bits everywhere and no contention.
@@ -15,6 +14,7 @@ import typer  # noqa: E402 - the threads of BLAS are set before anything imports
 from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
 from sim.cli.compare import app as compare_commands  # noqa: E402
 from sim.cli.drivers import app as driver_commands  # noqa: E402
+from sim.cli.help import WIDE, Group  # noqa: E402
 from sim.cli.importing import app as import_commands  # noqa: E402
 from sim.cli.keys import app as key_commands  # noqa: E402
 from sim.cli.launch import app as launch_commands  # noqa: E402
@@ -30,11 +30,14 @@ from sim.cli.studies import add_studies  # noqa: E402
 from sim.cli.view import app as view_commands  # noqa: E402
 
 app = typer.Typer(
+    cls=Group,
     help="Multi-robot SLAM as real processes over Zenoh.",
+    epilog="teamslam launch waypoints --view\nteamslam COMMAND --help",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,
+    context_settings=WIDE,
 )
 for _part in (
     launch_commands, scenario_commands, node_commands, order_commands, key_commands,
@@ -55,47 +58,10 @@ def _version(version: bool = typer.Option(False, "--version", help="Print the ve
         raise typer.Exit
 
 
-def command() -> Callable[[], None]:
-    """Build all commands from their functions."""
-    whole = typer.main.get_command(app)
-    _convert_plainly(whole)
-    return whole
-
-
-def _convert_plainly(command: Any) -> None:
-    """Convert a command's unchecked values without Pydantic."""
-    for parameter in command.get_params(typer.Context(command)):
-        parameter._runtime_param = _Plain()
-    for part in getattr(command, "commands", {}).values():
-        _convert_plainly(part)
-
-
-class _Plain:
-    """Convert a parameter: none, text or path directly, others like Typer.
-
-    Typer imports Pydantic even for these, at 12 MB and 0.1 s per process. A Typer version without
-    `_runtime_param` converts all itself.
-    """
-
-    def coerce(self, value: Any, *, param: Any, ctx: Any) -> Any:
-        """Value passed to the command's function."""
-        kind, checks = param.type_descriptor.annotation, param.type_descriptor.parameter_info
-        is_single = param.nargs == 1 and not param.multiple and checks.parser is None
-        if is_single and (value is None or kind is str):
-            return value
-        if not is_single and value is None:
-            return ()
-        if is_single and kind is Path and not _is_checked(value, checks):
-            return Path(value)
-        param._runtime_param = None
-        return param.get_runtime_param().coerce(value, param=param, ctx=ctx)
-
-
-def _is_checked(path: Any, checks: Any) -> bool:
-    restricted = checks.exists or checks.writable or not (checks.file_okay and checks.dir_okay)
-    return (
-        restricted or checks.resolve_path or (os.path.exists(path) and not os.access(path, os.R_OK))
-    )
+@cache
+def command() -> Any:
+    """All commands, built from their functions."""
+    return typer.main.get_command(app)
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
+from sim.cli.help import RARE, Command
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -52,9 +53,11 @@ def _connected(scenario: Scenario, connect: str) -> None:
     _LOG.info("connected to team %s at %s", scenario.team, connect)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam router --listen tcp/192.168.1.5:7447 --keys keys")
 def router(
-    listen: Annotated[str, typer.Option(help="Where to listen; port 0: any free one.")] = LOOPBACK,
+    listen: Annotated[
+        str, typer.Option(help="Where to listen; port 0: any free one.", metavar="ENDPOINT")
+    ] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
         bool,
@@ -90,19 +93,25 @@ def router(
                 )
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam world waypoints --speed max")
 def world(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     speed: SpeedText = "1",
     recorder: Annotated[
-        bool, typer.Option(help="Wait for a recorder before the first measurement.")
+        bool,
+        typer.Option(
+            help="Wait for a recorder before the first measurement.", rich_help_panel=RARE
+        ),
     ] = True,
     cache: Annotated[
         int | None,
         typer.Option(
-            help="Measurements per robot that can be asked for again; default: all.", min=0
+            help="Measurements per robot that can be asked for again; default: all.",
+            min=0,
+            metavar="N",
+            rich_help_panel=RARE,
         ),
     ] = None,
     robots: Robots = None,
@@ -124,7 +133,7 @@ def world(
         run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam robot waypoints r1 --connect tcp/192.168.1.5:7447")
 def robot(
     scenario: ScenarioArgument,
     name: Annotated[str, typer.Argument(help="The robot's name in the scenario, as r1.")],
@@ -137,7 +146,8 @@ def robot(
     log: Annotated[
         Path | None,
         typer.Option(
-            help="Its own log: what it sends and receives; `teamslam log merge` joins such logs."
+            help="Its own log: what it sends and receives; `teamslam log merge` joins such logs.",
+            metavar="FILE",
         ),
     ] = None,
     peers: Peers = False,
@@ -147,6 +157,7 @@ def robot(
             "--set",
             help="With --peers: the file that stores the team's set, of one run only.",
             metavar="FILE",
+            rich_help_panel=RARE,
         ),
     ] = None,
     fold: Annotated[
@@ -155,6 +166,7 @@ def robot(
             help="With --peers: fold the set always, on request (`teamslam map`) and at the end, "
             "or at the end only.",
             metavar="always|request|end",
+            rich_help_panel=RARE,
         ),
     ] = "always",
 ) -> None:
@@ -230,7 +242,7 @@ def _peer_shell(
         fail(str(error), WRONG_USE)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam central waypoints")
 def central(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
@@ -241,6 +253,7 @@ def central(
             help="Give up a robot that has been lost for this many seconds; default: wait for "
             "it. A final map without it is provisional.",
             min=0.0,
+            metavar="S",
         ),
     ] = None,
     robots: Robots = None,
@@ -310,10 +323,12 @@ def _central_shell(
     return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam record waypoints -o team.mcap")
 def record(
     scenario: ScenarioArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The MCAP file to write.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The MCAP file to write.", metavar="FILE")
+    ],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     resume: Annotated[
@@ -325,7 +340,12 @@ def record(
         ),
     ] = False,
     join_parts: Annotated[
-        bool, typer.Option("--join/--no-join", help="Join the parts of the log at the end.")
+        bool,
+        typer.Option(
+            "--join/--no-join",
+            help="Join the parts of the log at the end.",
+            rich_help_panel=RARE,
+        ),
     ] = True,
 ) -> None:
     """Record every message of the team to one MCAP file, until the team has left.

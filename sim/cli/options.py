@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
+from sim.cli.help import NETWORK, RARE
 from sim.scenarios.checks import ScenarioError
 from sim.scenarios.scenario import Scenario, load, loads
 from sim.world.config import UnlabelledWorld
@@ -43,15 +44,26 @@ ScenarioArgument = Annotated[
 LogArgument = Annotated[
     Path, typer.Argument(help="An MCAP log of a team, or the folder of its run.")
 ]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json", help="Write the figures as JSON, too.", metavar="FILE", rich_help_panel=RARE
+    ),
+]
 Connect = Annotated[
-    str, typer.Option(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
+    str,
+    typer.Option(
+        help="The router's endpoint, as tcp/HOST:PORT.",
+        metavar="ENDPOINT",
+        rich_help_panel=NETWORK,
+    ),
 ]
 Keys = Annotated[
     Path | None,
     typer.Option(
         help="Folder with the certificate of this process, as `teamslam keys` makes them.",
         metavar="DIR",
+        rich_help_panel=NETWORK,
     ),
 ]
 ASSUMED_NAME = "recorded"
@@ -63,14 +75,19 @@ ASSUMED = (
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
 TeamOption = Annotated[
-    str, typer.Option(help="The team's name; a scenario's own if not set there.")
+    str, typer.Option(help="The team's name; a scenario's own if not set there.", metavar="NAME")
 ]
 Seed = Annotated[
     int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
 ]
 Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 1000.", metavar="N")]
 Peers = Annotated[
-    bool, typer.Option("--peers", help="Each robot keeps the team's set and folds it by itself.")
+    bool,
+    typer.Option(
+        "--peers",
+        help="Each robot keeps the team's set and folds it by itself.",
+        rich_help_panel=RARE,
+    ),
 ]
 Pieces = Annotated[
     int | None,
@@ -80,6 +97,7 @@ Pieces = Annotated[
         min=1,
         max=100,
         metavar="N",
+        rich_help_panel=RARE,
     ),
 ]
 IdentitiesOption = Annotated[
@@ -89,8 +107,14 @@ IdentitiesOption = Annotated[
         metavar="WHICH",
     ),
 ]
-EstimatorOption = Annotated[str | None, typer.Option(help=_either(Estimator), metavar="NAME")]
-FusionOption = Annotated[str | None, typer.Option(help=_either(FusionRule), metavar="RULE")]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(help=_either(Estimator), metavar="NAME", rich_help_panel=RARE),
+]
+FusionOption = Annotated[
+    str | None,
+    typer.Option(help=_either(FusionRule), metavar="RULE", rich_help_panel=RARE),
+]
 Dataset = Annotated[
     Path | None,
     typer.Option(

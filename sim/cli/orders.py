@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -23,7 +24,7 @@ Reason = Annotated[str, typer.Option(help="Why, for the log.")]
 app = typer.Typer()
 
 
-@app.command(name="map")
+@app.command(name="map", cls=Command, epilog="teamslam map r3 --team waypoints")
 def map_(
     robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
     team: TeamOption,
@@ -54,7 +55,7 @@ def map_(
         typer.echo(f"{landmark},{x:.4f},{y:.4f}")
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam withdraw r3 --team waypoints --reason 'wheel is loose'")
 def withdraw(
     robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
     team: TeamOption,
@@ -82,7 +83,7 @@ def withdraw(
     typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam verdict same r1/1/12/7 r2/1/4/3 --team waypoints")
 def verdict(
     word: Annotated[str, typer.Argument(help="same: they are one landmark; different: two.")],
     first: Annotated[str, typer.Argument(help="robot/incarnation/submap/landmark, as r1/1/12/7.")],
@@ -145,7 +146,10 @@ def verdict(
     typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog=("teamslam end --team waypoints\nteamslam end --team waypoints --without r3"),
+)
 def end(
     team: TeamOption,
     without: Annotated[

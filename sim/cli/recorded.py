@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
+from sim.cli.help import NETWORK, RARE, Command
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -30,26 +31,45 @@ from sim.cli.steps import Steps
 if TYPE_CHECKING:
     from team.recording.reader import Log
 
+PICTURES = "Pictures for a paper or a talk"
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam replay runs/first --speed 20")
 def replay(
     log: LogArgument,
     speed: SpeedText = "1",
     connect: Annotated[
         str | None,
-        typer.Option(help="The router to publish at; default: one of our own.", metavar="ENDPOINT"),
+        typer.Option(
+            help="The router to publish at; default: one of our own.",
+            metavar="ENDPOINT",
+            rich_help_panel=NETWORK,
+        ),
     ] = None,
     listen: Annotated[
-        str, typer.Option(help="Where our own router listens; port 0: any free one.")
+        str,
+        typer.Option(
+            help="Where our own router listens; port 0: any free one.",
+            metavar="ENDPOINT",
+            rich_help_panel=NETWORK,
+        ),
     ] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool, typer.Option(help="Without keys, admit every process that reaches our own router.")
+        bool,
+        typer.Option(
+            help="Without keys, admit every process that reaches our own router.",
+            rich_help_panel=NETWORK,
+        ),
     ] = False,
     wait: Annotated[
-        float, typer.Option(help="Seconds between the router's start and the first message.")
+        float,
+        typer.Option(
+            help="Seconds between the router's start and the first message.",
+            metavar="S",
+            rich_help_panel=RARE,
+        ),
     ] = 1.0,
 ) -> None:
     """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
@@ -81,31 +101,53 @@ def replay(
     _hint_if_cut(opened)
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog=(
+        "teamslam report runs/first\n"
+        "teamslam report runs/first --picture map --style paper --format pdf"
+    ),
+)
 def report(
     log: LogArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the report.")],
-    json_file: JsonFile = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for the report; default: the run's, or one named like the log beside it.",
+            metavar="DIR",
+        ),
+    ] = None,
     ledger: Annotated[
         bool,
         typer.Option(help="Prove the ledger: the robots consume the recorded measurements again."),
     ] = True,
+    picture: Annotated[
+        Picture | None,
+        typer.Option(help="This picture alone, and no page.", rich_help_panel=PICTURES),
+    ] = None,
     look: Annotated[
-        Look | None, typer.Option("--style", help="Pictures in this style, beside the page's.")
+        Look | None,
+        typer.Option(
+            "--style", help="Pictures in this style, beside the page's.", rich_help_panel=PICTURES
+        ),
     ] = None,
     form: Annotated[
-        Form | None, typer.Option("--format", help="Pictures in this format, beside the page's.")
-    ] = None,
-    picture: Annotated[
-        Picture | None, typer.Option(help="This picture alone, and no page.")
+        Form | None,
+        typer.Option(
+            "--format", help="Pictures in this format, beside the page's.", rich_help_panel=PICTURES
+        ),
     ] = None,
     width: Annotated[
         str | None,
         typer.Option(
             help="Width of pictures for a paper, as 89mm; default: 3.5in, of panels 7.16in.",
             metavar="WIDTH",
+            rich_help_panel=PICTURES,
         ),
     ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Write page, pictures, tables and figures of a run from its log."""
     from rich.console import Console
@@ -115,6 +157,7 @@ def report(
     from central.desk.report.run import run_figures
     from team.recording.reader import open_log
 
+    output = output or _folder_of(log)
     _check_folder(output)
     width_in = _width(width, look)
     steps = Steps()
@@ -150,6 +193,15 @@ def report(
     _hint_if_cut(opened)
 
 
+def _folder_of(log: Path) -> Path:
+    """Folder of a run's report: the run's own, or one beside a log of another name."""
+    from team.recording.reader import IN_FOLDER
+
+    if log.is_dir():
+        return log
+    return log.parent if log.name == IN_FOLDER else log.with_suffix("")
+
+
 def _width(text: str | None, look: Look | None) -> float | None:
     if text is None:
         return None
@@ -169,10 +221,12 @@ def _check_folder(path: Path) -> None:
         fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam repair team.mcap -o whole.mcap")
 def repair(
     log: LogArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The new, complete log.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The new, complete log.", metavar="FILE")
+    ],
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from sim.importing.source import is_own_log

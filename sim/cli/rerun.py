@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import RARE, Command
 from sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -30,50 +31,38 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
+NETWORK_CHANGES = "Another network"
 OFFENDERS = 20
 """Most printed violations; the JSON file has all."""
 
 
-@app.command()
+@app.command(
+    cls=Command,
+    epilog=("teamslam rerun runs/first --verify\nteamslam rerun runs/first --without r3"),
+)
 def rerun(
     log: Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")],
     verify: Annotated[
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
     without: Annotated[
-        list[str] | None, typer.Option(help="A robot to leave out; repeatable.")
-    ] = None,
-    fusion: FusionOption = None,
-    estimator: EstimatorOption = None,
-    particles: Annotated[int | None, typer.Option(help="Particles of each robot.", min=4)] = None,
-    window: Annotated[float | None, typer.Option(help="Seconds of a submap's window.")] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of the estimators and of the losses.", min=0)
-    ] = None,
-    loss: Annotated[
-        float,
-        typer.Option(help="Probability that a submap is lost on its way; it is sent again."),
-    ] = 0.0,
-    delay: Annotated[
-        float, typer.Option(help="Seconds that submaps need to the centre.", min=0.0)
-    ] = 0.0,
-    no_centre: Annotated[
-        str | None, typer.Option(help="Seconds without a centre, as 60-120.", metavar="SPAN")
-    ] = None,
-    partition: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Robots cut off from the centre, and when, as r1,r2:100-200.",
-            metavar="ROBOTS:SPAN",
-        ),
+        typer.Option(help="A robot to leave out; repeatable.", metavar="ROBOT"),
     ] = None,
-    unsafe_feedback: Annotated[
-        bool,
-        typer.Option(
-            "--unsafe-feedback",
-            help="Robots send the team's map back as their own: law 1 broken, for comparison.",
-        ),
-    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for a picture of both maps.", metavar="DIR"),
+    ] = None,
+    particles: Annotated[
+        int | None, typer.Option(help="Particles of each robot.", min=4, metavar="N")
+    ] = None,
+    window: Annotated[
+        float | None, typer.Option(help="Seconds of a submap's window.", metavar="S")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Seed of the estimators and of the losses.", min=0, metavar="N"),
+    ] = None,
     noise: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,10 +70,50 @@ def rerun(
             metavar="KIND=FACTOR",
         ),
     ] = None,
-    json_file: JsonFile = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for a picture of both maps.")
+    loss: Annotated[
+        float,
+        typer.Option(
+            help="Probability that a submap is lost on its way; it is sent again.",
+            metavar="P",
+            rich_help_panel=NETWORK_CHANGES,
+        ),
+    ] = 0.0,
+    delay: Annotated[
+        float,
+        typer.Option(
+            help="Seconds that submaps need to the centre.",
+            min=0.0,
+            metavar="S",
+            rich_help_panel=NETWORK_CHANGES,
+        ),
+    ] = 0.0,
+    no_centre: Annotated[
+        str | None,
+        typer.Option(
+            help="Seconds without a centre, as 60-120.",
+            metavar="SPAN",
+            rich_help_panel=NETWORK_CHANGES,
+        ),
     ] = None,
+    partition: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Robots cut off from the centre, and when, as r1,r2:100-200.",
+            metavar="ROBOTS:SPAN",
+            rich_help_panel=NETWORK_CHANGES,
+        ),
+    ] = None,
+    fusion: FusionOption = None,
+    estimator: EstimatorOption = None,
+    unsafe_feedback: Annotated[
+        bool,
+        typer.Option(
+            "--unsafe-feedback",
+            help="Robots send the team's map back as their own: law 1 broken, for comparison.",
+            rich_help_panel=RARE,
+        ),
+    ] = False,
+    json_file: JsonFile = None,
 ) -> None:
     """Recompute a log, to verify it or to compare it under other conditions.
 
@@ -301,7 +330,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     )
 
 
-@app.command(name="verify-ledger")
+@app.command(name="verify-ledger", cls=Command, epilog="teamslam verify-ledger runs/first")
 def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import (
     WRONG_USE,
     IdentitiesOption,
@@ -21,7 +22,7 @@ from sim.scenarios.scenario import builtin_names, load, with_options
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam scenarios --show waypoints > mine.toml")
 def scenarios(
     show: Annotated[
         str | None, typer.Option(help="Print this one as TOML, to read or to begin with.")
@@ -41,7 +42,7 @@ def scenarios(
         typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam simulate waypoints -o my_world")
 def simulate(
     scenario: ScenarioArgument,
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],

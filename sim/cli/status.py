@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from central.desk.names import in_order
+from sim.cli.help import Command
 from sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -21,7 +22,7 @@ from sim.cli.options import (
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam status --team waypoints")
 def status(
     team: TeamOption,
     connect: Connect = LOOPBACK,

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import RARE, Command
 from sim.cli.options import (
+    FAILED,
     LOOPBACK,
     WRONG_USE,
     Connect,
@@ -30,10 +32,22 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("teamslam")
 Port = Annotated[
-    int, typer.Option(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
+    int,
+    typer.Option(
+        help="Where the page is served; 0: any free port.",
+        min=0,
+        metavar="PORT",
+        rich_help_panel=RARE,
+    ),
 ]
 FoxglovePort = Annotated[
-    int, typer.Option(help="Where Foxglove can connect; 0: any free port.", min=0, metavar="PORT")
+    int,
+    typer.Option(
+        help="Where Foxglove can connect; 0: any free port.",
+        min=0,
+        metavar="PORT",
+        rich_help_panel=RARE,
+    ),
 ]
 Open = Annotated[
     bool | None,
@@ -42,7 +56,7 @@ Open = Annotated[
 app = typer.Typer()
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam viewer waypoints")
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
     """Publish views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
@@ -61,13 +75,18 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
         _LOG.info("published %d views", run_viewer(bus, stop, peers))
 
 
-@app.command()
+@app.command(cls=Command, epilog="teamslam view runs/first")
 def view(
     log: LogArgument,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
     host: Annotated[
-        str, typer.Option(help="The address to serve at; others than 127.0.0.1 show it to others.")
+        str,
+        typer.Option(
+            help="The address to serve at; others than 127.0.0.1 show it to others.",
+            metavar="ADDRESS",
+            rich_help_panel=RARE,
+        ),
     ] = "127.0.0.1",
     browser: Open = None,
     follow: Annotated[
@@ -75,10 +94,20 @@ def view(
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option(help="Write the log with what other tools draw to this new file, and end."),
+        typer.Option(
+            help="Write the log with what other tools draw to this new file, and end.",
+            metavar="FILE",
+        ),
+    ] = None,
+    export_video: Annotated[
+        Path | None,
+        typer.Option(
+            "--export-video", help="Write the run as an animated GIF, and end.", metavar="FILE"
+        ),
     ] = None,
     layout: Annotated[
-        Path | None, typer.Option(help="Write a Foxglove layout for this team's log, and end.")
+        Path | None,
+        typer.Option(help="Write a Foxglove layout for this team's log, and end.", metavar="FILE"),
     ] = None,
 ) -> None:
     """Show a log, or a running team by its log, on a page in a browser.
@@ -91,6 +120,9 @@ def view(
     from team.shell import process
 
     log = log_file(log)
+    if export_video is not None:
+        _write_video(log, export_video)
+        return
     if not follow or log.exists():
         opened = open_log(log)
         if not follow:
@@ -130,6 +162,24 @@ def _has_display() -> bool:
     """Whether a browser is visible; text browsers would occupy the terminal."""
     windows = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     return bool(windows) and sys.stdout.isatty()
+
+
+def _write_video(log: Path, path: Path) -> None:
+    from central.desk.evaluation.evaluation import evaluate
+    from central.desk.pictures.film import draw_film, maps_over_time
+    from team.recording.reader import open_log
+    from team.wire.channels import FINAL_MAP, FUSED_MAP
+    from team.wire.codec import decoded
+    from team.wire.messages import FusedMap
+
+    if path.suffix != ".gif" or not path.parent.is_dir():
+        fail(f"--export-video {path}: give a .gif in an existing folder", WRONG_USE)
+    opened = open_log(log)
+    warn_of_holes(opened)
+    maps = (decoded(s.payload, FusedMap) for s in opened.samples((FUSED_MAP, FINAL_MAP)))
+    if not draw_film(evaluate(opened.samples()), maps_over_time(maps), path):
+        fail(f"{log} has no final map or no poses to draw", FAILED)
+    typer.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def _write(log: "Log", export: Path | None, layout: Path | None) -> None:

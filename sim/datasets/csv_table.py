@@ -257,7 +257,16 @@ def _unit_of(seconds: Decimal) -> str:
     for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
             unit, scale = each, by
-    return f"; to convert from {unit}, add a column map (scale = {scale})"
+    return f"; {conversion(unit, scale)}"
+
+
+def conversion(unit: str, scale: str) -> str:
+    """Remedy for a column in another unit."""
+    return (
+        f"to convert from {unit}, add a column map (scale = {scale}), columns.toml, and import: "
+        "`teamslam import SET -o NEW --columns columns.toml` converts every robot's folder, "
+        "`teamslam import SET/r1 -o NEW --robot r1 --columns columns.toml` one (docs/your_data.md)"
+    )
 
 
 def _landmark(text: str) -> int:

@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from sim.datasets.csv_table import CsvTable
+from sim.datasets.csv_table import CsvTable, conversion
 from sim.datasets.folder_tables import (
+    DEGREE,
     INCREMENTS,
     NOT_A_COVARIANCE,
     POSES,
@@ -101,8 +102,8 @@ def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
         return []
     usual = f"{usual_s:,.0f}" if usual_s > 1.0 else f"{usual_s:.3g}"
     return [
-        f"{PACE} {usual} s apart: times are taken for seconds; to convert from other units, add a "
-        "column map (scale = 1e-3 for milliseconds)"
+        f"{PACE} {usual} s apart: times are taken for seconds; "
+        f"{conversion('other units, as milliseconds', '1e-3')}"
     ]
 
 
@@ -217,8 +218,8 @@ def _judge_speeds(
     turning = rate[rate > 0.0]
     if len(turning) > 1 and np.median(turning) > WHIRLING_RAD_S:
         raise rows.table.fault(
-            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: to "
-            "convert from degrees, add a column map (scale = 0.017453292519943295)"
+            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: "
+            f"{conversion('degrees', DEGREE)}"
         )
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.datasets.csv_table import CsvTable
+from sim.datasets.csv_table import CsvTable, conversion
 from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from sim.datasets.some_rows import (
     POSE_COVARIANCE,
@@ -20,6 +20,7 @@ from sim.world.streams import StartPose
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")
+DEGREE = "0.017453292519943295"
 INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
 STEERED = ("wheel_speed_m_s", "steering_rad")
 POLAR = ("range_m", "bearing_rad")
@@ -130,8 +131,8 @@ def measurements_of(
     if len(found.ranges) and np.median(found.ranges) > FAR_M:
         rows.notes.append(
             f"the median range is {np.median(found.ranges):,.0f} m "
-            f"({rows.table.name}): ranges must be in metres; to convert from millimetres, add a "
-            "column map (scale = 0.001)"
+            f"({rows.table.name}): ranges must be in metres; "
+            f"{conversion('millimetres', '0.001')}"
         )
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
@@ -181,8 +182,8 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
         raise table.error(
             row,
             "bearing_rad",
-            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: to "
-            "convert from degrees, add a column map (scale = 0.017453292519943295)",
+            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: "
+            f"{conversion('degrees', DEGREE)}",
         )
     bearings, as_points = on_circle(bearings), ~np.isnan(points[:, 0])
     x, y = points[as_points].T
@@ -237,7 +238,10 @@ def start_of(table: CsvTable) -> StartPose | None:
     pose = table.numbers(*POSES)[0]
     if abs(pose[2]) > MOST_RAD:
         raise table.error(
-            0, "theta_rad", f"{pose[2]:g} is more than a whole turn; it is in radians"
+            0,
+            "theta_rad",
+            f"{pose[2]:g} is more than a whole turn; it must be in radians: "
+            f"{conversion('degrees', DEGREE)}",
         )
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return StartPose(pose, None)

@@ -60,8 +60,8 @@ def own_document(name: str) -> Fields:
         raise ScenarioError(f"no such file; built in are {', '.join(builtin_names())}")
     if not path.is_file():
         raise ScenarioError(
-            f"no such scenario; built in: {', '.join(builtin_names())}; "
-            "or give a path to a .toml file"
+            f"no such scenario{close(name, builtin_names())}; built in: "
+            f"{', '.join(builtin_names())}; or give a path to a .toml file"
         )
     try:
         text = path.read_text("utf-8")

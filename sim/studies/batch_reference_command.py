@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from sim.cli.help import Command
 from sim.cli.options import FAILED, fail, warn_of_holes
 
 Noise = Annotated[
@@ -20,7 +21,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures
 app = typer.Typer()
 
 
-@app.command(name="batch-reference")
+@app.command(name="batch-reference", cls=Command, epilog="teamslam batch-reference runs/first")
 def batch_reference(
     log: Source,
     noise: Noise = "white",

@@ -1,18 +1,24 @@
-"""The commands `teamslam experiment NAME`: one per entry of the catalogue, and `all`."""
+"""The commands `teamslam experiment NAME`: one per entry of the catalogue, `all`, and `merge`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sim.cli.help import Command, Group
 from sim.cli.options import FAILED, WRONG_USE, fail
 from sim.studies.experiments.catalogue import ENTRIES, Entry
 from team.extras import install_command
 
+if TYPE_CHECKING:
+    from sim.studies.experiments.runner import Plan
+
 app = typer.Typer(
     name="experiment",
+    cls=Group,
+    epilog="teamslam experiment accuracy --quick",
     help="Reproduce the sources' tables and figures, and measure the team's accuracy.",
     no_args_is_help=True,
 )
@@ -42,80 +48,208 @@ Datasets = Annotated[
     list[Path] | None,
     typer.Option("--dataset", help="A UTIAS data set, folder or zip; repeatable."),
 ]
+ShardText = Annotated[
+    str | None,
+    typer.Option(
+        help="Compute the I-th of N parts of the runs only; `experiment merge` joins them.",
+        metavar="I/N",
+    ),
+]
 Quick = Annotated[bool, typer.Option("--quick", help="Few seeds, and no run beyond a minute.")]
 Check = Annotated[bool, typer.Option("--check", help="Exit status 1 if a goal is missed.")]
 
 
-def _command(name: str, summary: str, entries: Sequence[Entry]) -> None:
+def _command(name: str, summary: str) -> None:
     def run(
         seeds: Seeds = None,
         first: First = 1,
-        json_file: JsonFile = None,
+        quick: Quick = False,
+        dataset: Datasets = None,
         output: Output = FOLDER,
         jobs: Jobs = None,
+        shard: ShardText = None,
         scheduler: Scheduler = None,
-        dataset: Datasets = None,
-        quick: Quick = False,
         check: Check = False,
+        json_file: JsonFile = None,
     ) -> None:
-        def chosen(entry: Entry) -> tuple[int, ...]:
-            own = min(entry.seeds, entry.seeds_in_all) if name == ALL else entry.seeds
-            count = seeds or (entry.quick_seeds if quick else own)
-            return tuple(range(first, first + count))
-
         asked = Asked(
-            json_file=json_file,
+            name=name,
+            seeds=seeds,
+            first=first,
+            quick=quick,
+            paths=dataset or [],
             output=output,
             jobs=jobs,
             scheduler=scheduler,
-            paths=dataset or [],
-            quick=quick,
             check=check,
+            json_file=json_file,
         )
-        _run(name, entries, chosen, asked)
+        if shard is None:
+            _run(asked)
+        else:
+            _run_shard(asked, shard)
 
-    app.command(name, help=summary)(run)
+    app.command(name, cls=Command, help=summary, epilog=f"teamslam experiment {name} --quick")(run)
+
+
+@app.command(
+    "merge",
+    cls=Command,
+    epilog="teamslam experiment merge shard-1 shard-2 shard-3 -o runs/accuracy",
+)
+def merge(
+    shards: Annotated[list[Path], typer.Argument(help="Folders of all shards of one experiment.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of results and pictures.", metavar="DIR")
+    ],
+    dataset: Datasets = None,
+    jobs: Jobs = None,
+    check: Check = False,
+    json_file: JsonFile = None,
+) -> None:
+    """Merge the shards of an experiment: its page and figures, as if one computer had made them.
+
+    Runs that failed in a shard are computed again.
+    """
+    _require_joblib()
+    from sim.studies.experiments.runner import tasks_by_name
+    from sim.studies.experiments.shards import (
+        ShardError,
+        collect_results,
+        described_study,
+        programs_of,
+    )
+
+    try:
+        study, program = described_study(shards)
+    except ShardError as error:
+        fail(str(error), WRONG_USE)
+    asked = Asked(
+        name=study.name,
+        seeds=study.seeds,
+        first=study.first,
+        quick=study.quick,
+        paths=dataset or [Path(path) for path in study.datasets],
+        output=output,
+        jobs=jobs,
+        check=check,
+        json_file=json_file,
+    )
+    tasks = tasks_by_name(asked.plans())
+    if programs_of(list(tasks.values())) != program:
+        fail("the shards were computed by another version of the program or libraries", WRONG_USE)
+    collect_results(shards, output)
+    _run(asked)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """Options of a command, except its seeds."""
+    """An experiment's name and the options of its command."""
 
-    json_file: Path | None
+    name: str
+    seeds: int | None
+    first: int
+    quick: bool
+    paths: Sequence[Path]
     output: Path
     jobs: int | None
-    scheduler: str | None
-    paths: Sequence[Path]
-    quick: bool
+    scheduler: str | None = None
     check: bool
+    json_file: Path | None
+
+    def plans(self) -> "list[Plan]":
+        """Plans of the experiment, or of all."""
+        from sim.studies.experiments.experiment import Options
+        from sim.studies.experiments.runner import dataset, planned
+
+        datasets = tuple(dataset(path) for path in self.paths)
+        entries = [entry for entry in ENTRIES if self.name in (entry.name, ALL)]
+        return [
+            planned(entry, Options(self._seeds_of(entry), self.quick, datasets))
+            for entry in entries
+        ]
+
+    def _seeds_of(self, entry: Entry) -> tuple[int, ...]:
+        own = min(entry.seeds, entry.seeds_in_all) if self.name == ALL else entry.seeds
+        count = self.seeds or (entry.quick_seeds if self.quick else own)
+        return tuple(range(self.first, self.first + count))
 
 
-def _run(
-    name: str,
-    entries: Sequence[Entry],
-    seeds: Callable[[Entry], tuple[int, ...]],
-    asked: Asked,
-) -> None:
-    import json
-
-    from rich.console import Console
-
+def _require_joblib() -> None:
+    """Exit before the work if the studies' libraries are missing."""
     try:
         import joblib  # noqa: F401 - reported before the work, not after it
     except ModuleNotFoundError:
         fail(f"experiments need joblib: {install_command('studies')}", WRONG_USE)
 
+
+def _run_shard(asked: Asked, text: str) -> None:
+    _require_joblib()
+
     from sim.studies.experiments.cases import SchedulerError
-    from sim.studies.experiments.experiment import Options, without_datasets
+    from sim.studies.experiments.experiment import without_datasets
+    from sim.studies.experiments.progress import shown
+    from sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
+    from sim.studies.experiments.shards import (
+        ShardError,
+        Study,
+        parsed_shard,
+        programs_of,
+        tasks_of,
+        write_shard,
+    )
+
+    try:
+        shard = parsed_shard(text)
+    except ShardError as error:
+        fail(str(error), WRONG_USE)
+    tasks = tasks_by_name(asked.plans())
+    if not tasks:
+        fail(without_datasets(asked.name), WRONG_USE)
+    part = tasks_of(tasks, shard)
+    try:
+        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), shown, asked.scheduler)
+    except SchedulerError as error:
+        fail(str(error), WRONG_USE)
+    except KeyboardInterrupt:
+        fail(
+            f"interrupted; results so far are in {asked.output}: repeat the command to continue",
+            FAILED,
+        )
+    study = Study(
+        name=asked.name,
+        seeds=asked.seeds,
+        first=asked.first,
+        quick=asked.quick,
+        datasets=[str(path.resolve()) for path in asked.paths],
+    )
+    write_shard(asked.output, shard, study, programs_of(list(tasks.values())))
+    typer.echo(
+        f"{asked.output}: {len(part) - len(failed)} of {len(tasks)} runs; with the other shards: "
+        "teamslam experiment merge FOLDER… -o DIR"
+    )
+    if failed:
+        fail(f"{len(failed)} runs failed; {asked.output / FAILURES} has their tracebacks", FAILED)
+
+
+def _run(asked: Asked) -> None:
+    import json
+
+    from rich.console import Console
+
+    _require_joblib()
+
+    from sim.studies.experiments.cases import SchedulerError
+    from sim.studies.experiments.experiment import without_datasets
     from sim.studies.experiments.output import printed, to_json, write
     from sim.studies.experiments.progress import shown
-    from sim.studies.experiments.runner import FAILURES, computed, cores, dataset, planned
+    from sim.studies.experiments.runner import FAILURES, computed, cores
     from team.recording.provenance import provenance
 
+    name = asked.name
     if asked.json_file is not None and not asked.json_file.absolute().parent.is_dir():
         fail(f"--json {asked.json_file}: no such folder; make it first", WRONG_USE)
-    datasets = tuple(dataset(path) for path in asked.paths)
-    plans = [planned(entry, Options(seeds(entry), asked.quick, datasets)) for entry in entries]
+    plans = asked.plans()
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
     try:
@@ -148,5 +282,5 @@ def _run(
 
 
 for _entry in ENTRIES:
-    _command(_entry.name, _entry.summary, [_entry])
-_command(ALL, "All experiments, on one page.", ENTRIES)
+    _command(_entry.name, _entry.summary)
+_command(ALL, "All experiments, on one page.")

@@ -20,9 +20,9 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; unknown ones are left out.
 
-    Errors are those of the map without alignment to the truth; landmark_nees_per_dof is of each
-    landmark by itself (2 degrees of freedom; its expectation is 1). status: the centre's figures,
-    those of the consistency monitor included.
+    Errors are those of the map without alignment to the truth; landmark_nees_per_dof is the map's
+    NEES per degree of freedom (1 is consistent), joint if the map has a joint covariance, else of
+    each landmark by itself. status: the centre's figures, with those of the consistency monitor.
     """
 
     team_time_s: float

@@ -1,5 +1,6 @@
 """The consistency monitor: quiet where covariances are true, and it names who claims too much."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -96,7 +97,10 @@ def test_no_loss_bounds_the_covariance_scale(factor):
     found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
     assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
     (said,) = (w for w in found.warnings if "covariances are too" in w)
-    assert "learn the sensors' and odometry's noise by `teamslam calibrate`" in said
+    assert "with ground truth learn them by `teamslam calibrate`" in said
+    by = re.search(r"multiply the sigmas of sensor and odometry by ([\d.]+)", said)
+    assert by is not None
+    assert float(by[1]) ** 2 == pytest.approx(1.0 / factor, rel=0.4)
 
 
 def test_outliers_of_a_minority_do_not_move_the_covariance_scale():

@@ -7,7 +7,8 @@ Door: mutated payloads of every message are opened as a receiver opens them; wha
 but `WireError` has escaped. Nodes: a team is launched as real processes, and a stranger publishes
 valid messages that no honest node would send, and mutated ones, on everybody's keys while it runs.
 Without keys no process may die and nothing may be set aside as a fault; what a stranger can do to
-the map then stands in docs/security.md, and orders and ends of the run are not among what is sent.
+the map then is in docs/decisions/09-keys-and-access-control.md, and orders and ends of the run are
+not among the messages.
 With --keys the stranger has a certificate of the team in the name of a robot that is not in the
 scenario, says everything, and the final map must be that of the same team in memory. Ends with 1
 if anything of this does not hold.

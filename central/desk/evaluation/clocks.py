@@ -123,7 +123,7 @@ def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
         f"{robot}: its detections are stamped {abs(found.offset_s):.2f} ± {found.sigma_s:.2f} s "
         f"{late} its odometry: correct the detections' stamps, or set clock_offset_s = "
         f"{config.clock_offset_s + found.offset_s:.2f}, which moves odometry and path to "
-        "their clock (`teamslam calibrate` learns it where there is a ground truth)"
+        "their clock"
     )
 
 

@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import PurePath
 from typing import Any
 
 import msgspec
@@ -41,7 +40,7 @@ from central.desk.evaluation.robot import Consumption, RobotLog, consumption, ro
 from central.desk.evaluation.running import TruthFrames
 from central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
 from central.desk.evaluation.verdicts import verdicts_given
-from central.desk.names import in_order, not_joined, short
+from central.desk.names import data_set_name, in_order, not_joined, short
 from central.monitor import TOO_LARGE
 from central.team_config import TeamConfig, team_config
 from team import translate
@@ -95,7 +94,6 @@ class MapResult:
     matching: Matching | None = None
 
 
-PACKED = (".zip", ".mcap", ".db3")
 USUAL = ("hybrid", "join")
 """Default estimator and rule."""
 TeamMotion = tuple[Float[np.ndarray, "3"], str]
@@ -480,10 +478,9 @@ def _data_set(log: Collected) -> str:
     if not isinstance(message, m.Configuration):
         return ""
     try:
-        place = PurePath(msgspec.json.decode(message.configuration, type=_World).world.path)
+        return data_set_name(msgspec.json.decode(message.configuration, type=_World).world.path)
     except (msgspec.MsgspecError, UnicodeEncodeError):
         return ""
-    return place.stem if place.suffix in PACKED else place.name
 
 
 def _uplink(team: TeamConfig) -> tuple[ch.Channel, ...] | None:

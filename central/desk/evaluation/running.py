@@ -17,7 +17,7 @@ from central.desk.evaluation.errors import (
 )
 from central.fused import START_POSES
 from team import translate
-from team.estimation.consistency import chi2_quantile
+from team.estimation.consistency import chi2_quantile, nees
 from team.wire import messages as m
 from team.wire.arrays import floats, stamps
 
@@ -56,21 +56,19 @@ class TruthFrames:
 class MapFit(NamedTuple):
     """Unaligned map errors of the landmarks that have truth.
 
-    rmse_m: of positions. nees: eᵀ P⁻¹ e in each landmark's own covariance, 2 degrees of freedom.
+    rmse_m: of positions. nees_per_dof: eᵀ P⁻¹ e / 2K with the covariance P that the map carries,
+    as in the report: joint, or of each landmark by itself; 1 if it is right. nees: of each landmark
+    in its own covariance, 2 degrees of freedom, for the coverage.
     """
 
     rmse_m: float
+    nees_per_dof: float
     nees: Float[np.ndarray, " K"]
 
     @property
     def landmarks(self) -> int:
         """Number of landmarks with truth."""
         return len(self.nees)
-
-    @property
-    def nees_per_dof(self) -> float:
-        """Mean NEES/2; 1 if the covariances are right."""
-        return float(self.nees.mean()) / 2.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,13 @@ class TrueLandmarks:
         errors = means[known] - true
         blocks = translate.landmark_blocks_of(fused)[known]
         solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
-        return MapFit(distance_rmse(means[known], true), np.einsum("ki,ki->k", errors, solved))
+        each = np.einsum("ki,ki->k", errors, solved)
+        squared = float(each.sum())
+        if fused.joint:
+            of_known = np.flatnonzero(np.repeat(known, 2))
+            P = translate.landmark_covariance_of(fused)[np.ix_(of_known, of_known)]
+            squared = nees(errors.ravel(), P)
+        return MapFit(distance_rmse(means[known], true), squared / (2.0 * len(each)), each)
 
 
 @dataclass

@@ -15,12 +15,13 @@ from central.desk.drawing import (
     TRUTH_COLOUR,
     curve_through,
     draw_ellipses,
+    ellipses,
     landmark_blocks,
     robot_colours,
     robot_labels,
 )
 from central.desk.evaluation.errors import Path, transform_points
-from central.desk.evaluation.evaluation import Evaluation, RobotResult
+from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
 from central.desk.paths import SmoothedPath
 from central.desk.pictures.style import save
 from team.config import UNNAMED
@@ -38,6 +39,13 @@ DRAWN_POINTS = 4000
 DRAWN_BARS = 60
 """Most error bars, evenly spaced; more would hide the online poses."""
 LABELLED_LANDMARKS = 60
+MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+SAME_M = 1e-9
+"""Distance of equal points [m]."""
+LEAST_SHARE = 0.01
+"""Least share of the map's extent of a drawn ellipse's median semi-axis; smaller ones are
+magnified.
+"""
 
 
 def map_picture(
@@ -49,7 +57,7 @@ def map_picture(
     """
     if evaluation.map is None and not evaluation.robots:
         return False
-    evaluation = _in_the_maps_frame(evaluation)
+    evaluation = in_the_maps_frame(evaluation)
     figure, axes = new_figure(9.0, 9.0, 1, 1)
     axis = axes[0][0]
     colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
@@ -72,9 +80,9 @@ def map_picture(
         axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
     axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
     handles, _ = axis.get_legend_handles_labels()
-    axis.legend(
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.07),
+    figure.legend(
+        *axis.get_legend_handles_labels(),
+        loc="outside lower center",
         ncols=min(4, -(-len(handles) // 2)),
         frameon=False,
         fontsize=10,
@@ -83,11 +91,13 @@ def map_picture(
     return True
 
 
-def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
+def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
     """Move the truth into an arbitrary map frame by the map's alignment."""
     fused = evaluation.map
-    motion = None if fused is None or fused.errors is None else fused.errors.truth_from_map
-    if not evaluation.arbitrary_frame or motion is None:
+    if not evaluation.arbitrary_frame or fused is None or fused.errors is None:
+        return evaluation
+    motion = fused.errors.truth_from_map
+    if motion is None:
         return evaluation
     back = inverse(motion)
 
@@ -95,8 +105,10 @@ def _in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
         turned = path.poses[:, 2:] + back[2]
         return Path(path.stamps_ns, np.hstack((transform_points(back, path.poses[:, :2]), turned)))
 
+    truth = transform_points(back, fused.truth)
     return replace(
         evaluation,
+        map=replace(fused, truth=truth),
         true_landmarks=transform_points(back, evaluation.true_landmarks),
         robots={n: replace(r, truth=moved_path(r.truth)) for n, r in evaluation.robots.items()},
     )
@@ -192,20 +204,28 @@ def _draw_paths(
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
+    """Draw ellipses, and true landmarks; both magnified about the estimates if they are small.
+
+    An ellipse contains its landmark's truth as drawn if and only if it does so in scale.
+    """
     truth, fused = evaluation.true_landmarks, evaluation.map
+    has_map = fused is not None and len(fused.ids) > 0
+    blocks = landmark_blocks(fused.covariance) if fused is not None and has_map else None
+    times = 1 if fused is None or blocks is None else magnification(evaluation, blocks)
     if len(truth):
+        drawn = truth if fused is None or times == 1 else _magnified_truth(truth, fused, times)
         axis.plot(
-            *truth.T, linestyle="", marker="x", markersize=6, markeredgewidth=0.9,
-            color=TRUE_LANDMARK_COLOUR, label="true landmarks", zorder=6,
+            *drawn.T, linestyle="", marker="x", markersize=6, markeredgewidth=0.9,
+            color=TRUE_LANDMARK_COLOUR, zorder=6,
+            label="true landmarks" if times == 1 else f"true landmarks, errors × {times}",
         )  # fmt: skip
-    if fused is None or not len(fused.ids):
+    if fused is None or blocks is None:
         return
     axis.plot(
-        *fused.means.T, linestyle="", marker=".", markersize=2, color=MAP_COLOUR,
-        label="landmarks of the map, 95 % ellipses", zorder=7,
+        *fused.means.T, linestyle="", marker=".", markersize=2, color=MAP_COLOUR, zorder=7,
+        label="landmarks, 95 % ellipses" + (f" × {times}" if times > 1 else ""),
     )  # fmt: skip
-    blocks = landmark_blocks(fused.covariance)
-    draw_ellipses(axis, fused.means, blocks, MAP_COLOUR, width=1.1, zorder=7)
+    draw_ellipses(axis, fused.means, times**2 * blocks, MAP_COLOUR, width=1.1, zorder=7)
     named = fused.ids < UNNAMED  # numbers of unnamed landmarks have no meaning
     if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
         means = fused.means[named]
@@ -223,6 +243,26 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
                 color=MAP_COLOUR,
                 zorder=8,
             )
+
+
+def magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) -> int:
+    """Factor at which the median ellipse is visible on a map of this extent."""
+    assert evaluation.map is not None
+    paths = [each.smoothed_path.poses[:, :2] for each in evaluation.robots.values()]
+    extent = float(np.ptp(np.vstack([evaluation.map.means, *paths]), axis=0).max())
+    major, _, _ = ellipses(blocks[:, (0, 0, 1), (0, 1, 1)])
+    least = LEAST_SHARE * extent / max(float(np.median(major)), 1e-12)
+    return next((each for each in MAGNIFICATIONS if each >= least), MAGNIFICATIONS[-1])
+
+
+def _magnified_truth(
+    truth: Float[np.ndarray, "T 2"], fused: MapResult, times: int
+) -> Float[np.ndarray, "T 2"]:
+    """True landmarks at `times` their distance from the estimates; others in place."""
+    means, matched = fused.means[fused.known], fused.truth[fused.known]
+    kept = [p for p in truth if np.hypot(*(matched - p).T).min(initial=np.inf) > SAME_M]
+    moved = means + times * (matched - means)
+    return np.vstack([moved, *kept]) if kept else moved
 
 
 def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
@@ -322,5 +362,5 @@ def _title(evaluation: Evaluation) -> list[str]:
             text += f" ({errors.aligned_rmse_m:.3g} m aligned)"
         if fused.matching is not None:
             text += f", {fused.matching.by}"
-        second += [text, f"NEES/dof {errors.nees_per_dof:.3g}"]
+        second += [text, f"map NEES per dof {errors.nees_per_dof:.3g}"]
     return [_heading(evaluation), " · ".join(second)]

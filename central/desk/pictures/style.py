@@ -47,9 +47,6 @@ class Picture(StrEnum):
     MAP = "map"
     ERRORS = "errors"
     CONSISTENCY = "consistency"
-    TRAFFIC = "traffic"
-    LATENCY = "latency"
-    TIMELINE = "timeline"
 
 
 class Look(StrEnum):
@@ -139,13 +136,15 @@ def _resize(figure: "Figure", width_in: float | None) -> None:
         line.set_linewidth(line.get_linewidth() * scale)
     for axis in figure.axes:
         axis.tick_params(labelsize=PAPER_PT)
+        for patch in axis.patches:
+            patch.set_linewidth(patch.get_linewidth() * scale)
         for label in axis.texts:
             label.set_fontsize(POINT_PT)
             if isinstance(label, Annotation):
                 label.xyann = tuple(scale * each for each in label.xyann)
         if is_column and panels and axis.get_title():
             axis.set_title("")
-        legend = axis.get_legend()
+        legend = axis.get_legend() if panels else next(iter(figure.legends), None)
         if legend is None or not (is_column or not panels):
             continue
         handles, labels = axis.get_legend_handles_labels()

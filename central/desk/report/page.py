@@ -16,12 +16,7 @@ from central.desk.export.tum import write_trajectories
 from central.desk.names import OUTSIDE, in_order
 from central.desk.pictures.run import error_picture, map_picture
 from central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
-from central.desk.pictures.time import (
-    consistency_picture,
-    latency_picture,
-    timeline_picture,
-    traffic_picture,
-)
+from central.desk.pictures.time import consistency_picture
 from central.desk.report.identities import decision_sheet, score_sheet
 from central.desk.report.run import Run
 from central.desk.report.tables import (
@@ -84,9 +79,6 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
         Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
         Picture.ERRORS: lambda path: error_picture(evaluation, path),
         Picture.CONSISTENCY: lambda path: consistency_picture(evaluation, history, path),
-        Picture.TRAFFIC: lambda path: traffic_picture(history, path),
-        Picture.LATENCY: lambda path: latency_picture(history, path),
-        Picture.TIMELINE: lambda path: timeline_picture(history, path),
     }
     directory.mkdir(parents=True, exist_ok=True)
     with drawn_in(style):
@@ -141,9 +133,9 @@ def _page(
         ("Consistency", _consistency(run, pictures)),
         ("Paths", _paths(run)),
         ("Measurements", _measurements(run)),
-        ("Events", _events(run, pictures)),
-        ("Latency", _latency(run, pictures)),
-        ("Traffic", _traffic(run, pictures)),
+        ("Events", _events(run)),
+        ("Latency", _latency(run)),
+        ("Traffic", _traffic(run)),
         ("Processes", _processes(processes)),
         ("Origin", _origin(run)),
     ]
@@ -283,7 +275,7 @@ def _measurements(run: Run) -> list[str]:
     ]
 
 
-def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+def _events(run: Run) -> list[str]:
     events = run.history.events
     if not events:
         return []
@@ -294,10 +286,10 @@ def _events(run: Run, pictures: Mapping[str, Path]) -> list[str]:
     ]
     more = len(events) - len(rows)
     left = _note(f"{more} more in report.json") if more else ""
-    return [_image(pictures, "timeline"), _table(("", "node", "event"), rows, words=True), left]
+    return [_table(("", "node", "event"), rows, words=True), left]
 
 
-def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+def _latency(run: Run) -> list[str]:
     latency = run.history.latencies
     if not latency:
         return []
@@ -315,10 +307,10 @@ def _latency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         "Wall time [s] from the publication of a submap's last and first measurement to that of "
         "the first map that used it, by the publishers' clocks."
     )
-    return [*_sheet(Sheet(headings, rows, note)), _image(pictures, "latency")]
+    return _sheet(Sheet(headings, rows, note))
 
 
-def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
+def _traffic(run: Run) -> list[str]:
     span_s = (run.history.end_ns - run.history.start_ns) * 1e-9
     rows = [
         (key, f"{t.messages:,}", f"{t.bytes:,}", f"{t.bytes / span_s:,.1f}" if span_s > 0 else "–")
@@ -328,7 +320,7 @@ def _traffic(run: Run, pictures: Mapping[str, Path]) -> list[str]:
         return []
     table = _table(("key", "messages", "bytes", "B/s"), rows)
     summary = f"<summary>Every key ({len(rows)})</summary>"
-    return [_image(pictures, "traffic"), f"<details>{summary}{table}</details>"]
+    return [f"<details>{summary}{table}</details>"]
 
 
 def _origin(run: Run) -> list[str]:

@@ -122,8 +122,8 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("map NEES per dof", nees))
         shape = errors.shape
         if shape is not None:
-            nees = f"{shape.nees_per_landmark:.2f}, 2 is right; {shape.coverage:.0%} within 95 %"
-            rows.append(("shape NEES/landmark", nees))
+            nees = f"{shape.nees_per_landmark / 2.0:.2f}; {shape.coverage:.0%} within 95 %"
+            rows.append(("shape NEES per dof", nees))
         if not arbitrary:
             rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
     rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f", "")))
@@ -229,7 +229,10 @@ def _robot_note(evaluation: Evaluation) -> str:
     online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
     star = ", * of online ones" if online else ""
     frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
-    words = f"a step is one odometry interval; errors of smoothed poses{star}{frame}"
+    words = (
+        "a step is one odometry interval; measurements are odometry intervals, scans and "
+        f"inter-robot measurements; errors of smoothed poses{star}{frame}"
+    )
     left_out = [
         f"{name}: {robot.consumption.not_used}"
         for name, robot in evaluation.robots.items()

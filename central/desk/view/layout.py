@@ -26,7 +26,9 @@ def layout(team: str, robots: Sequence[str]) -> str:
                 _line(
                     f"{prefix}/{views.TEAM.key()}.status.covariance_scale", "covariance scale", None
                 ),
-                _line(f"{prefix}/{views.TEAM.key()}.landmark_nees_per_dof", "landmark NEES", None),
+                _line(
+                    f"{prefix}/{views.TEAM.key()}.landmark_nees_per_dof", "map NEES per dof", None
+                ),
             ],
         ),
     }

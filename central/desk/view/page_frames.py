@@ -22,6 +22,7 @@ import numpy as np
 from central.desk.drawing import ROBOT_COLOURS
 from central.desk.evaluation.events import EventDetector
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
+from central.desk.names import data_set_name
 from central.desk.view.drawn import centre_particles, landmarks_of
 from central.desk.view.landmark_sets import sets_of
 from central.desk.view.node import FORGET_NS
@@ -39,10 +40,13 @@ _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
 
 def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
-    """Page title: scenario, seed, file."""
+    """Page title: data set, or scenario and seed; file."""
     try:
-        scenario = str(json.loads(metadata.get("scenario", "{}"))["name"])
-    except (ValueError, KeyError, TypeError):
+        of = json.loads(metadata.get("scenario", "{}"))
+        if data_set := data_set_name(str(of.get("world", {}).get("path", ""))):
+            return f"{data_set} · {name}"
+        scenario = str(of["name"])
+    except (ValueError, KeyError, TypeError, AttributeError):
         scenario = team
     seed = f", seed {metadata['seed']}" if "seed" in metadata else ""
     return f"{scenario}{seed} · {name}"
@@ -234,6 +238,7 @@ class PageFrames:
             xy=_base64(landmarks.means.astype("<f4")),
             c=_base64(landmarks.blocks.astype("<f4")),
             final=message.final,
+            joint=message.joint,
             rmse=None if fit is None else _short(fit.rmse_m),
             nees=None if fit is None else _short(fit.nees_per_dof),
             **unnamed,

@@ -68,8 +68,24 @@ def computed(
     scheduler: str | None = None,
 ) -> list[Concluded]:
     """Outcomes of all plans; common tasks run once."""
+    results, failures = compute_runs(tasks_by_name(plans), folder, jobs, progress, scheduler)
+    return [_concluded(plan, results, failures) for plan in plans]
+
+
+def tasks_by_name(plans: Sequence[Plan]) -> dict[str, Task]:
+    """Tasks of all plans, common ones once."""
+    return {task.name: task for plan in plans for task in plan.tasks}
+
+
+def compute_runs(
+    tasks: Mapping[str, Task],
+    folder: Path,
+    jobs: int,
+    progress: Progress,
+    scheduler: str | None = None,
+) -> tuple[Results, Mapping[str, Done]]:
+    """Results of these tasks, stored or computed now, and the failed ones."""
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = {task.name: task for plan in plans for task in plan.tasks}
     cases = Cases(folder)
     cached = {name: cases.found(task) for name, task in tasks.items()}
     results = {name: result for name, result in cached.items() if result is not None}
@@ -83,7 +99,7 @@ def computed(
                 results[done.task.name] = done.result
             tell(done)
     _write_failures(folder / FAILURES, list(failures.values()))
-    return [_concluded(plan, Results(results), failures) for plan in plans]
+    return Results(results), failures
 
 
 def _concluded(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:

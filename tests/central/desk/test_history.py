@@ -50,13 +50,13 @@ def test_the_cost_and_the_nees_are_those_of_each_map(run: History, log: list[Sam
     maps = [opened(s)[2] for s in log if s.key in keys]
     assert len(run.map_cost.values) == len([x for x in maps if x.dof])
     assert run.map_cost.values[-1] == maps[-1].chi2 / maps[-1].dof
-    blocks = translate.landmark_blocks_of(maps[-1])
     ids, means = translate.landmarks_of(maps[-1])
     world = streams(scenario(robots=2))
     true = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
     errors = [mean - true[i] for i, mean in zip(ids.tolist(), means, strict=True)]
-    nees = [e @ np.linalg.solve(P, e) / 2 for e, P in zip(errors, blocks, strict=True)]
-    assert run.map_nees.values[-1] == pytest.approx(np.mean(nees))
+    e, P = np.concatenate(errors), translate.landmark_covariance_of(maps[-1])
+    assert maps[-1].joint
+    assert run.map_nees.values[-1] == pytest.approx(e @ np.linalg.solve(P, e) / len(e))
     assert (np.diff(run.map_nees.stamps_ns) >= 0).all()
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from PIL import Image
 from rich.console import Console
 
 from central.desk.compare import compare_rows
@@ -19,6 +20,7 @@ from central.desk.drawing import (
 )
 from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
 from central.desk.evaluation.history import history
+from central.desk.pictures import film
 from central.desk.pictures.run import (
     error_picture,
     map_picture,
@@ -28,6 +30,8 @@ from central.desk.report.page import write_pictures
 from central.desk.report.run import Run
 from central.desk.report.tables import summary_tables, team_rows
 from team.wire import channels as ch
+from team.wire import messages as m
+from team.wire.codec import decoded
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -103,12 +107,47 @@ def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
     nowhere = replace(path, stamps_ns=path.stamps_ns[:0], poses=path.poses[:0])
     alone = replace(run.robots["r2"], smoothed_path=nowhere)
     assert map_picture(replace(run, robots={**run.robots, "r2": alone}), tmp_path / "map.png")
-    legend = drawn[0].axes[0].get_legend()
-    assert legend is not None
+    (legend,) = drawn[0].legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert "r1" in labels
     assert "r2: not in this map" in labels
     assert not any("online" in label for label in labels)
+
+
+def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(
+    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film, "FRAMES", 3)
+    monkeypatch.setattr(film, "LAST_FRAMES", 1)
+    log = joined_log(scenario(robots=2), 0.1)
+    maps = [decoded(s.payload, m.FusedMap) for s in log if s.key == ch.FINAL_MAP.key()]
+    moving = {n: replace(r, online_path=r.smoothed_path) for n, r in run.robots.items()}
+    path = tmp_path / "team.gif"
+    assert film.draw_film(replace(run, robots=moving), film.maps_over_time(maps), path)
+    with Image.open(path) as drawn:
+        assert drawn.format == "GIF"
+        assert getattr(drawn, "n_frames", 1) > 1
+    assert not film.draw_film(evaluate([]), [], tmp_path / "none.gif")
+    assert not (tmp_path / "none.gif").exists()
+
+
+def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_factor(
+    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr("central.desk.pictures.run.save", lambda figure, _: drawn.append(figure))
+    assert run.map is not None
+    small = replace(run, map=replace(run.map, covariance=1e-8 * np.eye(len(run.map.covariance))))
+    assert map_picture(small, tmp_path / "map.png")
+    (legend,) = drawn[0].legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert "landmarks, 95 % ellipses × 100" in labels
+    assert "true landmarks, errors × 100" in labels
+    (crosses,) = (x for x in drawn[0].axes[0].lines if str(x.get_label()).startswith("true land"))
+    error = run.map.truth[run.map.known] - run.map.means[run.map.known]
+    expected = run.map.means[run.map.known] + 100 * error
+    found = np.column_stack([crosses.get_xdata(), crosses.get_ydata()])
+    np.testing.assert_allclose(found[: len(expected)], expected)
 
 
 def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
@@ -143,7 +182,7 @@ def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
     )
     console = Console(width=80, record=True, force_terminal=False)
     console.print(summary_tables(absurd)[0])
-    (line,) = [x for x in console.export_text().splitlines() if "NEES per dof" in x]
+    (line,) = [x for x in console.export_text().splitlines() if "map NEES per dof" in x]
     assert line.strip("│ ").partition("│")[2].strip() == said
     assert to_json(absurd)["map_nees_per_dof"] == 6e18
 

@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from central.desk.evaluation.errors import map_errors
 from central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from central.desk.view.drawn import PATH_POINTS, Track, centre_particles, landmarks_of, place_points
 from central.desk.view.export import export_views, with_views
@@ -251,7 +252,27 @@ def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
     np.testing.assert_allclose(errors.truth_at(round(260.5 * S)), [260.5, 0.0, 0.0])
 
 
-def test_a_maps_nees_is_of_each_landmark():
+def test_the_nees_of_a_joint_map_is_that_of_the_report():
+    P = np.diag([0.25, 1.0, 0.25, 1.0]) + 0.2
+    means = np.array([[1.0, 0.0], [5.5, 5.0]])
+    fused = fused_map(
+        ids=from_ids([4, 7]),
+        means=from_floats(means.ravel()),
+        covariance=translate.joint_bytes(P),
+        joint=True,
+    )
+    true = np.array([[0.0, 0.0], [5.0, 5.0]])
+    fit = TrueLandmarks(np.array([4, 7], np.uint32), true).fit(fused)
+    assert fit is not None
+    assert fit.nees_per_dof == pytest.approx(map_errors(means, P, true).nees_per_dof)
+    assert fit.nees_per_dof != pytest.approx(0.25 * (1.0 / 0.45 + 0.25 / 0.45))
+    of_one = TrueLandmarks(np.array([7], np.uint32), true[1:]).fit(fused)
+    assert of_one is not None
+    e = means[1] - true[1]
+    assert of_one.nees_per_dof == pytest.approx(e @ np.linalg.solve(P[2:, 2:], e) / 2.0)
+
+
+def test_the_nees_of_a_map_of_blocks_is_the_mean_over_its_landmarks():
     fused = fused_map(
         ids=from_ids([4, 7]),
         means=from_floats([1.0, 0.0, 5.0, 5.0]),

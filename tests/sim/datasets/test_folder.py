@@ -315,7 +315,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
         ("odometry", "0,1,0\n1,1,0\n", "line 1: '0' is a number, and the first line names the"),
         ("odometry", SPEEDS + "17e18,1,0\n", "to convert from nanoseconds, add a column map"),
         ("start", "x_m,y_m,theta_rad\n0,0,0\n1,1,1\n", "2 rows: one pose is where"),
-        ("start", "x_m,y_m,theta_rad\n0,0,90\n", "90 is more than a whole turn; it is in rad"),
+        ("start", "x_m,y_m,theta_rad\n0,0,90\n", "90 is more than a whole turn; it must be in rad"),
         (
             "observations",
             "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,0,1\n2,1,1,1,1,,\n",

@@ -47,6 +47,9 @@ def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     assert "`teamslam calibrate my_set -o my_set/scenario.toml` learns" in (
         launch._how_to_learn(Path("my_set"), world)
     )
+    unknown = [replace(each, truth=None, truth_ns=None) for each in world.streams]
+    advice = launch._how_to_learn(Path("my_set"), replace(world, streams=tuple(unknown)))
+    assert "learns the odometry's scales; without ground truth not the noise" in advice
     short = [
         replace(each, intervals=each.intervals.where(each.intervals.end_ns < 100_000_000_000))
         for each in world.streams

@@ -189,7 +189,8 @@ function lookAtMap() {
   put('robot-count', here.filter((r) => store.stateAt(r, state.time) !== 'lost').length);
   $('rmse-box').hidden = $('nees-box').hidden = !store.trueMap;
   put('rmse', shown && shown.rmse !== null ? metresText(shown.rmse) : '–');
-  put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) : '–', '');
+  const kind = shown && shown.joint ? '' : ' (blocks only)';
+  put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) + kind : '–', '');
   const figures = store.figuresAt('central', state.time);
   const cost = figures && figures.joint_cost_per_dof;
   $('cost-box').hidden = !store.figures.has('central');
@@ -462,7 +463,7 @@ function drawConsistency() {
   const fits = store.maps.filter((m) => m.nees !== null);
   if (fits.length) {
     line(fits.map((m) => m.t), fits.map((m) => m.nees), { colour: colour('landmark'), width: 1.5 });
-    legend.push(['landmark', 'landmarks, NEES per dof']);
+    legend.push(['landmark', 'map NEES per dof: blocks only, at the end joint']);
     for (const m of fits) high = Math.max(high, Math.min(1.15 * m.nees, 5));
   }
   drawInnovations();
