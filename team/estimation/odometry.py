@@ -58,7 +58,8 @@ class OdometryInterval(NamedTuple):
         """Magnitude of the velocity [m/s]; without a reported motion, the signed forward speed."""
         if self.moved is None:
             return self.forward
-        return core.hypot(*self.moved.twist[:2]) / (self.duration_ns * 1e-9)
+        forward, left, _ = self.moved.twist
+        return core.hypot(float(forward), float(left)) / (self.duration_ns * 1e-9)
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
