@@ -140,7 +140,7 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
         after=chain[after].sequence,
         begin_ns=chain[before].end_ns,
         end_ns=chain[after - 1].end_ns,
-        by=(float(by[0]), float(by[1]), wrapped(float(by[2]))),
+        by=(float(by[0]), float(by[1]), wrapped(by[2])),
         in_all=bool(spoilt),
     )
 
@@ -229,7 +229,7 @@ def _seam(chain: Sequence[Contribution], one: _Placed, two: _Placed) -> _Seam:
         )
         pose = after
     gap = two.start.a_from_b - pose
-    gap[2] = wrapped(float(gap[2]))
+    gap[2] = wrapped(gap[2])
     try:
         metric = information(covariance + two.start.covariance, "a seam")
     except NotACovarianceError:

@@ -26,6 +26,7 @@ from tests import bits
 CLASSES: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
     "without AVX": {
+        "TEAMSLAM_CORE": "base",
         "NUMBA_CPU_NAME": "generic",
         "NUMBA_CPU_FEATURES": "",
         "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL",

@@ -3,7 +3,7 @@ The numerical core: the state of a window, and functions with defined bits.
 """
 
 from collections.abc import Sequence
-from typing import Annotated, overload
+from typing import overload
 
 import numpy
 from numpy.typing import NDArray
@@ -90,7 +90,7 @@ def squared(x: float) -> float:
     """
 
 @overload
-def squared(x: NDArray[numpy.float64]) -> object: ...
+def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def normal_below(x: float) -> float:

@@ -130,8 +130,8 @@ def carried(
     """
     if own[3] == SENSOR:
         return own[None]
-    reach, far = max(distance, NEAREST_M), max(float(core.hypot(*to)), NEAREST_M)
-    turn = direction - float(core.atan2(to[1], to[0]))
+    reach, far = max(distance, NEAREST_M), max(core.hypot(*to), NEAREST_M)
+    turn = direction - core.atan2(to[1], to[0])
     s, c = core.sin_and_cos(turn)
     rr, rb, bb = own[0], own[1] * reach, own[2] * reach * reach
     along = c * c * rr - 2.0 * c * s * rb + s * s * bb

@@ -42,7 +42,7 @@ def unexpected(nis: Innovation, outliers: float, estimator: Estimator) -> tuple[
 
 def slipped(slip: Slipped) -> str:
     """Describes a slip of the odometry."""
-    metres, turn = float(core.hypot(*slip.by[:2])), float(np.degrees(slip.by[2]))
+    metres, turn = core.hypot(*slip.by[:2]), float(np.degrees(slip.by[2]))
     return (
         f"the odometry slipped by {metres:.2f} m, {turn:.0f}° before {slip.stamp_ns * 1e-9:.2f} s"
     )

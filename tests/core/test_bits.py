@@ -15,37 +15,49 @@ from team import core
 from tests.support import ROOT
 
 FOLDER = ROOT / "team" / "core"
-HASH = "8c51871c169fc457"
-"""Of all results of tests/core/bits.cpp; equal to the bits of the Numba kernels before them."""
-SOURCES = ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian")
+PROGRAMS = {
+    "bits": (
+        "8c51871c169fc457",
+        ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
+    ),
+    "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
+    "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
+}
+"""Hash of all results of a program in this folder, equal to the bits of the Numba kernels before
+them; and the core's sources that it takes.
+"""
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 FUSED = re.compile(r"\s(?:vfn?m(?:add|sub)\w*|fn?m(?:add|sub)|fml[as])\s.*")
 
 
-def hash_of(tmp_path: Path, *command: str) -> str:
-    program = tmp_path / "bits"
-    sources = [FOLDER / "src" / f"{name}.cpp" for name in SOURCES]
-    words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / "tests/core/bits.cpp"]
+def hash_of(name: str, tmp_path: Path, *command: str) -> str:
+    program = tmp_path / name
+    sources = [FOLDER / "src" / f"{each}.cpp" for each in PROGRAMS[name][1]]
+    words = [*command, *EXACT, "-I", FOLDER / "src", *sources, ROOT / f"tests/core/{name}.cpp"]
     subprocess.run([*words, "-o", program], check=True, capture_output=True, timeout=900)
     return subprocess.run([program], check=True, capture_output=True, text=True).stdout.strip()
 
 
 @pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
-def test_gcc_gives_the_same_bits_at_every_level(flags: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_gcc_gives_the_same_bits_at_every_level(
+    name: str, flags: tuple[str, ...], tmp_path: Path
+) -> None:
     if shutil.which("g++") is None:
         pytest.skip("g++ is not on the path")
     if "-mavx2" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("this processor has no AVX2")
-    assert hash_of(tmp_path, "g++", *flags) == HASH
+    assert hash_of(name, tmp_path, "g++", *flags) == PROGRAMS[name][0]
 
 
-def test_clang_gives_the_bits_of_gcc(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_clang_gives_the_bits_of_gcc(name: str, tmp_path: Path) -> None:
     """clang comes from the ziglang wheel."""
     if find_spec("ziglang") is None:
         pytest.skip("ziglang is not installed: pip install --no-deps -r hashes-zig.txt")
-    assert (
-        hash_of(tmp_path, sys.executable, "-m", "ziglang", "c++", "-O3", "-mcpu=x86_64_v2") == HASH
-    )
+    clang = (sys.executable, "-m", "ziglang", "c++")
+    found = hash_of(name, tmp_path, *clang, "-O3", "-mcpu=x86_64_v2")
+    assert found == PROGRAMS[name][0]
 
 
 def test_no_library_holds_a_fused_multiply_add() -> None:

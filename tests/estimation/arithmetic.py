@@ -6,20 +6,13 @@ python -m tests.estimation.arithmetic
 import hashlib
 import json
 
-import numba
 import numpy as np
-from llvmlite.binding import get_host_cpu_name
 
 from team import core
 from team.estimation import dense
 
 SIZES = (3, 40, 130)
 """Dense matrices: by loops, by a part of a tile, by several tiles and blocks."""
-
-
-def processor() -> str:
-    """The processor that the kernels are compiled for."""
-    return numba.config.CPU_NAME or get_host_cpu_name()
 
 
 def digests() -> dict[str, str]:
@@ -46,4 +39,4 @@ def digests() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    print(json.dumps([processor(), digests()]))
+    print(json.dumps([core.level, digests()]))

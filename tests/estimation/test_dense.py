@@ -57,18 +57,38 @@ def test_solutions_are_those_of_numpy() -> None:
         dense.inverse(np.zeros((2, 2)))
 
 
-def test_factors_are_those_of_numpy() -> None:
-    P = _drawn((9, 30))
+@pytest.mark.parametrize("n", [0, 1, 9, 31, 32, 70, 130])
+def test_factors_are_those_of_numpy(n: int) -> None:
+    P = _drawn((n, n + 21))
     P = P @ P.T
     L = dense.cholesky(P)
-    np.testing.assert_allclose(L, np.linalg.cholesky(P), rtol=1e-12)
+    np.testing.assert_allclose(L, np.linalg.cholesky(P), rtol=1e-9, atol=1e-12)
     inverse = dense.inverse_of_factored(L)
     assert (inverse == inverse.T).all()
     np.testing.assert_allclose(inverse, np.linalg.inv(P), rtol=1e-9, atol=1e-12)
-    for B in (_drawn((9,), 5), _drawn((9, 2), 5)):
-        np.testing.assert_allclose(L @ dense.forward(L, B), B, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(P @ dense.solve_factored(L, B), B, rtol=1e-9, atol=1e-12)
-    with pytest.raises(np.linalg.LinAlgError):
-        dense.cholesky(-P)
+    for B in (_drawn((n,), 5), _drawn((n, 2), 5), _drawn((n, 100), 5)):
+        np.testing.assert_allclose(L @ dense.forward(L, B), B, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(P @ dense.solve_factored(L, B), B, rtol=1e-8, atol=1e-8)
+
+
+def test_a_matrix_that_has_no_factor_and_shapes_that_do_not_fit_are_refused() -> None:
+    for singular in (-np.eye(3), np.array([[1.0, 1.0], [1.0, 1.0]])):
+        with pytest.raises(np.linalg.LinAlgError):
+            dense.cholesky(singular)
     with pytest.raises(np.linalg.LinAlgError):
         dense.cholesky(np.full((2, 2), np.nan))
+    for function, *of_wrong_shape in (
+        (dense.product, np.eye(2), np.eye(3)),
+        (dense.product, np.array(1.0), np.eye(3)),
+        (dense.solve, np.ones((2, 3)), np.ones(2)),
+        (dense.solve, np.eye(2), np.ones(3)),
+        (dense.inverse, np.ones((2, 3))),
+        (dense.cholesky, np.ones((2, 3))),
+        (dense.cholesky, np.ones(2)),
+        (dense.forward, np.eye(2), np.ones(3)),
+        (dense.forward, np.eye(2), np.ones((2, 2, 2))),
+        (dense.solve_factored, np.ones((2, 3)), np.ones(2)),
+        (dense.inverse_of_factored, np.ones((2, 3))),
+    ):
+        with pytest.raises(ValueError):
+            function(*of_wrong_shape)

@@ -112,7 +112,7 @@ class _Scan:
         used = np.arange(self._means.shape[1]) < self._counts[:, None]
         likely = np.where(used & self._free & (squared < gate), likely, -np.inf)
         best = likely.argmax(axis=1)
-        edge = -0.5 * gate - 0.5 * float(core.log(np.linalg.det(R))) - core.log(2.0 * np.pi)
+        edge = -0.5 * gate - 0.5 * core.log(np.linalg.det(R)) - core.log(2.0 * np.pi)
         old = likely[particles, best] > edge
         self._logs += np.where(old, likely[particles, best], edge)
         place = np.where(old, best, self._counts)

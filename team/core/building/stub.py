@@ -26,7 +26,7 @@ def made_stub() -> str:
     made = StubGen(module=import_module(LIBRARY), quiet=True)
     made.put(made.module)
     sys.path.remove(str(FOLDER))
-    text = ARRAY.sub(r"\1", made.get()).replace("from typing import Annotated\n", "")
+    text = ARRAY.sub(r"\1", made.get()).replace("import Annotated, ", "import ")
     return VALUE.sub(r"\1", text).replace(": tuple\n", ": tuple[float, ...]\n")
 
 

@@ -7,13 +7,6 @@ namespace teamslam::binding {
 
 namespace {
 
-template <class F>
-MadeArray each_of(const Array& x, F&& function) {
-  std::vector<double> y(x.size());
-  for (std::size_t i = 0; i < y.size(); i++) y[i] = function(x.data()[i]);
-  return made_array(std::move(y), axes_of(x));
-}
-
 // In packs, with zeros behind the last number; both begin at a pack's first number.
 template <class F>
 void each_pack(std::vector<double>& x, F&& function) {
@@ -23,49 +16,49 @@ void each_pack(std::vector<double>& x, F&& function) {
   x.resize(n);
 }
 
-template <class F>
-void def_of_one(nb::module_& m, const char* name, F function, const char* argument, const char* doc) {
-  m.def(name, [function](const Number& x) { return function(x.value); }, nb::arg(argument), doc);
-  m.def(name, [function](const Array& x) { return each_of(x, function); }, nb::arg(argument));
+template <double (*function)(double)>
+void def_of_one(nb::module_& m, const char* name, const char* argument, const char* doc) {
+  m.def(name, [](const Number& x) { return function(x.value); }, nb::arg(argument), doc);
+  m.def(
+      name,
+      [](const Array& x) {
+        std::vector<double> y(x.size());
+        for (std::size_t i = 0; i < y.size(); i++) y[i] = function(x.data()[i]);
+        return made_array(std::move(y), axes_of(x));
+      },
+      nb::arg(argument));
 }
 
-// Of each pair of two arrays, or of an array and a number; as NumPy broadcasts them.
-template <class F>
-MadeArray each_of_both(std::span<const double> x, const Axes& of_x, std::span<const double> y, const Axes& of_y, F&& function) {
-  std::vector<double> z;
-  if (of_x == of_y) {
-    for (std::size_t i = 0; i < x.size(); i++) z.push_back(function(x[i], y[i]));
-    return made_array(std::move(z), of_x);
+// Numbers with the lengths of their axes: an array's, or one number.
+struct Operand {
+  std::span<const double> numbers;
+  Axes axes;
+
+  Operand(const Array& from) : numbers(from.data(), from.size()), axes(axes_of(from)) {}
+  Operand(const Number& from) : numbers(&from.value, 1) {}
+};
+
+// Of each pair, as NumPy broadcasts them.
+template <double (*function)(double, double)>
+MadeArray each_of_both(const Operand& x, const Operand& y) {
+  if (x.axes == y.axes) {
+    std::vector<double> z(x.numbers.size());
+    for (std::size_t i = 0; i < z.size(); i++) z[i] = function(x.numbers[i], y.numbers[i]);
+    return made_array(std::move(z), x.axes);
   }
-  const Broadcast both(of_x, of_y);
-  for (std::size_t i = 0; i < both.left.size(); i++) z.push_back(function(x[both.left[i]], y[both.right[i]]));
+  const Broadcast both(x.axes, y.axes);
+  std::vector<double> z(both.left.size());
+  for (std::size_t i = 0; i < z.size(); i++) z[i] = function(x.numbers[both.left[i]], y.numbers[both.right[i]]);
   return made_array(std::move(z), both.axes);
 }
 
-std::span<const double> numbers_of(const Array& x) { return {x.data(), x.size()}; }
-
-template <class F>
-void def_of_two(nb::module_& m, const char* name, F function, const char* first, const char* second, const char* doc) {
+template <double (*function)(double, double)>
+void def_of_two(nb::module_& m, const char* name, const char* first, const char* second, const char* doc) {
   const nb::arg one(first), other(second);
-  m.def(name, [function](const Number& x, const Number& y) { return function(x.value, y.value); }, one, other, doc);
-  m.def(
-      name,
-      [function](const Array& x, const Array& y) {
-        return each_of_both(numbers_of(x), axes_of(x), numbers_of(y), axes_of(y), function);
-      },
-      one, other);
-  m.def(
-      name,
-      [function](const Array& x, const Number& y) {
-        return each_of_both(numbers_of(x), axes_of(x), {&y.value, 1}, {}, function);
-      },
-      one, other);
-  m.def(
-      name,
-      [function](const Number& x, const Array& y) {
-        return each_of_both({&x.value, 1}, {}, numbers_of(y), axes_of(y), function);
-      },
-      one, other);
+  m.def(name, [](const Number& x, const Number& y) { return function(x.value, y.value); }, one, other, doc);
+  m.def(name, [](const Array& x, const Array& y) { return each_of_both<function>(x, y); }, one, other);
+  m.def(name, [](const Array& x, const Number& y) { return each_of_both<function>(x, y); }, one, other);
+  m.def(name, [](const Number& x, const Array& y) { return each_of_both<function>(x, y); }, one, other);
 }
 
 using Both = std::tuple<MadeArray, MadeArray>;
@@ -103,20 +96,21 @@ void bind_elementary(nb::module_& m) {
         return made_array(std::move(powers), axes_of(x));
       },
       "x"_a);
-  def_of_one(m, "sin", elementary::sin, "angle", "The sine of an angle [rad], or of each of an array.");
-  def_of_one(m, "cos", elementary::cos, "angle", "The cosine of an angle [rad], or of each of an array.");
-  def_of_one(m, "tan", elementary::tan, "angle", "The tangent of an angle [rad], or of each of an array.");
-  def_of_one(m, "log", elementary::log, "x", "The natural logarithm of x, or of each of an array.");
-  def_of_one(m, "log1p", elementary::log1p, "x", "The logarithm of 1 + x, or of that of each of an array.");
-  def_of_one(m, "expm1", elementary::expm1, "x", "E to the power of x, less 1; x may be an array.");
+  def_of_one<elementary::sin>(m, "sin", "angle", "The sine of an angle [rad], or of each of an array.");
+  def_of_one<elementary::cos>(m, "cos", "angle", "The cosine of an angle [rad], or of each of an array.");
+  def_of_one<elementary::tan>(m, "tan", "angle", "The tangent of an angle [rad], or of each of an array.");
+  def_of_one<elementary::log>(m, "log", "x", "The natural logarithm of x, or of each of an array.");
+  def_of_one<elementary::log1p>(m, "log1p", "x", "The logarithm of 1 + x, or of that of each of an array.");
+  def_of_one<elementary::expm1>(m, "expm1", "x", "E to the power of x, less 1; x may be an array.");
   m.def("squared", [](const Number& x) { return x.value * x.value; }, "x"_a,
         "The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.");
-  m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a);
-  def_of_one(m, "normal_below", elementary::normal_below, "x",
+  m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a,
+        nb::sig("def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]"));
+  def_of_one<elementary::normal_below>(m, "normal_below", "x",
              "The probability that a standard normal variable stays below x, to 1e-15; x may be an array.");
-  def_of_one(m, "wrapped", se2::wrapped<double>, "angle", "The same direction in (-pi, pi]; angle may be an array.");
-  def_of_two(m, "atan2", elementary::atan2, "y", "x", "The direction of (x, y) in [-pi, pi]; both may be arrays.");
-  def_of_two(m, "hypot", elementary::hypot, "x", "y", "The length of (x, y); both may be arrays.");
+  def_of_one<se2::wrapped<double>>(m, "wrapped", "angle", "The same direction in (-pi, pi]; angle may be an array.");
+  def_of_two<elementary::atan2>(m, "atan2", "y", "x", "The direction of (x, y) in [-pi, pi]; both may be arrays.");
+  def_of_two<elementary::hypot>(m, "hypot", "x", "y", "The length of (x, y); both may be arrays.");
 }
 
 }  // namespace teamslam::binding

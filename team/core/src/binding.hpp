@@ -195,6 +195,8 @@ struct Broadcast {
     }
     const std::size_t count = product_of(axes);
     std::size_t in_a = 0, in_b = 0;
+    left.reserve(count);
+    right.reserve(count);
     for (std::size_t k = 0; k < count; k++) {
       left.push_back(in_a);
       right.push_back(in_b);

@@ -4,17 +4,11 @@
 #include <cmath>
 #include <limits>
 
-#include "pack.hpp"
+#include "product.hpp"
 
 namespace teamslam::dense {
 
-using pack::Pack, pack::load, pack::store;
-
 namespace {
-
-// Big products go by tiles of columns and blocks of terms, which stay in the first cache; four rows
-// and four terms at once keep most of the work in registers.
-constexpr std::size_t TILE = 64, DEPTH = 32;
 
 // row −= factor · other.
 void take(double* __restrict row, double factor, const double* __restrict other, std::size_t count) {
@@ -23,24 +17,6 @@ void take(double* __restrict row, double factor, const double* __restrict other,
 
 void divide(double* row, double by, std::size_t count) {
   for (std::size_t j = 0; j < count; j++) row[j] /= by;
-}
-
-// Adds to four rows of a tile the products of `deep` entries of A's rows with the packed rows of B:
-// eight registers of sums at a time.
-void add_terms(const double* const (&a)[4], const double* packed, double* sums, std::size_t deep, std::size_t width) {
-  constexpr std::size_t PACKS = 2 / pack::REGISTERS;
-  for (std::size_t j = 0; j < width; j += PACKS * pack::WIDTH) {
-    const auto place = [j](std::size_t k) { return k / PACKS * TILE + j + k % PACKS * pack::WIDTH; };
-    Pack s[4 * PACKS];
-#pragma GCC unroll 8
-    for (std::size_t k = 0; k < 4 * PACKS; k++) s[k] = load(sums + place(k));
-    for (std::size_t p = 0; p < deep; p++) {
-#pragma GCC unroll 8
-      for (std::size_t k = 0; k < 4 * PACKS; k++) s[k] += a[k / PACKS][p] * load(packed + p * TILE + j + k % PACKS * pack::WIDTH);
-    }
-#pragma GCC unroll 8
-    for (std::size_t k = 0; k < 4 * PACKS; k++) store(sums + place(k), s[k]);
-  }
 }
 
 }  // namespace
@@ -55,13 +31,6 @@ Matrix transposed(Const a) {
   Matrix made(a.columns, a.rows);
   for (std::size_t i = 0; i < a.rows; i++)
     for (std::size_t j = 0; j < a.columns; j++) made[j][i] = a[i][j];
-  return made;
-}
-
-Matrix negative(Const a) {
-  Matrix made(a.rows, a.columns);
-  for (std::size_t i = 0; i < a.rows; i++)
-    for (std::size_t j = 0; j < a.columns; j++) made[i][j] = -a[i][j];
   return made;
 }
 
@@ -100,47 +69,13 @@ std::vector<double> product(Const a, std::span<const double> x) {
 Matrix product(Const a, Const b) {
   assert(a.columns == b.rows);
   Matrix c(a.rows, b.columns);
-  if (a.rows >= 4 && b.columns > TILE / 2 && a.columns >= 4) {
-    add_product(a, b, c.view());
-    return c;
-  }
-  const std::size_t whole = a.columns - a.columns % 4;
-  for (std::size_t i = 0; i < a.rows; i++) {
-    double* __restrict sums = c[i];
-    for (std::size_t p = 0; p < whole; p += 4) {
-      const double f0 = a[i][p], f1 = a[i][p + 1], f2 = a[i][p + 2], f3 = a[i][p + 3];
-      const double *b0 = b[p], *b1 = b[p + 1], *b2 = b[p + 2], *b3 = b[p + 3];
-      for (std::size_t j = 0; j < b.columns; j++)
-        sums[j] = (((sums[j] + f0 * b0[j]) + f1 * b1[j]) + f2 * b2[j]) + f3 * b3[j];
-    }
-    for (std::size_t p = whole; p < a.columns; p++) {
-      const double factor = a[i][p];
-      const double* row = b[p];
-      for (std::size_t j = 0; j < b.columns; j++) sums[j] += factor * row[j];
-    }
-  }
+  multiply<Into::SET>(c.view(), by_rows(a), b);
   return c;
 }
 
 void add_product(Const a, Const b, View c, Shape shape) {
-  assert(a.columns == b.rows && c.rows == a.rows && c.columns == b.columns);
-  double packed[DEPTH * TILE] = {}, sums[4 * TILE] = {};
-  for (std::size_t begin = 0; begin < b.columns; begin += TILE) {
-    const std::size_t width = std::min(TILE, b.columns - begin), filled = pack::padded(width);
-    const std::size_t rows = shape.is_upper ? std::min(a.rows, begin + width) : a.rows;
-    for (std::size_t first = shape.is_lower ? begin : 0; first < b.rows; first += DEPTH) {
-      const std::size_t deep = std::min(DEPTH, b.rows - first);
-      for (std::size_t p = 0; p < deep; p++) std::copy_n(b[first + p] + begin, width, packed + p * TILE);
-      for (std::size_t i = 0; i < rows; i += 4) {
-        const std::size_t high = std::min<std::size_t>(4, rows - i);
-        const double* of_rows[4];
-        for (std::size_t r = 0; r < 4; r++) of_rows[r] = a[i + std::min(r, high - 1)] + first;
-        for (std::size_t r = 0; r < high; r++) std::copy_n(c[i + r] + begin, width, sums + r * TILE);
-        add_terms(of_rows, packed, sums, deep, filled);
-        for (std::size_t r = 0; r < high; r++) std::copy_n(sums + r * TILE, width, c[i + r] + begin);
-      }
-    }
-  }
+  assert(a.columns == b.rows && c.rows == a.rows);
+  multiply<Into::ADD>(c, by_rows(a), b, shape);
 }
 
 bool solve(View A, View B) {
@@ -182,7 +117,7 @@ bool factor_upper(View U) {
     }
     if (end < n) {
       const Const right = U.part(begin, end, end - begin, n - end);
-      add_product(negative(transposed(right)), right, U.part(end, end, n - end, n - end), {.is_upper = true});
+      multiply<Into::SUBTRACT>(U.part(end, end, n - end, n - end), by_columns(right), right, {.is_upper = true});
     }
   }
   return true;
@@ -221,8 +156,8 @@ void solve_lower(Const L, View right) {
   for (std::size_t begin = 0; begin < n; begin += BLOCK) {
     const std::size_t end = std::min(begin + BLOCK, n);
     if (begin > 0)
-      add_product(negative(L.part(begin, 0, end - begin, begin)), right.part(0, 0, begin, many),
-                  right.part(begin, 0, end - begin, many));
+      multiply<Into::SUBTRACT>(right.part(begin, 0, end - begin, many), by_rows(L.part(begin, 0, end - begin, begin)),
+                               right.part(0, 0, begin, many));
     for (std::size_t k = begin; k < end; k++) {
       for (std::size_t p = begin; p < k; p++) take(right[k], L[k][p], right[p], many);
       divide(right[k], L[k][k], many);
@@ -248,8 +183,8 @@ void solve_upper(Const L, View right) {
       for (std::size_t p = begin; p < k; p++) take(right[p], L[k][p], right[k], many);
     }
     if (begin > 0)
-      add_product(negative(transposed(L.part(begin, 0, end - begin, begin))), right.part(begin, 0, end - begin, many),
-                  right.part(0, 0, begin, many));
+      multiply<Into::SUBTRACT>(right.part(0, 0, begin, many), by_columns(L.part(begin, 0, end - begin, begin)),
+                               right.part(begin, 0, end - begin, many));
   }
 }
 
@@ -260,8 +195,8 @@ Matrix inverse_from_factor(Const L) {
   for (std::size_t begin = 0; begin < n; begin += BLOCK) {
     const std::size_t end = std::min(begin + BLOCK, n);
     if (begin > 0)
-      add_product(negative(L.part(begin, 0, end - begin, begin)), R.view().part(0, 0, begin, begin),
-                  R.view().part(begin, 0, end - begin, begin), {.is_lower = true});
+      multiply<Into::SUBTRACT>(R.view().part(begin, 0, end - begin, begin), by_rows(L.part(begin, 0, end - begin, begin)),
+                               R.view().part(0, 0, begin, begin), {.is_lower = true});
     for (std::size_t k = begin; k < end; k++) {
       for (std::size_t p = begin; p < k; p++) take(R[k], L[k][p], R[p], p + 1);
       divide(R[k], L[k][k], k + 1);
@@ -273,7 +208,7 @@ Matrix inverse_from_factor(Const L) {
       for (std::size_t i = 0; i <= k; i++)
         for (std::size_t j = i; j <= k; j++) inverse[i][j] += R[k][i] * R[k][j];
   } else {
-    add_product(transposed(R), R, inverse.view(), {.is_upper = true, .is_lower = true});
+    multiply<Into::SET>(inverse.view(), by_columns(R), R, {.is_upper = true, .is_lower = true});
   }
   for (std::size_t i = 0; i < n; i++)
     for (std::size_t j = 0; j < i; j++) inverse[i][j] = inverse[j][i];

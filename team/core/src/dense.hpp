@@ -82,7 +82,6 @@ inline View column(std::span<double> x) { return {x.data(), x.size(), 1, 1}; }
 
 Matrix identity(std::size_t n);
 Matrix transposed(Const a);
-Matrix negative(Const a);
 bool is_finite(Const a);
 
 // Σ aᵢ bᵢ in eight lanes, which are summed in pairs.
@@ -96,11 +95,12 @@ Matrix product(Const a, Const b);
 
 // Which entries of a product are needed or read.
 struct Shape {
-  bool is_upper = false;  // only the upper triangle of the square A B is needed; tiles below may stay as they are
-  bool is_lower = false;  // B is lower triangular: entries above its diagonal are not read, except within its tiles
+  bool is_upper = false;       // only the upper triangle of the square A B is needed; some below it are written too
+  bool is_lower = false;       // B is lower triangular, with zeros above
+  bool is_left_upper = false;  // A is upper triangular, with zeros below
 };
 
-// C += A B, each entry its terms in order; C overlaps neither A nor B.
+// C += A B, each entry its terms in order; C overlaps neither A nor B. `product.hpp` has more of these.
 void add_product(Const a, Const b, View c, Shape shape = {});
 
 // B := A⁻¹ B by elimination with partial pivoting, A := what is left of it; false for a zero pivot.

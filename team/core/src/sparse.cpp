@@ -3,117 +3,19 @@
 #include <algorithm>
 #include <cmath>
 
-#include "pack.hpp"
+#include "product.hpp"
 
 namespace teamslam::sparse {
 
-using dense::Const, dense::Matrix, dense::transposed, dense::View;
+using dense::by_columns, dense::by_rows, dense::Const, dense::Into, dense::Left, dense::load, dense::Matrix;
+using dense::multiply, dense::Register, dense::transposed, dense::View;
 
 namespace {
 
 constexpr double PIVOT_TOLERANCE = 1e-14;  // pivot to diagonal entry below which it is rounding: undetermined
 constexpr std::size_t ROWS = 256, WIDTH = 16;  // rows and columns from which a panel is big
 constexpr std::size_t BLOCK = 48;              // columns of a big panel that are factored, solved or inverted together
-constexpr std::size_t HIGH = 4;                // rows of a product that are computed together
-constexpr std::size_t PACKED = 16;             // rows of a product from which columns of a factor are copied first
-
-using Register = pack::Numbers;
-
-template <class T>
-T load(const double* from) {
-  T x;
-  std::memcpy(&x, from, sizeof x);
-  return x;
-}
-
-// The left factor of a product: entry (i, k) is at[i · row + k · column].
-struct Left {
-  const double* at;
-  std::size_t row, column;
-};
-
-// What becomes of C with the sum S = A B of each entry, whose terms are in order: C + S and C − S term
-// by term, C − S as a whole, S.
-enum class Into { ADD, SUBTRACT, SUBTRACT_SUM, SET };
-
-// R rows of a product, N registers T wide.
-template <Into INTO, std::size_t R, class T, std::size_t N>
-inline void tile(double* c, std::size_t c_stride, Left a, const double* b, std::size_t b_stride, std::size_t depth) {
-  constexpr std::size_t LANES = sizeof(T) / sizeof(double);
-  T sum[R][N];
-  for (std::size_t r = 0; r < R; r++)
-    for (std::size_t q = 0; q < N; q++)
-      sum[r][q] = INTO == Into::ADD || INTO == Into::SUBTRACT ? load<T>(c + r * c_stride + q * LANES) : T{};
-  for (std::size_t k = 0; k < depth; k++) {
-    T right[N];
-    for (std::size_t q = 0; q < N; q++) right[q] = load<T>(b + k * b_stride + q * LANES);
-    for (std::size_t r = 0; r < R; r++) {
-      const double left = a.at[r * a.row + k * a.column];
-      for (std::size_t q = 0; q < N; q++) {
-        if constexpr (INTO == Into::SUBTRACT)
-          sum[r][q] -= left * right[q];
-        else
-          sum[r][q] += left * right[q];
-      }
-    }
-  }
-  for (std::size_t r = 0; r < R; r++)
-    for (std::size_t q = 0; q < N; q++) {
-      double* to = c + r * c_stride + q * LANES;
-      const T entries = INTO == Into::SUBTRACT_SUM ? load<T>(to) - sum[r][q] : sum[r][q];
-      std::memcpy(to, &entries, sizeof entries);
-    }
-}
-
-enum Shape : unsigned { FULL = 0, UPPER = 1, LEFT_UPPER = 2 };
-
-// Columns of C of one register's width from `column` on.
-//
-// UPPER: only the upper triangle of C is required; entries below it within a tile are written too.
-// LEFT_UPPER: A is upper triangular with zeros below; its terms begin at the diagonal.
-template <Into INTO, class T, std::size_t N>
-void product_columns(View c, Left a, Const b, unsigned shape, std::size_t column, std::vector<double>& packed) {
-  constexpr std::size_t LANES = N * sizeof(T) / sizeof(double);
-  const std::size_t rows = shape & UPPER ? std::min(c.rows, column + LANES) : c.rows;
-  const double* right = b.data + column;
-  std::size_t stride = b.stride;
-  if (rows >= PACKED) {
-    packed.resize(b.rows * LANES);
-    for (std::size_t k = 0; k < b.rows; k++) std::copy_n(right + k * stride, LANES, &packed[k * LANES]);
-    right = packed.data();
-    stride = LANES;
-  }
-  for (std::size_t i = 0; i < rows; i += HIGH) {
-    const std::size_t skip = shape & LEFT_UPPER ? std::min(i, b.rows) : 0, depth = b.rows - skip;
-    const Left left{a.at + i * a.row + skip * a.column, a.row, a.column};
-    double* to = c.data + i * c.stride + column;
-    const double* from = right + skip * stride;
-    switch (std::min(rows - i, HIGH)) {
-      case 4: tile<INTO, 4, T, N>(to, c.stride, left, from, stride, depth); break;
-      case 3: tile<INTO, 3, T, N>(to, c.stride, left, from, stride, depth); break;
-      case 2: tile<INTO, 2, T, N>(to, c.stride, left, from, stride, depth); break;
-      default: tile<INTO, 1, T, N>(to, c.stride, left, from, stride, depth);
-    }
-  }
-}
-
-// C and A B, by tiles that stay in registers over all terms.
-template <Into INTO>
-void product(View c, Left a, Const b, unsigned shape = FULL) {
-  constexpr std::size_t LANES = pack::IN_REGISTER;
-  std::vector<double> packed;
-  std::size_t column = 0;
-  for (; column + 2 * LANES <= c.columns; column += 2 * LANES)
-    product_columns<INTO, Register, 2>(c, a, b, shape, column, packed);
-  if (column + LANES <= c.columns) {
-    product_columns<INTO, Register, 1>(c, a, b, shape, column, packed);
-    column += LANES;
-  }
-  for (; column < c.columns; column++) product_columns<INTO, double, 1>(c, a, b, shape, column, packed);
-}
-
-Left by_rows(Const a) { return {a.data, a.stride, 1}; }
-Left by_columns(Const a) { return {a.data, 1, a.stride}; }  // of Aᵀ
+constexpr std::size_t HIGH = 4;                // columns of a panel that are worked together, as rows of a product
 
 void negate(View a) {
   for (std::size_t i = 0; i < a.rows; i++)
@@ -128,7 +30,7 @@ Index factorise_columns(View panel, std::size_t begin, std::size_t end, const do
   for (std::size_t first = begin; first < end; first += HIGH) {
     const std::size_t behind = std::min(first + HIGH, end), m = panel.columns - first;
     const Const before = panel.part(begin, first, first - begin, m);
-    product<Into::SUBTRACT>(panel.part(first, first, behind - first, m), by_columns(before), before);
+    multiply<Into::SUBTRACT>(panel.part(first, first, behind - first, m), by_columns(before), before);
     for (std::size_t k = first; k < behind; k++) {
       double* row = panel[k];
       if (!(row[k] > least[k])) return Index(k);
@@ -152,7 +54,7 @@ Index factorise_panel(View panel, const double* least) {
     const Index failed = factorise_columns(panel, begin, end, least);
     if (failed >= 0) return failed;
     const Const block = panel.part(begin, end, end - begin, m);
-    product<Into::SUBTRACT_SUM>(panel.part(end, end, panel.rows - end, m), by_columns(block), block, UPPER);
+    multiply<Into::SUBTRACT_SUM>(panel.part(end, end, panel.rows - end, m), by_columns(block), block, {.is_upper = true});
   }
   return -1;
 }
@@ -210,7 +112,7 @@ Matrix over_own_triangle(Const panel) {
   for (std::size_t k = width; k-- > 0;) {
     std::copy_n(panel[k] + width, below, y[k] + width);
     const Left left{panel[k] + k + 1, panel.stride, 1};
-    product<Into::SUBTRACT>(y.view().part(k, width, 1, below), left, y.view().part(k + 1, width, width - k - 1, below));
+    multiply<Into::SUBTRACT>(y.view().part(k, width, 1, below), left, y.view().part(k + 1, width, width - k - 1, below));
     for (std::size_t i = width; i < panel.columns; i++) y[k][i] /= panel[k][k];
   }
   return y;
@@ -228,9 +130,9 @@ Matrix inverse_by_blocks(Const panel) {
     if (begin == 0) continue;
     Matrix coupled(begin, size);
     const View beside = inverse.view().part(0, begin, begin, size);
-    product<Into::SET>(coupled.view(), by_rows(inverse.view().part(0, 0, begin, begin)),
-                       panel.part(0, begin, begin, size), LEFT_UPPER);
-    product<Into::SET>(beside, by_rows(coupled), own);
+    multiply<Into::SET>(coupled.view(), by_rows(inverse.view().part(0, 0, begin, begin)),
+                       panel.part(0, begin, begin, size), {.is_left_upper = true});
+    multiply<Into::SET>(beside, by_rows(coupled), own);
     negate(beside);
   }
   return inverse;
@@ -241,12 +143,12 @@ void select_by_blocks(Const panel, Const known, View result) {
   const std::size_t width = panel.rows, below = panel.columns - width;
   const Matrix inverse = inverse_by_blocks(panel), across = transposed(inverse);
   const View own = result.part(0, 0, width, width), rest = result.part(0, width, width, below);
-  product<Into::SET>(own, by_rows(inverse), across, UPPER | LEFT_UPPER);
+  multiply<Into::SET>(own, by_rows(inverse), across, {.is_upper = true, .is_left_upper = true});
   if (below == 0) return;
   Matrix y(width, below), coupled(width, width);
-  product<Into::SET>(y.view(), by_rows(inverse), panel.part(0, width, width, below), LEFT_UPPER);
-  product<Into::SET>(rest, by_rows(y), known);
-  product<Into::SET>(coupled.view(), by_rows(rest), transposed(y), UPPER);
+  multiply<Into::SET>(y.view(), by_rows(inverse), panel.part(0, width, width, below), {.is_left_upper = true});
+  multiply<Into::SET>(rest, by_rows(y), known);
+  multiply<Into::SET>(coupled.view(), by_rows(rest), transposed(y), {.is_upper = true});
   for (std::size_t k = 0; k < width; k++)
     for (std::size_t later = k; later < width; later++) own[k][later] += coupled[k][later];
   negate(rest);
@@ -257,9 +159,9 @@ void select(Const panel, Const known, View result) {
   const Matrix y = over_own_triangle(panel), across = transposed(y);
   const View own = result.part(0, 0, width, width), rest = result.part(0, width, width, below);
   const Const y_below = y.view().part(0, width, width, below);
-  product<Into::SUBTRACT>(rest, by_rows(y_below), known);
-  product<Into::ADD>(own, by_rows(y), across.view().part(0, 0, width, width), UPPER | LEFT_UPPER);
-  product<Into::SUBTRACT>(own, by_rows(y_below), transposed(rest), UPPER);
+  multiply<Into::SUBTRACT>(rest, by_rows(y_below), known);
+  multiply<Into::ADD>(own, by_rows(y), across.view().part(0, 0, width, width), {.is_upper = true, .is_left_upper = true});
+  multiply<Into::SUBTRACT>(own, by_rows(y_below), transposed(rest), {.is_upper = true});
 }
 
 // Overwrites x with L_JJ⁻¹ x; by_sums: the products of blocks are subtracted as a whole.
@@ -269,7 +171,7 @@ void solve_forward(Const panel, View x, std::size_t block, bool by_sums) {
     const std::size_t end = std::min(begin + block, width);
     for (std::size_t first = begin; first < end; first += HIGH) {
       const std::size_t behind = std::min(first + HIGH, end);
-      product<Into::SUBTRACT>(x.part(first, 0, behind - first, x.columns),
+      multiply<Into::SUBTRACT>(x.part(first, 0, behind - first, x.columns),
                               by_columns(panel.part(begin, first, first - begin, behind - first)),
                               x.part(begin, 0, first - begin, x.columns));
       for (std::size_t k = first; k < behind; k++) {
@@ -280,7 +182,7 @@ void solve_forward(Const panel, View x, std::size_t block, bool by_sums) {
     }
     const Left later = by_columns(panel.part(begin, end, end - begin, width - end));
     if (by_sums)
-      product<Into::SUBTRACT_SUM>(x.part(end, 0, width - end, x.columns), later, x.part(begin, 0, end - begin, x.columns));
+      multiply<Into::SUBTRACT_SUM>(x.part(end, 0, width - end, x.columns), later, x.part(begin, 0, end - begin, x.columns));
   }
 }
 
@@ -343,7 +245,7 @@ Cholesky::Cholesky(std::shared_ptr<const Pattern> pattern, Values values)
     for (std::size_t first = 0; first < below; first += HIGH) {
       const std::size_t high = std::min(HIGH, below - first), wide = below - first;
       const Const rest = from.part(0, width + first, width, wide);
-      product<Into::SET>({update.data(), high, wide, wide}, by_columns(rest), rest);
+      multiply<Into::SET>({update.data(), high, wide, wide}, by_columns(rest), rest);
       for (std::size_t j = 0; j < high; j++) {
         double* column = panels_.data() + reached.column(first + j);
         const double* sums = update.data() + j * wide;
@@ -377,7 +279,7 @@ void Cholesky::forward(Columns& x) const {
     } else {
       const View local = x.local.view();
       solve_forward(L, local.part(0, 0, width, many), width, false);
-      product<Into::SUBTRACT>(local.part(width, 0, below, many), by_columns(L.part(0, width, width, below)),
+      multiply<Into::SUBTRACT>(local.part(width, 0, below, many), by_columns(L.part(0, width, width, below)),
                               local.part(0, 0, width, many));
     }
     for (std::size_t i = 0; i < L.columns; i++) std::copy_n(x.local[i], many, x.x[rows[i]]);
@@ -513,12 +415,12 @@ Matrix Cholesky::inverse_among(Indices requested) const {
     const View own = solution.view().part(nodes.columns_of[s], begin, width, count);
     solve_forward(L, own, BLOCK, true);
     Matrix reached(below, count);
-    product<Into::SET>(reached.view(), by_columns(L.part(0, width, width, below)), own);
+    multiply<Into::SET>(reached.view(), by_columns(L.part(0, width, width, below)), own);
     const Indices rows = nodes.rows(s).subspan(width);
     for (std::size_t i = 0; i < below; i++)
       for (std::size_t c = 0; c < count; c++) solution[rows[i]][begin + c] -= reached[i][c];
     Matrix squares(count, count);
-    product<Into::SET>(squares.view(), by_columns(own), own, UPPER);
+    multiply<Into::SET>(squares.view(), by_columns(own), own, {.is_upper = true});
     for (std::size_t i = 0; i < count; i++)
       for (std::size_t c = i; c < count; c++) result[begin + i][begin + c] += squares[i][c];
   }

@@ -213,7 +213,7 @@ def assign_jointly(
         longer = [more for one in beam for more in _extend(one, own, others, profile, most_sd)]
         longer.sort(key=lambda one: -one.weight)
         best = longer[0].weight
-        lost += sum(float(core.exp(one.weight - best)) for one in longer[BEAM:])
+        lost += sum(core.exp(one.weight - best) for one in longer[BEAM:])
         beam = [one for one in longer[:BEAM] if one.weight > best - HOPELESS]
     pairs = []
     for pair in _accept_agreed(part, beam, profile, lost):
@@ -285,7 +285,7 @@ def _accept_agreed(
         same = _find_fragments(best.joint, pair.second, profile)
         having = np.array([each.get(pair.first, -1) in same for each in others])
         against = float(weights[~having].sum()) + lost
-        odds = float(core.log(weights[having].sum() / against)) if against > 0.0 else HOPELESS
+        odds = core.log(weights[having].sum() / against) if against > 0.0 else HOPELESS
         if odds >= profile.odds:
             sure.append(pair._replace(rival=pair.llr - odds))
     alone = sure if len(sure) == len(best.pairs) else _evaluate_alone(part, sure, profile)

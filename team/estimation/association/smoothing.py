@@ -96,7 +96,7 @@ def _linearise_motions(
     before = np.concatenate((np.zeros((1, 3)), poses[:-1]))
     went = np.column_stack((relative_to(before, poses[:, :2]), poses[:, 2] - before[:, 2]))
     error = np.column_stack((relative_to(motions, went[:, :2]), went[:, 2] - motions[:, 2]))
-    error[:, 2] = _wrap(error[:, 2])
+    error[:, 2] = wrapped(error[:, 2])
     back = np.zeros((k, 3, 3))  # −Ad(went⁻¹): the earlier pose's error at the later one
     turned = rotations(went[:, 2]).transpose(0, 2, 1)
     shift = -np.einsum("kij,kj->ki", turned, went[:, :2])
@@ -118,13 +118,9 @@ def _linearise_motions(
     return information, gradient, float(np.einsum("ki,ki->", error, W_error))
 
 
-def _wrap(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return np.array([wrapped(float(angle)) for angle in angles])
-
-
 def _apply_step(
     poses: Float[np.ndarray, "K 3"], steps: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "K 3"]:
     xi = steps.reshape(-1, 3)
     went = np.einsum("kij,kj->ki", rotations(poses[:, 2]), xi[:, :2])
-    return np.column_stack((poses[:, :2] + went, _wrap(poses[:, 2] + xi[:, 2])))
+    return np.column_stack((poses[:, :2] + went, wrapped(poses[:, 2] + xi[:, 2])))

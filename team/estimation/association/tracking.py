@@ -243,7 +243,7 @@ def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Covariance of a motion with a slip of about this (forward, left, turn): the slip is its
     standard deviation, at least LEAST_SLIP.
     """
-    metres = max(float(core.hypot(*slip[:2])), LEAST_SLIP)
+    metres = max(core.hypot(*slip[:2]), LEAST_SLIP)
     turn = max(abs(float(slip[2])), LEAST_SLIP)
     return np.diag([core.squared(metres), core.squared(metres), core.squared(turn)])
 

@@ -156,8 +156,8 @@ def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np
         weight = np.bincount(at, minlength=len(fullest))
         x = np.bincount(at, some[:, 0], len(fullest)) / weight
         y = np.bincount(at, some[:, 1], len(fullest)) / weight
-        cosine = np.bincount(at, core.cos(some[:, 2]), len(fullest))
-        sine = np.bincount(at, core.sin(some[:, 2]), len(fullest))
+        cosine: Float[np.ndarray, " n"] = np.bincount(at, core.cos(some[:, 2]), len(fullest))
+        sine: Float[np.ndarray, " n"] = np.bincount(at, core.sin(some[:, 2]), len(fullest))
         peaks += list(np.column_stack([x, y, core.atan2(sine, cosine)]))
     return peaks
 

@@ -72,7 +72,7 @@ def redrawn(
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
     """Effective number of the particles' ancestors at the window's first keyframe."""
     _, ancestor = np.unique(window.paths[0], axis=0, return_inverse=True)
-    shares = np.bincount(ancestor.ravel(), weights)
+    shares: Float[np.ndarray, " n"] = np.bincount(ancestor.ravel(), weights)
     return 1.0 / float(dense.product(shares, shares))
 
 

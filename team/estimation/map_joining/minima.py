@@ -177,7 +177,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
             p = a + turned * np.conj(p - a)
             state = island.state.copy()
             state[at], state[at + 1] = p.real, p.imag
-            state[at + 2] = [wrapped(np.angle(turned) - h) for h in island.state[at + 2].tolist()]
+            state[at + 2] = wrapped(np.angle(turned) - island.state[at + 2])
             yield replace(island, state=state)
 
 
@@ -249,7 +249,7 @@ def is_another_minimum(one: Minimum, best: Minimum) -> bool:
 def _difference(one: Island, other: Island) -> Values:
     difference: Values = one.state - other.state
     headings = one.graph.headings
-    difference[headings] = [wrapped(float(turn)) for turn in difference[headings]]
+    difference[headings] = wrapped(difference[headings])
     return difference
 
 

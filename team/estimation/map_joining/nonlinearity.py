@@ -111,7 +111,7 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
     for walked, rise in profile(island, node):
         pose = walked.state[at : at + 3]
         eta = logarithm(compose(inverse(mean), pose))
-        distance = float(core.hypot(*(pose - mean)[:2]))
+        distance = core.hypot(*(pose - mean)[:2])
         found.append(
             UnderstatedUncertainty(
                 distance, rise, float(dense.product(dense.product(eta, metric), eta))
