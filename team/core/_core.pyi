@@ -136,7 +136,7 @@ def hypot(x: float, y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 class WholeMap:
     """
-    N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.
     """
 
     def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
@@ -253,8 +253,8 @@ def check_pose_covariance(data: bytes, what: str) -> None:
     """
     Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.
 
-    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding
-    error of a matrix with a unit diagonal.
+    Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the
+    rounding error of a matrix with a unit diagonal.
     """
 
 def check_packed_covariance(data: bytes, n: int, what: str) -> None:

@@ -21,6 +21,10 @@ PROGRAMS = {
         ("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
     ),
     "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
+    "bits_maps": (
+        "5b4d4dd12f244a66",
+        ("own_map", "chain", "submap_factor", "dense", "gaussian"),
+    ),
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
 }
 """Hash of all results of a program in this folder, equal to the bits of the Numba kernels before

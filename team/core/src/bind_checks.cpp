@@ -47,8 +47,8 @@ using Count = std::optional<std::size_t>;
 Floats finite_floats(const nb::bytes& data, const char* what, Count count) {
   const Floats values(data, what);
   if (count && values.count != *count)
-    refuse("wrong length",
-           std::string(what) + " has " + std::to_string(values.count) + " numbers, " + std::to_string(*count) + " expected");
+    refuse("wrong length", std::string(what) + " has " + std::to_string(values.count) + " numbers, " +
+                               std::to_string(*count) + " expected");
   for (std::size_t i = 0; i < values.count; i++)
     if (!std::isfinite(values[i])) refuse("not finite", what);
   return values;
@@ -137,8 +137,8 @@ void check_blocks(const nb::bytes& data, std::size_t count, const char* what) {
 
 void bind_checks(nb::module_& m) {
   m.def(
-      "check_finite", [](const nb::bytes& data, const char* what, Count count) { finite_floats(data, what, count); }, "data"_a,
-      "what"_a, "count"_a = nb::none(), "Raise ValueError unless there are `count` float64, all finite.");
+      "check_finite", [](const nb::bytes& data, const char* what, Count count) { finite_floats(data, what, count); },
+      "data"_a, "what"_a, "count"_a = nb::none(), "Raise ValueError unless there are `count` float64, all finite.");
   m.def("check_angles", check_angles, "data"_a, "what"_a, "count"_a,
         "Raise ValueError unless there are `count` angles in [-pi, pi].");
   m.def("check_ranges", check_ranges, "data"_a, "what"_a, "count"_a = nb::none(),
@@ -146,11 +146,12 @@ void bind_checks(nb::module_& m) {
   m.def("check_named", check_named, "data"_a, "what"_a,
         "Raise ValueError if an id is that of a landmark without identity, 2^31 or larger.\n\n"
         "A window assigns these numbers itself, so they would collide.");
-  m.def("check_ascending", check_ascending, "data"_a, "what"_a, "Raise ValueError unless the ids are strictly ascending.");
+  m.def("check_ascending", check_ascending, "data"_a, "what"_a,
+        "Raise ValueError unless the ids are strictly ascending.");
   m.def("check_pose_covariance", check_pose_covariance, "data"_a, "what"_a,
         "Raise ValueError unless nine float64 form a symmetric positive definite 3 x 3 matrix.\n\n"
-        "Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the rounding\n"
-        "error of a matrix with a unit diagonal.");
+        "Symmetry is judged by the standard deviations, |P_ij - P_ji| <= 1e-9 sigma_i sigma_j; a pivot by the\n"
+        "rounding error of a matrix with a unit diagonal.");
   m.def("check_packed_covariance", check_packed_covariance, "data"_a, "n"_a, "what"_a,
         "Raise ValueError unless a packed upper triangle is a positive definite n x n matrix.");
   m.def("check_blocks", check_blocks, "data"_a, "count"_a, "what"_a,

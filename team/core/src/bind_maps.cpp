@@ -14,7 +14,8 @@ using ViewIds = nb::ndarray<nb::numpy, const std::uint32_t, nb::ndim<1>, nb::c_c
 
 LocalMap submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
   const std::size_t n = mean.size();
-  check(n >= 3 + 2 * ids.size() && (n - 2 * ids.size()) % 3 == 0, "mean must be of poses (x, y, theta), then of each landmark");
+  check(n >= 3 + 2 * ids.size() && (n - 2 * ids.size()) % 3 == 0,
+        "mean must be of poses (x, y, theta), then of each landmark");
   check(covariance.shape(0) == n && covariance.shape(1) == n, "covariance must be (n, n) of a mean of n numbers");
   for (std::size_t k = 1; k < ids.size(); k++) check(ids(k - 1) < ids(k), "ids must ascend");
   return {{ids.data(), ids.size()}, {mean.data(), n}, matrix_of(covariance)};
@@ -30,11 +31,12 @@ LocalMap bare_submap_of(const Ids& ids, const Numbers& mean, const Table& covari
 
 void bind_maps(nb::module_& m) {
   nb::class_<WholeMap>(m, "WholeMap",
-                       "N(mean, covariance) of (pose, landmarks by ascending id) in one frame [m, rad]; it does not change.")
+                       "N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.")
       .def("__init__",
            [](WholeMap* self, const Ids& ids, const Numbers& mean, const Table& covariance) {
              const LocalMap of = bare_submap_of(ids, mean, covariance);
-             new (self) WholeMap{{of.ids.begin(), of.ids.end()}, {of.mean.begin(), of.mean.end()}, dense::Matrix(of.covariance)};
+             new (self) WholeMap{
+                 {of.ids.begin(), of.ids.end()}, {of.mean.begin(), of.mean.end()}, dense::Matrix(of.covariance)};
            },
            "ids"_a.noconvert(), "mean"_a, "covariance"_a)
       .def_prop_ro("ids", [](WholeMap& self) { return ViewIds(self.ids.data(), {self.ids.size()}, nb::find(self)); },
@@ -51,10 +53,8 @@ void bind_maps(nb::module_& m) {
       .def(
           "pose",
           [](const WholeMap& self) {
-            std::vector<double> covariance;
-            for (std::size_t i = 0; i < 3; i++) covariance.insert(covariance.end(), self.covariance[i], self.covariance[i] + 3);
             return std::tuple(made_numbers({self.mean.begin(), self.mean.begin() + 3}),
-                              made<double, nb::ndim<2>>(std::move(covariance), {3, 3}));
+                              made_matrix(dense::Matrix(self.covariance.view().part(0, 0, 3, 3))));
           },
           "Copy mean (3,) and covariance (3, 3) of the pose.")
       .def(
@@ -114,7 +114,9 @@ void bind_maps(nb::module_& m) {
       .def_prop_ro("known", [](const ChainSolution& self) { return Places{self.known}; },
                    "For each submap, the number of its landmarks that another map has, too.")
       .def_prop_ro("landmark_chi2",
-                   [](ChainSolution& self) { return View1(self.landmark_chi2.data(), {self.landmark_chi2.size()}, nb::find(self)); },
+                   [](ChainSolution& self) {
+                     return View1(self.landmark_chi2.data(), {self.landmark_chi2.size()}, nb::find(self));
+                   },
                    "Chi-squared of each landmark of the submaps by its own covariance.")
       .def_prop_ro("fault", [](const ChainSolution& self) { return int(self.fault); },
                    "0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.")

@@ -29,8 +29,9 @@ double largest(const Numbers& x) {
 
 // The unknowns: the origin (which stays zero), the end pose of each map, the landmarks by ascending id.
 struct Chain::Problem {
+  // damping: for the next step. change: the largest of the full step; NaN where an unknown is undetermined.
   struct Step {
-    double damping, change;  // for the next step; the largest change of the full one, NaN where an unknown is undetermined
+    double damping, change;
   };
 
   const std::vector<Link>& links;

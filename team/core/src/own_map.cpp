@@ -101,7 +101,8 @@ std::optional<Matrix> inverse(const Matrix& S) {
 // Iterates the EKF update by the constraints; returns whether S is positive definite.
 //
 // mean: (t, θ, a₁, a₂, …); seen: (b₁, b₂, …), the same landmarks in the submap.
-bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, const Matrix& of_seen, Constraints& found) {
+bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, const Matrix& of_seen,
+         Constraints& found) {
   const std::size_t m = seen.size();
   Numbers state = mean, local = seen, y(m);
   found.lever.resize(m);
@@ -269,10 +270,10 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   // The covariance of (map, submap) after the update: P less P Hᵀ S⁻¹ H P.
   const Matrix map_gain = dense::product(U, found.tie.inverse), gain = dense::product(V, found.tie.inverse);
   const Matrix Ut = dense::transposed(U), Vt = dense::transposed(V);
-  Matrix whole = map.covariance, local(submap.covariance);
+  Matrix whole = map.covariance, local(submap.covariance), cross(n, m);
   subtract(whole, dense::product(map_gain, Ut));
   subtract(local, dense::product(gain, Vt));
-  const Matrix cross = dense::product(dense::negative(map_gain), Vt);
+  subtract(cross, dense::product(map_gain, Vt));
   // The new pose and the new landmarks are made of (pose, submap).
   Matrix own(3 + m, 3 + m), with_old(old, 3 + m);
   put(own.view().part(0, 0, 3, 3), whole.view().part(0, 0, 3, 3));
@@ -323,7 +324,8 @@ TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate) {
   put(gain.view().part(0, 0, 3, m), of_map(found.covariance.view().part(0, 0, 3, 3 + m), found.tie.lever));
   put(gain.view().part(3, 0, 3, m),
       of_submap(part(submap.covariance, up_to(3), found.sights), found.tie.sine, found.tie.cosine));
-  const double before[6] = {found.mean[0], found.mean[1], found.mean[2], submap.mean[0], submap.mean[1], submap.mean[2]};
+  Numbers before(found.mean.begin(), found.mean.begin() + 3);
+  before.insert(before.end(), submap.mean.begin(), submap.mean.begin() + 3);
   const Numbers state = moved(before, gain, z);
   put(joint.view().part(0, 0, 3, 3), found.covariance.view().part(0, 0, 3, 3));
   put(joint.view().part(3, 3, 3, 3), submap.covariance.part(0, 0, 3, 3));

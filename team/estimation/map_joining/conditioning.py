@@ -74,22 +74,15 @@ class SubmapCorrection(NamedTuple):
         The remaining uncertainty of b is taken as independent of the map; the true correlation
         makes this covariance rather too large than too small. A bias without an estimate is zero.
         """
-        known = [each for each in self.biases if each[0] in local.biases]
-        if not known and self.covariance_factor == 1.0 and not local.biases:
+        if self.covariance_factor == 1.0 and not local.biases:
             return local
-        if not known:
-            return LocalMap(
-                local.ids,
-                local.mean,
-                self.covariance_factor * local.covariance,
-                local.node_stamps,
-            )
+        known = [each for each in self.biases if each[0] in local.biases]
         mean, covariance = core.corrected(
             local.mean,
             local.covariance,
             self.covariance_factor,
             local.sensitivity[[local.biases.index(name) for name, _, _ in known]],
-            np.array([(value, sigma) for _, value, sigma in known]),
+            np.array([(value, sigma) for _, value, sigma in known]).reshape(-1, 2),
         )
         return LocalMap(local.ids, mean, covariance, local.node_stamps)
 
