@@ -184,7 +184,7 @@ void bind_graph(nb::module_& m) {
         [](const Table& a, const Table& b, const Changed& c, bool upper, bool lower) {
           check(a.shape(1) == b.shape(0), "a must have as many columns as b has rows");
           check(c.shape(0) >= a.shape(0) && c.shape(1) >= b.shape(1), "the sum must have room for the product");
-          dense::add_product(matrix_of(a), matrix_of(b), {c.data(), c.shape(0), c.shape(1), c.shape(1)}, {upper, lower});
+          dense::add_product(matrix_of(a), matrix_of(b), {c.data(), a.shape(0), b.shape(1), c.shape(1)}, {upper, lower});
         },
         "a"_a, "b"_a, nb::arg("c").noconvert(), "upper"_a = false, "lower"_a = false,
         "Add A B to the first rows and columns of C, in place; each entry adds its terms in order.\n\n"
