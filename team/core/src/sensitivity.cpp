@@ -33,7 +33,8 @@ Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<doub
   const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
   const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
   const auto of_landmark = models::landmark_jacobian(d, direction);
-  Sight sight{z.keyframe, landmark, d, 0.0, {{}, noise.range_variance + noise.range_per_m2 * d * d}, {{}, noise.bearing_variance}};
+  const double range_variance = noise.range_variance + noise.range_per_m2 * d * d;
+  Sight sight{z.keyframe, landmark, d, 0.0, {{}, range_variance}, {{}, noise.bearing_variance}};
   const auto set = [](Line& line, const std::array<double, 3>& by_pose, const std::array<double, 2>& by_landmark) {
     std::copy(by_pose.begin(), by_pose.end(), line.H);
     std::copy(by_landmark.begin(), by_landmark.end(), line.H + 3);
