@@ -59,7 +59,7 @@ class OdometryInterval(NamedTuple):
         if self.moved is None:
             return self.forward
         forward, left, _ = self.moved.twist.tolist()
-        return core.hypot(forward, left) / (self.duration_ns * 1e-9)
+        return core.hypot(float(forward), float(left)) / (self.duration_ns * 1e-9)
 
 
 STANDING = OdometryInterval(0, 1, 0.0, 0.0)
