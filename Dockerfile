@@ -10,6 +10,7 @@ COPY pyproject.toml README.md LICENSE hashes-run.txt hashes-zig.txt ./
 COPY team team
 COPY central central
 COPY sim sim
+COPY teamslam teamslam
 # What is installed is known by its hash beforehand, what builds the wheel too.
 # The slim image has no C++ compiler: that of the ziglang wheel builds the core, for any x86-64.
 RUN sed -n '/^\(pip\|cmake\|nanobind\|ninja\|packaging\|pathspec\|scikit-build-core\)==/,/[^\\]$/p' hashes-run.txt > build.txt \

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.baseline import worse
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 
 CHANNELS = (ch.SUBMAP, ch.FUSED_MAP, ch.PRIOR, ch.CENTRAL_PROGRESS, ch.STATUS)
 Submap = tuple[str, int, int]
@@ -90,7 +90,7 @@ def _first(
 def launched(folder: Path) -> Path:
     words = ["launch", "waypoints", "--speed", "10", "--no-report", "--no-views"]
     subprocess.run(
-        [sys.executable, "-P", "-m", "sim", *words, "--output", str(folder)],
+        [sys.executable, "-P", "-m", "teamslam", *words, "--output", str(folder)],
         check=True,
         stdout=sys.stderr,
     )

@@ -23,19 +23,19 @@ from typing import Any
 import numpy as np
 
 from benchmarks.baseline import worse
-from central.config import CentralConfig
-from central.map_publisher import MapPublisher
-from central.submap_fold import SubmapFold
-from team import translate
-from team.association import profile_for
-from team.config import UNNAMED, AssociationSettings, Sensor
-from team.estimation.association.clustering import associate_window
-from team.estimation.association.scans import UNASSIGNED, Scans
-from team.estimation.submap import LocalMap, Unnamed
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, ids
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.team import translate
+from teamslam.team.association import profile_for
+from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
+from teamslam.team.estimation.association.clustering import associate_window
+from teamslam.team.estimation.association.scans import UNASSIGNED, Scans
+from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
 
 TICK_S = 10.0
 WINDOW = 25

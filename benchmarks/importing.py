@@ -18,9 +18,9 @@ from pathlib import Path
 from rosbags.highlevel import AnyReader
 
 from benchmarks.baseline import worse
-from sim.importing.bag import import_bag
-from team.ros2.decoding import READERS, DamagedError, decode
-from team.ros2.definitions import types
+from teamslam.sim.importing.bag import import_bag
+from teamslam.team.ros2.decoding import READERS, DamagedError, decode
+from teamslam.team.ros2.definitions import types
 from tests.ros2 import messages as ros
 from tests.ros2.test_decoding import SAMPLES
 

@@ -22,14 +22,14 @@ from typing import Any
 import msgspec
 
 from benchmarks.baseline import worse
-from central.desk.verification.verification import verify
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.config import SimulatedWorld
-from team.recording.provenance import provenance
-from team.recording.reader import open_log
-from team.recording.recorder import Recorder
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team.recording.provenance import provenance
+from teamslam.team.recording.reader import open_log
+from teamslam.team.recording.recorder import Recorder
 
 BASE = 50
 LANDMARKS = 18

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from sim.in_memory.air import Air, Reach, always
-from team.peers.members import Member, about
-from team.peers.node import PeerNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from teamslam.sim.in_memory.air import Air, Reach, always
+from teamslam.team.peers.members import Member, about
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
 
 BASELINE = Path(__file__).with_suffix(".json")
 DRIVE_S = 300

@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.baseline import concluded
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
-from team.estimation.hybrid_slam.innovation import innovation
-from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.models import Increment, increment_of
-from team.estimation.odometry import OdometryInterval
-from team.robot.node import RobotNode
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
+from teamslam.team.estimation.hybrid_slam.innovation import innovation
+from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
 
 MOTION = MotionModel(forward=MotionNoise(per_m=0.03), turn=MotionNoise(per_rad=0.1))
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)

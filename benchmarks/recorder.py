@@ -21,19 +21,19 @@ from typing import Any
 import numpy as np
 
 from benchmarks.baseline import concluded
-from sim.scenarios.scenario import dumps, load, with_options
-from team.recording.check import check_log
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.scenarios.scenario import dumps, load, with_options
+from teamslam.team.recording.check import check_log
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.zenoh.bus import ZenohBus
 
 PUBLISHERS = 2
 LANDMARKS = 5
 """Landmarks per observation."""
-_COMMAND = [sys.executable, "-m", "sim"]
+_COMMAND = [sys.executable, "-m", "teamslam"]
 
 
 def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds: float) -> None:

@@ -16,8 +16,8 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from central.desk.verification.verification import verify
-from team.recording.reader import LogError, open_log
+from teamslam.central.desk.verification.verification import verify
+from teamslam.team.recording.reader import LogError, open_log
 
 LEAST = 35.0
 """× real time for a team of five."""

@@ -4,8 +4,8 @@
 
 Links: router, publisher and receiver, each a process with Zenoh on loopback; alternately over open
 TCP, and over TLS with access control. Throughput: observations of five landmarks at the receiver's
-rate. Latency: round trip of one message at rest. Boundary: a node with `team.containment` and
-without it; CPU time, the least of alternating turns.
+rate. Latency: round trip of one message at rest. Boundary: a node with `teamslam.team.containment`
+and without it; CPU time, the least of alternating turns.
 
 Only ratios have a baseline (benchmarks/security.json): both halves depend on the machine.
 """
@@ -25,17 +25,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks.baseline import worse
-from team.containment import Boundary
-from team.keys.authority import make_keys
-from team.keys.credentials import credentials_of
-from team.keys.roster import load_roster, nodes_of
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing, Sample, opened
-from team.wire.codec import encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.containment import Boundary
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import load_roster, nodes_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing, Sample, opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 
 TEAM = "bench"
 PINGS = 500

@@ -21,12 +21,12 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.baseline import concluded
-from sim.launch.launch import launch
-from sim.launch.plan import Plan
-from sim.launch.processes import PROGRAM, Starter
-from sim.scenarios.scenario import Scenario, load, with_options
-from team.recording.reader import open_log
-from team.wire.channels import SENSORS
+from teamslam.sim.launch.launch import launch
+from teamslam.sim.launch.plan import Plan
+from teamslam.sim.launch.processes import PROGRAM, Starter
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire.channels import SENSORS
 
 
 def launched(scenario: Scenario, folder: Path) -> dict[str, Any]:

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from central.robot_attendance import Attendance, Awaited, Least, note
-from team.wire import messages as m
-from team.wire.newer import further, later_end, later_head
+from teamslam.central.robot_attendance import Attendance, Awaited, Least, note
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.newer import further, later_end, later_head
 
 _OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
 HasReceived = Callable[[m.Done], bool]

@@ -16,18 +16,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
-from team import core
-from team.config import UNNAMED
-from team.estimation import dense
-from team.estimation.contribution import Contribution, moment
-from team.estimation.gaussian import NotACovarianceError, information
-from team.estimation.map_joining.alignment import Alignment, aligned
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.landmark_view import known
-from team.estimation.map_joining.marginals import landmark_blocks
-from team.estimation.se2 import compose, wrapped
-from team.estimation.submap import LocalMap
+from teamslam.central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Contribution, moment
+from teamslam.team.estimation.gaussian import NotACovarianceError, information
+from teamslam.team.estimation.map_joining.alignment import Alignment, aligned
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import known
+from teamslam.team.estimation.map_joining.marginals import landmark_blocks
+from teamslam.team.estimation.se2 import compose, wrapped
+from teamslam.team.estimation.submap import LocalMap
 
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the map: two also fit their mirror image."""

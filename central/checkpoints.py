@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass, replace
 
-from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
+from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
 
 NEWEST = 4
 """Number of newest ticks whose checkpoints are all kept; of older ones as many per doubling of

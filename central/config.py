@@ -5,8 +5,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.association import AssociationProfile
-from team.config import Bounds, FusionRule, NonNegative, Positive
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,16 +40,17 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fusion rule and its parameters.
 
-    fusion: `join` joins submaps by least squares; `team.pairs` lists the inputs of the others.
-    Under rules with feedback the robots' covariance counts measurements more than once, save that
-    of `covariance-intersection`. tick_s: span of team time that is folded at once. broadcast_s:
-    least team time between two broadcasts of the map. robust_c: scale of the Cauchy loss on
-    sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a range and a
-    bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a landmark
-    needs to enter the map; above 1 where outliers are expected. covariance_factor: scales the
-    submaps' covariances; 1 for errors independent from measurement to measurement. normal_scale:
-    the monitor's covariance scale where the covariances are right: 1 where the errors of windows
-    are independent; less where part of them outlasts a window. particles: of `joint-fastslam`.
+    fusion: `join` joins submaps by least squares; `teamslam.team.pairs` lists the inputs of the
+    others. Under rules with feedback the robots' covariance counts measurements more than once,
+    save that of `covariance-intersection`. tick_s: span of team time that is folded at once.
+    broadcast_s: least team time between two broadcasts of the map. robust_c: scale of the Cauchy
+    loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a range
+    and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a
+    landmark needs to enter the map; above 1 where outliers are expected. covariance_factor: scales
+    the submaps' covariances; 1 for errors independent from measurement to measurement.
+    normal_scale: the monitor's covariance scale where the covariances are right: 1 where the errors
+    of windows are independent; less where part of them outlasts a window. particles: of
+    `joint-fastslam`.
     bias_sigma: of the errors whose sensitivities robots send. common_bias_sigma: of the part of
     them that all robots share, in addition. joined_ranges: for errors proportional to the range,
     weight a submap's landmarks by the range in the joined map: weighted by the measured range,

@@ -7,15 +7,15 @@ fold without some robots reads the same inputs.
 import math
 from collections.abc import Collection, Mapping, Sequence
 
-from central.config import CentralConfig
-from central.members import Members
-from team.estimation.association.landmark_sets import Verdict
-from team.estimation.contribution import Contribution, Stream, named
-from team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
-from team.estimation.map_joining.relinearising import restore_submaps
-from team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
-from team.wire.digest import digest_of
-from team.wire.messages import SightingFactor, Submap
+from teamslam.central.config import CentralConfig
+from teamslam.central.members import Members
+from teamslam.team.estimation.association.landmark_sets import Verdict
+from teamslam.team.estimation.contribution import Contribution, Stream, named
+from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
+from teamslam.team.estimation.map_joining.relinearising import restore_submaps
+from teamslam.team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from teamslam.team.wire.digest import digest_of
+from teamslam.team.wire.messages import SightingFactor, Submap
 
 
 class FoldInputs:

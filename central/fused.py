@@ -2,12 +2,12 @@
 
 import msgspec
 
-from central.config import CentralConfig
-from team import translate
-from team.estimation.gaussian import LandmarkGaussian
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import unsound
+from teamslam.central.config import CentralConfig
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import unsound
 
 START_POSES = "start poses"
 """The frame of a map that lies in the frame of the given initial poses."""

@@ -8,31 +8,31 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from central.config import CentralConfig
-from central.fused import JOINT_LANDMARKS, version_entry
-from central.monitor import miscalibrations
-from central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
-from team import translate
-from team.config import UNNAMED
-from team.estimation.association.verification import find_possible_duplicates
-from team.estimation.contribution import Stream, named
-from team.estimation.map_joining import landmark_view, marginals
-from team.estimation.map_joining.alignment import SharedPoints
-from team.estimation.map_joining.distinctness import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import JOINT_LANDMARKS, version_entry
+from teamslam.central.monitor import miscalibrations
+from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
+from teamslam.team import translate
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.verification import find_possible_duplicates
+from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.map_joining import landmark_view, marginals
+from teamslam.team.estimation.map_joining.alignment import SharedPoints
+from teamslam.team.estimation.map_joining.distinctness import (
     find_lost_streams,
     find_missed,
     find_weakly_placed,
 )
-from team.estimation.map_joining.fold_association import view_island
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.marginals import BiasEstimate
-from team.estimation.map_joining.misfits import worst_landmark
-from team.estimation.map_joining.refusal import refusals
-from team.estimation.map_joining.repetition import Repetition, find_repetitions
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing
+from teamslam.team.estimation.map_joining.fold_association import view_island
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.marginals import BiasEstimate
+from teamslam.team.estimation.map_joining.misfits import worst_landmark
+from teamslam.team.estimation.map_joining.refusal import refusals
+from teamslam.team.estimation.map_joining.repetition import Repetition, find_repetitions
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing
 
 Tail = Literal["final", "closed", "provisional"]
 """The kind of a map: the last one; one with all submaps up to a time; one with later ones, too."""

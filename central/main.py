@@ -6,17 +6,17 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from central.config import CentralConfig
-from central.node import make_centre
-from central.stored_set import StoredSet
-from team.missing import MissingMeasurements
-from team.shell import WAIT_S, Shell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import ids
-from team.wire.bus import Bus, Outgoing, Sample, opened
-from team.wire.codec import WireError
-from team.wire.patience import Patience
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.central.stored_set import StoredSet
+from teamslam.team.missing import MissingMeasurements
+from teamslam.team.shell import WAIT_S, Shell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids
+from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.patience import Patience
 
 LOST_S = 3.0
 """Time [s] after which a lost robot delays no broadcast; the final map still waits for it."""

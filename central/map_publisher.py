@@ -9,12 +9,12 @@ import math
 from bisect import bisect_right
 from collections.abc import Collection, Mapping
 
-from central.join_messages import Tail
-from central.submap_fold import SubmapFold
-from team.store import Stream
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.join_messages import Tail
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.team.store import Stream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 PATIENCE = 3.0
 """Broadcasts, or ticks if longer, after which a provisional map is published despite a stalled

@@ -11,12 +11,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from weakref import WeakValueDictionary
 
-from team import translate
-from team.estimation.contribution import Contribution
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.plausible import with_least_spread
-from team.wire.digest import Digest
-from team.wire.messages import SightingFactor, Submap
+from teamslam.team import translate
+from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.plausible import with_least_spread
+from teamslam.team.wire.digest import Digest
+from teamslam.team.wire.messages import SightingFactor, Submap
 
 Key = tuple[int, str, int, int]
 STORED_DIGESTS = 4

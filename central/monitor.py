@@ -15,11 +15,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from team import core
-from team.config import Bias
-from team.estimation.consistency import Scale, chi2_quantile, covariance_scale
-from team.estimation.map_joining.condensed_factor import SubmapCost
-from team.estimation.map_joining.marginals import Agreement, BiasEstimate
+from teamslam.team import core
+from teamslam.team.config import Bias
+from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
+from teamslam.team.estimation.map_joining.condensed_factor import SubmapCost
+from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate
 
 WARN = 1.1
 FAIL = 1.3

@@ -6,7 +6,8 @@
             ──> maps         map, priors, withdrawals; at the end the final map
 
 The node subscribes to submaps, progress and liveliness, and to nothing that contains the fused map.
-The centre of a comparison method (`sim.studies.rules`) is a subclass with other inputs and maps.
+The centre of a comparison method (`teamslam.sim.studies.rules`) is a subclass with other inputs and
+maps.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,21 +15,21 @@ from typing import ClassVar
 
 import msgspec
 
-from central.attendance import TeamAttendance
-from central.config import CentralConfig
-from central.fused import fused_message
-from central.map_publisher import MapPublisher
-from central.submap_fold import SubmapFold
-from team.door import Door, absurd
-from team.estimation.gaussian import NO_LANDMARKS
-from team.pairs import RULES
-from team.registry import loaded
-from team.store import Stream, SubmapStore
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
-from team.wire.digest import configured
+from teamslam.central.attendance import TeamAttendance
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import fused_message
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.team.door import Door, absurd
+from teamslam.team.estimation.gaussian import NO_LANDMARKS
+from teamslam.team.pairs import RULES
+from teamslam.team.registry import loaded
+from teamslam.team.store import Stream, SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.digest import configured
 
 MOST_ROBOTS = 100
 """Most robots of a team, admitted ones included."""

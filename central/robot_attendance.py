@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import Generic, TypeVar
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 MOST_NOTED = 1_000
 """Most announced ends of the team, and `Done` messages of a robot, that are stored."""

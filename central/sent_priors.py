@@ -14,10 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team import core
-from team.estimation.contribution import Stream
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.marginals import LandmarkBlocks, landmark_blocks, last_pose
+from teamslam.team import core
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.marginals import (
+    LandmarkBlocks,
+    landmark_blocks,
+    last_pose,
+)
 
 EVERY = 8
 """Most broadcasts between two priors, which bounds the robot's own submaps to join and the delay of

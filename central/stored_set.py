@@ -1,18 +1,18 @@
 """A centre's set on disk: the messages of robots and operators, as they were sent.
 
-The file format is a peer's (`team.peers.set_file`). A restarted centre continues from it: no member
-is sent again, and the same set gives the same map.
+The file format is a peer's (`teamslam.team.peers.set_file`). A restarted centre continues from it:
+no member is sent again, and the same set gives the same map.
 """
 
 import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from team.peers.members import CHANNELS, member_of
-from team.peers.set_file import Keeper
-from team.wire import channels as ch
-from team.wire.bus import Sample
-from team.wire.codec import WireError
+from teamslam.team.peers.members import CHANNELS, member_of
+from teamslam.team.peers.set_file import Keeper
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import WireError
 
 _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
 

@@ -8,9 +8,9 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
-from central.config import CentralConfig
-from central.fused import receivable
-from central.join_messages import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import receivable
+from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
     Tail,
     priors,
@@ -19,19 +19,19 @@ from central.join_messages import (
     team_map,
     trajectories,
 )
-from central.monitor import NOTHING, finding
-from central.sent_priors import SentPriors
-from central.tick_fold import TickFold
-from central.unnamed_landmarks import verdict_of
-from team import translate
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.joining import Fold
-from team.store import Stream, SubmapStore
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded, unsound
-from team.wire.digest import digest_of
+from teamslam.central.monitor import NOTHING, finding
+from teamslam.central.sent_priors import SentPriors
+from teamslam.central.tick_fold import TickFold
+from teamslam.central.unnamed_landmarks import verdict_of
+from teamslam.team import translate
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.store import Stream, SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded, unsound
+from teamslam.team.wire.digest import digest_of
 
 
 class RecordedFields(NamedTuple):

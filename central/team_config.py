@@ -5,8 +5,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from central.config import CentralConfig
-from team.config import Estimator, Exchange, FusionRule, RobotConfig
+from teamslam.central.config import CentralConfig
+from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
 
 KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 """A part of a key, between two slashes."""

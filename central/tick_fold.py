@@ -11,9 +11,9 @@ tick has arrived, so the fold is final.
 Each of the three pieces of state has one owner. The inputs depend on no fold. The checkpoints are a
 stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back, and the ticks are
 folded again. The conviction, the robots that contradict the rest beyond chance
-(`central.withdrawal`), is replaced as a whole; a change folds all ticks again without these robots.
-Agreement is tested after the first tick of each broadcast's time and after the full solution, so a
-withdrawal depends on the set alone, not on order or time of arrival.
+(`teamslam.central.withdrawal`), is replaced as a whole; a change folds all ticks again without
+these robots. Agreement is tested after the first tick of each broadcast's time and after the full
+solution, so a withdrawal depends on the set alone, not on order or time of arrival.
 
 A robot with few submaps is suspended: running maps leave it out at once, but it is withdrawn only
 once it has enough of them, or by the full solution. Until then it is tested again, with all its
@@ -28,11 +28,11 @@ condensed (but see FULL_UNNAMED).
 import math
 from collections.abc import Collection, Mapping, Sequence
 
-from central.carried_off import CarriedOff, carried_off
-from central.checkpoints import Checkpoints
-from central.config import CentralConfig
-from central.fold_inputs import FoldInputs
-from central.withdrawal import (
+from teamslam.central.carried_off import CarriedOff, carried_off
+from teamslam.central.checkpoints import Checkpoints
+from teamslam.central.config import CentralConfig
+from teamslam.central.fold_inputs import FoldInputs
+from teamslam.central.withdrawal import (
     LEAST_SUBMAPS,
     Conviction,
     Suspension,
@@ -40,17 +40,22 @@ from central.withdrawal import (
     find_suspects,
     hold_trial,
 )
-from team.config import BIASES
-from team.estimation.association.landmark_sets import Verdict
-from team.estimation.contribution import Stream
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.auditing import fold_tick
-from team.estimation.map_joining.condensing import LIMITS, Limits
-from team.estimation.map_joining.joining import Fold, InitialPoseFactor, JoinSettings, converged
-from team.estimation.map_joining.marginals import Agreement
-from team.estimation.map_joining.relinearising import is_contradicted, is_due
-from team.estimation.map_joining.submap_graph import CommonBias
-from team.wire.messages import SightingFactor, Submap
+from teamslam.team.config import BIASES
+from teamslam.team.estimation.association.landmark_sets import Verdict
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
+from teamslam.team.estimation.map_joining.joining import (
+    Fold,
+    InitialPoseFactor,
+    JoinSettings,
+    converged,
+)
+from teamslam.team.estimation.map_joining.marginals import Agreement
+from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
+from teamslam.team.estimation.map_joining.submap_graph import CommonBias
+from teamslam.team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""

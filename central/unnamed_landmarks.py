@@ -7,16 +7,16 @@ from itertools import groupby
 
 import numpy as np
 
-from team.estimation.association.landmark_sets import Landmarks, Verdict
-from team.estimation.association.member_log import (
+from teamslam.team.estimation.association.landmark_sets import Landmarks, Verdict
+from teamslam.team.estimation.association.member_log import (
     KINDS,
     LAST,
     LocalLandmark,
     MemberRecord,
     record_of,
 )
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
 
 STEPS = ("", *KINDS)
 """The step that merged an unnamed landmark into a set, by its number on the wire."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
-from team.estimation.map_joining.marginals import Agreement
+from teamslam.team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
 """Least submaps of a robot for a median over all of them, and for its withdrawal before the final

@@ -42,15 +42,15 @@ myst_links_external_new_tab = False
 
 apidoc_modules = [
     {
-        "path": HERE.parent / package,
-        "destination": f"generated/api/{package}",
+        "path": HERE.parent / "teamslam",
+        "destination": "generated/api",
         "separate_modules": False,
         "module_first": True,
-        "max_depth": 1,
+        "max_depth": 2,
+        "follow_links": True,
         "automodule_options": {"members"},
-        "exclude_patterns": [str(HERE.parent / left_out) for left_out in LEFT_OUT],
+        "exclude_patterns": [str(HERE.parent / "teamslam" / left_out) for left_out in LEFT_OUT],
     }
-    for package in ("team", "central", "sim")
 ]
 suppress_warnings = ["ref.python"]  # a type's short name may be that of two classes
 autodoc_member_order = "bysource"
@@ -130,7 +130,16 @@ def _write_commands(app: object) -> None:
     """Write the page of all commands with their options, by Typer."""
     GENERATED.mkdir(exist_ok=True)
     page = GENERATED / "commands.md"
-    command = [sys.executable, "-m", "typer", "sim.cli.main", "utils", "docs", "--name", "teamslam"]
+    command = [
+        sys.executable,
+        "-m",
+        "typer",
+        "teamslam.sim.cli.main",
+        "utils",
+        "docs",
+        "--name",
+        "teamslam",
+    ]
     subprocess.run(  # noqa: S603 - our own command line, no shell
         [*command, "--title", "Commands", "--output", str(page)], check=True, cwd=HERE.parent
     )

@@ -7,22 +7,24 @@ import sys
 
 import numpy as np
 
-import team
+import teamslam
 
 rng = np.random.default_rng(1)
-sensor = team.Sensor(range_sigma=0.1, bearing_sigma=0.02)
-motion = team.MotionModel(forward=team.MotionNoise(per_m=0.05), turn=team.MotionNoise(per_rad=0.05))
+sensor = teamslam.Sensor(range_sigma=0.1, bearing_sigma=0.02)
+motion = teamslam.MotionModel(
+    forward=teamslam.MotionNoise(per_m=0.05), turn=teamslam.MotionNoise(per_rad=0.05)
+)
 landmarks = rng.uniform((-7.0, -3.0), (7.0, 11.0), (8, 2))
-path, particles = [np.zeros(3)], team.particles_at(np.zeros((100, 3)))
+path, particles = [np.zeros(3)], teamslam.particles_at(np.zeros((100, 3)))
 for _ in range(60):  # a keyframe each second: half a metre and an eighth of a radian
-    increment = team.increment_of(motion, duration_s=1.0, forward=0.5, yaw_rate=0.125)
+    increment = teamslam.increment_of(motion, duration_s=1.0, forward=0.5, yaw_rate=0.125)
     moved = rng.multivariate_normal(increment.mean, increment.covariance)
-    path.append(team.compose(path[-1], moved))
-    true = np.array([team.measurement_of(path[-1], landmark) for landmark in landmarks])
+    path.append(teamslam.compose(path[-1], moved))
+    true = np.array([teamslam.measurement_of(path[-1], landmark) for landmark in landmarks])
     seen = np.flatnonzero(true[:, 0] < 6.0).astype(np.uint32)
     ranges, bearings = (true + rng.normal(0.0, (0.1, 0.02), true.shape))[seen].T
-    keyframe = team.Keyframe(increment=increment, ids=seen, ranges=ranges, bearings=bearings)
-    particles, info = team.fastslam_step(particles, keyframe, sensor, rng)
+    keyframe = teamslam.Keyframe(increment=increment, ids=seen, ranges=ranges, bearings=bearings)
+    particles, info = teamslam.fastslam_step(particles, keyframe, sensor, rng)
 
 means = np.tensordot(np.exp(particles.log_weights), particles.means, 1)
 errors = np.linalg.norm(means - landmarks[particles.ids], axis=1)

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 
-from team import (
+from teamslam import (
     InitialPose,
     Keyframe,
     LocalMap,

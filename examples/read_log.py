@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 
-from team import join, open_log, submaps_in
+from teamslam import join, open_log, submaps_in
 
 log = open_log(sys.argv[1])
 print(f"team {log.team}, {'complete' if log.complete else 'its recorder was killed'}")

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import zenoh
 
-from team import submap_in
+from teamslam import submap_in
 
 endpoint, team = sys.argv[1:3]
 links = f'mode: "client", connect: {{endpoints: ["{endpoint}"]}}'

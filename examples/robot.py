@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from team import Driver
+from teamslam import Driver
 
 name, folder, team, endpoint, *pause = sys.argv[1:]
 events, speed = [], [0.0, 0.0]

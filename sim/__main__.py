@@ -1,4 +1,4 @@
-"""`python -m sim` is `teamslam`."""
+"""`python -m teamslam` is `teamslam`."""
 
 import sys
 
@@ -9,7 +9,7 @@ INTERRUPTED = 130
 def main() -> None:
     """Run a command."""
     try:
-        from sim.cli.main import main as run
+        from teamslam.sim.cli.main import main as run
 
         run()
     except KeyboardInterrupt:  # while modules are imported; later a command reports it

@@ -6,7 +6,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.config import GATE, NonNegative, Positive, Sensor, Share
+from teamslam.team.config import GATE, NonNegative, Positive, Sensor, Share
 
 Few = Annotated[int, Meta(ge=1, le=1000)]
 
@@ -17,7 +17,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
     empirical, chosen with DLR and Victoria Park in view (docs/notes/association-with-undo.md).
     `tight`, `same` and `slack` are reduced where a map's landmarks stand closer
-    (`team.estimation.association.density`).
+    (`teamslam.team.estimation.association.density`).
     """
 
     gate: Positive = GATE

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import msgspec
 from msgspec import Meta
 
-from team.pairs import ESTIMATORS, RULES
+from teamslam.team.pairs import ESTIMATORS, RULES
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
@@ -253,7 +253,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Speed of a teammate in between [m/s]."""
     outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     """Share of measurements that are not of their landmark. Above 0 a window uses only measurements
-    that others confirm (`team.estimation.hybrid_slam.outliers`)."""
+    that others confirm (`teamslam.team.estimation.hybrid_slam.outliers`)."""
     biases: tuple[Bias, ...] = ()
     """Errors shared by all of the robot's windows, estimated by the centre; each submap carries its
     derivative by each of them."""

@@ -14,12 +14,12 @@ from functools import cache
 from types import TracebackType
 from typing import Protocol, TypeVar, runtime_checkable
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample, opened
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.logs import LOG
-from team.wire.text import cut, one_line
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample, opened
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.text import cut, one_line
 
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000

@@ -1,14 +1,14 @@
 """Refuse messages that are valid but contradict the team.
 
 A stranger or a broken robot may send unknown robots, unreachable incarnations and counters, or
-stamps that are years off. The boundary (`team.containment`) counts the reason and shows it in the
-node's status; the recorder keeps every message. The bounds are so wide that no order of arrival
-makes a true message fail.
+stamps that are years off. The boundary (`teamslam.team.containment`) counts the reason and shows it
+in the node's status; the recorder keeps every message. The bounds are so wide that no order of
+arrival makes a true message fail.
 """
 
 from collections.abc import Iterable, Iterator
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 MOST_LIVES = 1_000
 """Most incarnations of a stream."""

@@ -1,7 +1,7 @@
 """The estimators as a library of functions on arrays, without processes or network.
 
-`from team import …` provides every name listed here. The changelog announces a change of a name or
-its meaning one version ahead.
+`from teamslam import …` provides every name listed here. The changelog announces a change of a name
+or its meaning one version ahead.
 
 Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points with
 ids, measured by range [m] and bearing [rad].
@@ -16,29 +16,29 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team import translate
-from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.fastslam import (
+from teamslam.team import translate
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.fastslam import (
     Particles,
     Proposal,
     StepInfo,
     propagated_and_updated,
 )
-from team.estimation.hybrid_slam.fastslam import at_poses as particles_at
-from team.estimation.map_joining import joining, marginals
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.marginals import LandmarkMap, Trajectory
-from team.estimation.models import Increment, increment_of, located, scanned
-from team.estimation.models import predicted as measurement_of
-from team.estimation.se2 import compose, inverse
-from team.estimation.submap import LocalMap
-from team.recording.reader import Log, LogError, open_log
-from team.registry import loaded
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import WireError, decoded
+from teamslam.team.estimation.hybrid_slam.fastslam import at_poses as particles_at
+from teamslam.team.estimation.map_joining import joining, marginals
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.marginals import LandmarkMap, Trajectory
+from teamslam.team.estimation.models import Increment, increment_of, located, scanned
+from teamslam.team.estimation.models import predicted as measurement_of
+from teamslam.team.estimation.se2 import compose, inverse
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.recording.reader import Log, LogError, open_log
+from teamslam.team.registry import loaded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import WireError, decoded
 
 __all__ = [
     "BatchMap",
@@ -264,7 +264,7 @@ def batch_map(
     Raises ValueError for a robot without an initial pose.
     Dellaert and Kaess 2006, Square root SAM.
     """
-    solve = loaded("sim.studies.batch_map:solved_map", "batch_map")
+    solve = loaded("teamslam.sim.studies.batch_map:solved_map", "batch_map")
     return cast("BatchMap", solve(keyframes, sensors, initial_poses, robust_c))
 
 

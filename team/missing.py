@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from team.containment import reply_of
-from team.shell import Shell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import BusError
-from team.wire.codec import WireError
+from teamslam.team.containment import reply_of
+from teamslam.team.shell import Shell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.codec import WireError
 
 PATIENCE_S = 0.5
 """Time [s] for which a gap may stay open before it is requested."""

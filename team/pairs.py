@@ -1,7 +1,7 @@
 """The table of estimators and fusion rules, one row each, and which estimator may feed which rule.
 
-A row names its class as `package.module:name`, found by `team.registry` when it is chosen, so the
-methods for comparison can be left out of an installation.
+A row names its class as `package.module:name`, found by `teamslam.team.registry` when it is chosen,
+so the methods for comparison can be left out of an installation.
 """
 
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ maps. measurements: the sensor channels; the robots' estimators are then for the
 
 
 class EstimatorRow(NamedTuple):
-    """made_by: a `sim.studies.robots.estimator.Factory`; of `hybrid` its mapper. feeds: rules,
-    beside those that name it.
+    """made_by: a `teamslam.sim.studies.robots.estimator.Factory`; of `hybrid` its mapper. feeds:
+    rules, beside those that name it.
 
     needs_map: it is given a prior map.
     """
@@ -26,7 +26,8 @@ class EstimatorRow(NamedTuple):
 
 
 class RuleRow(NamedTuple):
-    """made_by: a `central.node.CentralNode`. takes: its estimators, beside those that name it.
+    """made_by: a `teamslam.central.node.CentralNode`. takes: its estimators, beside those that name
+    it.
 
     feedback: the robots absorb its map again, in lockstep.
     """
@@ -37,18 +38,18 @@ class RuleRow(NamedTuple):
     feedback: bool = False
 
 
-COMPARISON_ROBOT = "sim.studies.robots.node:comparison_robot"
+COMPARISON_ROBOT = "teamslam.sim.studies.robots.node:comparison_robot"
 """Makes the robot's node of a pair whose rule does not fuse submaps."""
-_RUNNING = "sim.studies.robots.running:running_estimator"
+_RUNNING = "teamslam.sim.studies.robots.running:running_estimator"
 _WHOLE = ("latest", "alone")
-_ROUNDS = "sim.studies.rules.feedback_rule:RoundsCentre"
-_SVD = "sim.studies.rules.svd_rule:SvdCentre"
+_ROUNDS = "teamslam.sim.studies.rules.feedback_rule:RoundsCentre"
+_SVD = "teamslam.sim.studies.rules.svd_rule:SvdCentre"
 _CHEAP = ("hybrid", "dead-reckoning")
 _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")
 
 ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(
     {
-        "hybrid": EstimatorRow("team.robot.mapper:Mapper"),
+        "hybrid": EstimatorRow("teamslam.team.robot.mapper:Mapper"),
         "hybrid-thesis": EstimatorRow(_RUNNING, _WHOLE),
         "hybrid-thesis-coded": EstimatorRow(_RUNNING, ("alone",)),
         "ekf-slam": EstimatorRow(_RUNNING, _WHOLE),
@@ -60,18 +61,22 @@ ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(
 )
 RULES: Mapping[str, RuleRow] = MappingProxyType(
     {
-        "join": RuleRow("central.node:CentralNode", "submap"),
+        "join": RuleRow("teamslam.central.node:CentralNode", "submap"),
         "kalman": RuleRow(_ROUNDS, "own/map", feedback=True),
         "kalman-per-axis": RuleRow(_ROUNDS, "own/map", _PER_AXIS, feedback=True),
         "covariance-intersection": RuleRow(_ROUNDS, "own/map", feedback=True),
-        "latest": RuleRow("sim.studies.rules.map_rules:LatestCentre", "own/map"),
-        "alone": RuleRow("sim.studies.rules.map_rules:AloneCentre", "own/map"),
+        "latest": RuleRow("teamslam.sim.studies.rules.map_rules:LatestCentre", "own/map"),
+        "alone": RuleRow("teamslam.sim.studies.rules.map_rules:AloneCentre", "own/map"),
         "svd-join": RuleRow(_SVD, "submap"),
         "svd-join-spherical": RuleRow(_SVD, "submap"),
         "joint-fastslam": RuleRow(
-            "sim.studies.rules.joint_fastslam_rule:JointFastSlamCentre", "measurements", _CHEAP
+            "teamslam.sim.studies.rules.joint_fastslam_rule:JointFastSlamCentre",
+            "measurements",
+            _CHEAP,
         ),
-        "batch": RuleRow("sim.studies.rules.batch_rule:BatchCentre", "measurements", _CHEAP),
+        "batch": RuleRow(
+            "teamslam.sim.studies.rules.batch_rule:BatchCentre", "measurements", _CHEAP
+        ),
     }
 )
 

@@ -15,16 +15,16 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from team.config import UNNAMED
-from team.ros2 import encoding as ros
-from team.ros2.arrivals import attachment
-from team.ros2.definitions import types
-from team.ros2.encoding import Names, Pose, compose, inverse, names_of
-from team.ros2.keys import publication
-from team.ros2.topics import RobotTopics
-from team.wire import messages as m
-from team.wire.arrays import floats, ids, landmark_blocks, stamps
-from team.wire.zenoh.foreign import ForeignKeys
+from teamslam.team.config import UNNAMED
+from teamslam.team.ros2 import encoding as ros
+from teamslam.team.ros2.arrivals import attachment
+from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.encoding import Names, Pose, compose, inverse, names_of
+from teamslam.team.ros2.keys import publication
+from teamslam.team.ros2.topics import RobotTopics
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids, landmark_blocks, stamps
+from teamslam.team.wire.zenoh.foreign import ForeignKeys
 
 MOST_PATH = 2000
 """Most poses of a path; a longer one keeps every second pose."""

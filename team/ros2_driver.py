@@ -15,10 +15,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from team.containment import place_of
-from team.driver.measured import MeasurementError
-from team.ros2.arrivals import MOST_WAITING, Backlog, Lost
-from team.ros2.decoding import (
+from teamslam.team.containment import place_of
+from teamslam.team.driver.measured import MeasurementError
+from teamslam.team.ros2.arrivals import MOST_WAITING, Backlog, Lost
+from teamslam.team.ros2.decoding import (
     READERS,
     DamagedError,
     OdometryRecord,
@@ -26,12 +26,12 @@ from team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from team.ros2.frames import Frames, heading, misplaced
-from team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
-from team.ros2.owners import Owners
-from team.ros2.topics import RobotTopics
-from team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
-from team.wire.zenoh.foreign import ForeignSample
+from teamslam.team.ros2.frames import Frames, heading, misplaced
+from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
+from teamslam.team.ros2.owners import Owners
+from teamslam.team.ros2.topics import RobotTopics
+from teamslam.team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
+from teamslam.team.wire.zenoh.foreign import ForeignSample
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 HELD = 1000

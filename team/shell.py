@@ -14,13 +14,13 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
-from team.containment import Boundary
-from team.spare_time import SpareTime
-from team.the_end import TheEnd
-from team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
-from team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import FusedMap, Liveliness, Message, Status, Tally, tag_of
+from teamslam.team.containment import Boundary
+from teamslam.team.spare_time import SpareTime
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
+from teamslam.team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.messages import FusedMap, Liveliness, Message, Status, Tally, tag_of
 
 STATUS_S = 0.5
 """Wall time [s] between two statuses of a node."""
@@ -88,7 +88,7 @@ class Shell:
     """Run one node on one bus; ends: channels on which the node's team ends.
 
     A refused message is counted, logged with the reason and dropped. A message whose handling
-    raises is set aside (`team.containment`), and the node continues.
+    raises is set aside (`teamslam.team.containment`), and the node continues.
     """
 
     def __init__(

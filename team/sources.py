@@ -8,13 +8,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
-"""A name in a table of `team.registry`."""
+"""A name in a table of `teamslam.team.registry`."""
 
 
 def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
     """The text of a module and of every module of these packages that it imports, transitively.
 
-    Names in tables (`team.registry`) count as imports.
+    Names in tables (`teamslam.team.registry`) count as imports.
     """
     found: dict[str, bytes] = {}
     waiting = [module]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 Stream = tuple[str, int]
 """(robot, incarnation)."""

@@ -5,10 +5,10 @@ import os
 import time
 from collections.abc import Collection
 
-from team.wire.bus import Bus, BusError, Sample, replied
-from team.wire.channels import FINAL_MAP, KEPT, Channel, channel_of
-from team.wire.codec import WireError
-from team.wire.messages import KeptRequest
+from teamslam.team.wire.bus import Bus, BusError, Sample, replied
+from teamslam.team.wire.channels import FINAL_MAP, KEPT, Channel, channel_of
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.messages import KeptRequest
 
 FINAL_S = 3.0
 """Time [s] between two queries to the router for a missed end."""

@@ -7,16 +7,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import UNNAMED, RobotConfig
-from team.estimation.gaussian import Matrix, packed, unpacked
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
-from team.estimation.map_joining.joining import Contribution, InitialPoseFactor
-from team.estimation.odometry import OdometryInterval, moved, steered
-from team.estimation.scans import Scan, point_scan, polar_scan
-from team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
-from team.wire import messages as m
-from team.wire.arrays import (
+from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import Matrix, packed, unpacked
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
+from teamslam.team.estimation.map_joining.joining import Contribution, InitialPoseFactor
+from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
+from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
+from teamslam.team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import (
     floats,
     from_floats,
     from_ids,
@@ -27,7 +27,7 @@ from team.wire.arrays import (
     octets,
     stamps,
 )
-from team.wire.codec import unsound
+from teamslam.team.wire.codec import unsound
 
 
 def frame_name(robot: str, incarnation: int) -> str:

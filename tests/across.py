@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.scenario import Scenario
 from tests import bits
 
 CLASSES: Mapping[str, Mapping[str, str]] = {

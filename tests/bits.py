@@ -23,13 +23,13 @@ import msgspec
 import numpy as np
 import scipy
 
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from team.pairs import PAIRS
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.pairs import PAIRS
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests.support import ROOT
 
 TABLE = Path(__file__).with_suffix(".json")

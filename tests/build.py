@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 S = 1_000_000_000
 """One second [ns]."""

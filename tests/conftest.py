@@ -21,14 +21,14 @@ import tests.shapes
 settings.register_profile("repeatable", derandomize="HYPOTHESIS_SEARCH" not in os.environ)
 settings.load_profile("repeatable")
 
-install_import_hook(["team", "central", "sim"], f"{tests.shapes.__name__}.checked")
+install_import_hook(["teamslam"], f"{tests.shapes.__name__}.checked")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Before a test's own fixtures; those of a module are checked with its first test."""
     tests.shapes.begin_test()
-    from team.wire.logs import LIMITS  # behind the import hook
+    from teamslam.team.wire.logs import LIMITS  # behind the import hook
 
     LIMITS.forget()
     if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(SYSTEM):

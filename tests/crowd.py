@@ -4,11 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import fused_map
 

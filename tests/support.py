@@ -12,11 +12,11 @@ from typing import Self, TypeVar
 import msgspec
 import numpy as np
 
-from team.config import UNNAMED
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Bus, Sample
-from team.wire.channels import Channel
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Bus, Sample
+from teamslam.team.wire.channels import Channel
 from tests import build
 
 ROOT = Path(__file__).parents[1]
@@ -491,7 +491,7 @@ def examples() -> Iterator[m.Message]:
         message="submap/1",
         error="ValueError",
         text="no frame",
-        place="central.node:CentralNode.handle:58",
+        place="teamslam.central.node:CentralNode.handle:58",
         digest=b"\x01\x02\x03\x04\x05\x06\x07\x08",
     )
     yield build.liveliness(node="robot/alpha")

@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 
-from central.config import CentralConfig
-from central.node import make_centre
-from sim.publisher.node import WorldNode, expected_nodes
-from sim.world.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams
-from team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.pairs import NEEDS_MAP
-from team.robot.node import RobotNode, robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.world.streams import Detections, Intervals, RobotStream, StartPose, WorldStreams
+from teamslam.team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.pairs import NEEDS_MAP
+from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 
 LANDMARKS = np.array([[5.0, 3.0], [9.0, -2.0], [14.0, 4.0], [20.0, -3.0], [3.0, -4.0]])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import typer
 
-from sim.cli.main import app
+from teamslam.sim.cli.main import app
 from tests.support import ROOT
 
 PAGES = sorted(
@@ -19,7 +19,7 @@ PAGES = sorted(
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("[0-9]*.md"))
 NOTES = sorted((ROOT / "docs" / "notes").glob("*.md"))
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
-FOLDERS = ("team", "central", "sim", "tests", "docs", "examples", "benchmarks")
+FOLDERS = ("teamslam", "team", "central", "sim", "tests", "docs", "examples", "benchmarks")
 NAMED = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w./-]+\.\w+):\s+([^`]+)`")
 PATHS = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w.-]+(?:/[\w.-]+)*(?:\.\w+|/))[`:]")
 """Folders end with a slash, since keys of the wire look alike."""

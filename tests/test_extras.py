@@ -5,7 +5,7 @@ from importlib.metadata import PackageNotFoundError
 
 import pytest
 
-from team import extras
+from teamslam.team import extras
 
 
 def test_an_extra_is_installed_by_its_packages_wherever_we_come_from(

@@ -15,24 +15,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sim.publisher.node
-import team.robot.node
-from central.config import CentralConfig
-from central.node import CentralNode, make_centre
-from sim.datasets.utias_writer import write_utias
-from sim.in_memory.team import final_map, run_team
-from sim.publisher.node import WorldNode
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.robots.node import ExchangingRobot
-from team import translate
-from team.pairs import PAIRS
-from team.robot.node import RobotNode, robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, opened
-from team.wire.codec import encoded
-from team.wire.digest import NO_MAP, digest_of
+import teamslam.sim.publisher.node
+import teamslam.team.robot.node
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode, make_centre
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.robots.node import ExchangingRobot
+from teamslam.team import translate
+from teamslam.team.pairs import PAIRS
+from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import NO_MAP, digest_of
 from tests import build
 from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
@@ -49,10 +49,10 @@ def team_of(streams, rng, **options):
 @pytest.fixture
 def scarce(monkeypatch):
     """Little credit and small portions, so that everybody waits for somebody."""
-    monkeypatch.setattr(sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
-    monkeypatch.setattr(sim.publisher.node, "BATCH", 5)
-    monkeypatch.setattr(team.robot.node, "PROGRESS_MEASUREMENTS", 4)
-    monkeypatch.setattr(team.robot.node, "CREDIT_SUBMAPS", 1)
+    monkeypatch.setattr(teamslam.sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
+    monkeypatch.setattr(teamslam.sim.publisher.node, "BATCH", 5)
+    monkeypatch.setattr(teamslam.team.robot.node, "PROGRESS_MEASUREMENTS", 4)
+    monkeypatch.setattr(teamslam.team.robot.node, "CREDIT_SUBMAPS", 1)
 
 
 # Law 1.
@@ -334,16 +334,21 @@ def reached_from(module: str) -> set[str]:
     return seen
 
 
-@pytest.mark.parametrize("module", ["team.robot.node", "central.node", "sim.publisher.node"])
+@pytest.mark.parametrize(
+    "module", ["teamslam.team.robot.node", "teamslam.central.node", "teamslam.sim.publisher.node"]
+)
 def test_a_node_reaches_no_clock_no_socket_and_no_file(module):
     reached = reached_from(module)
-    assert "team.wire.messages" in reached
+    assert "teamslam.team.wire.messages" in reached
     assert not {name.split(".")[0] for name in reached} & FORBIDDEN
 
 
 def test_a_shell_does_reach_them():
     """The mutant: the search above can find what it looks for."""
-    assert {name.split(".")[0] for name in reached_from("team.robot.main")} >= {"time", "threading"}
+    assert {name.split(".")[0] for name in reached_from("teamslam.team.robot.main")} >= {
+        "time",
+        "threading",
+    }
 
 
 # Whoever waits, waits for something that comes.

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import team
-from team import library
-from team.wire import channels as ch
-from team.wire.bus import Outgoing, opened
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+import teamslam
+from teamslam.team import library
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Outgoing, opened
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import ROOT, submap
 
 EXAMPLES = ROOT / "examples"
-SENSOR = team.Sensor(range_sigma=0.1, bearing_sigma=0.02)
-MOTION = team.MotionModel(
-    forward=team.MotionNoise(per_m=0.05), turn=team.MotionNoise(per_rad=0.05, per_m=0.01)
+SENSOR = teamslam.Sensor(range_sigma=0.1, bearing_sigma=0.02)
+MOTION = teamslam.MotionModel(
+    forward=teamslam.MotionNoise(per_m=0.05), turn=teamslam.MotionNoise(per_rad=0.05, per_m=0.01)
 )
 LANDMARKS = np.array([[2.0, 4.0], [6.0, -3.0], [9.0, 4.0], [13.0, 1.0], [4.0, 1.0]])
 
@@ -31,29 +31,31 @@ def driven(start, keyframes, rng):
     """The true pose at the end and what was measured on the way."""
     pose, taken = start, []
     for _ in range(keyframes):
-        increment = team.increment_of(MOTION, 1.0, 1.0, 0.05)
+        increment = teamslam.increment_of(MOTION, 1.0, 1.0, 0.05)
         factor = np.linalg.cholesky(increment.covariance + 1e-12 * np.eye(3))
-        pose = team.compose(pose, increment.mean)
-        pose = team.compose(pose, factor @ rng.normal(size=3))
-        z = np.array([team.measurement_of(pose, landmark) for landmark in LANDMARKS])
+        pose = teamslam.compose(pose, increment.mean)
+        pose = teamslam.compose(pose, factor @ rng.normal(size=3))
+        z = np.array([teamslam.measurement_of(pose, landmark) for landmark in LANDMARKS])
         z += rng.normal(0.0, (0.1, 0.02), z.shape)
         ids = np.arange(len(z), dtype=np.uint32)
-        taken.append(team.Keyframe(increment=increment, ids=ids, ranges=z[:, 0], bearings=z[:, 1]))
+        taken.append(
+            teamslam.Keyframe(increment=increment, ids=ids, ranges=z[:, 0], bearings=z[:, 1])
+        )
     return pose, taken
 
 
 def submaps(keyframes, rng, window=5):
-    front_end = team.FrontEnd(particles=50)
+    front_end = teamslam.FrontEnd(particles=50)
     return [
-        team.submap_of(keyframes[k : k + window], SENSOR, rng, front_end)
+        teamslam.submap_of(keyframes[k : k + window], SENSOR, rng, front_end)
         for k in range(0, len(keyframes), window)
     ]
 
 
 def test_every_name_of_the_library_comes_from_team_and_is_documented() -> None:
     for name in library.__all__:
-        assert getattr(team, name) is getattr(library, name)
-        assert (getattr(team, name).__doc__ or "").strip()
+        assert getattr(teamslam, name) is getattr(library, name)
+        assert (getattr(teamslam, name).__doc__ or "").strip()
     page = (ROOT / "docs" / "library.md").read_text()
     assert [name for name in library.__all__ if f"`{name}`" not in page] == []
 
@@ -62,10 +64,10 @@ def test_two_robots_joined_are_where_the_batch_reference_says() -> None:
     rng = np.random.default_rng(3)
     starts = {"r1": np.zeros(3), "r2": np.array([3.0, -2.0, 0.4])}
     measured = {robot: driven(start, 15, rng)[1] for robot, start in starts.items()}
-    initial = {"r1": team.InitialPose(pose=starts["r1"])}
-    joined = team.join({robot: submaps(of, rng) for robot, of in measured.items()}, initial)
-    wide = team.InitialPose(pose=starts["r2"], covariance=np.diag((100.0, 100.0, 10.0)))
-    batch = team.batch_map(measured, dict.fromkeys(measured, SENSOR), {**initial, "r2": wide})
+    initial = {"r1": teamslam.InitialPose(pose=starts["r1"])}
+    joined = teamslam.join({robot: submaps(of, rng) for robot, of in measured.items()}, initial)
+    wide = teamslam.InitialPose(pose=starts["r2"], covariance=np.diag((100.0, 100.0, 10.0)))
+    batch = teamslam.batch_map(measured, dict.fromkeys(measured, SENSOR), {**initial, "r2": wide})
     assert batch.converged
     assert joined.apart == {}
     np.testing.assert_array_equal(joined.landmarks.ids, batch.landmarks.ids)
@@ -79,15 +81,15 @@ def test_a_robot_that_shares_too_little_is_apart_and_the_map_says_why() -> None:
     rng = np.random.default_rng(5)
     _, keyframes = driven(np.zeros(3), 5, rng)
     strangers = [
-        team.Keyframe(
+        teamslam.Keyframe(
             increment=each.increment, ids=each.ids + np.uint32(100), ranges=each.ranges,
             bearings=each.bearings,
         )
         for each in keyframes
     ]  # fmt: skip
-    joined = team.join(
+    joined = teamslam.join(
         {"r1": submaps(keyframes, rng), "r2": submaps(strangers, rng), "r3": []},
-        {"r1": team.InitialPose(pose=np.zeros(3))},
+        {"r1": teamslam.InitialPose(pose=np.zeros(3))},
     )
     assert set(joined.trajectories) == {"r1"}
     assert "shared landmark" in joined.apart["r2"]
@@ -96,15 +98,15 @@ def test_a_robot_that_shares_too_little_is_apart_and_the_map_says_why() -> None:
 
 def test_wrong_use_of_the_library_is_named() -> None:
     with pytest.raises(ValueError, match="no submaps of r9"):
-        team.join({}, {"r9": team.InitialPose(pose=np.zeros(3))})
+        teamslam.join({}, {"r9": teamslam.InitialPose(pose=np.zeros(3))})
     with pytest.raises(ValueError, match="no submaps at all"):
-        team.join({"r1": []}, {})
+        teamslam.join({"r1": []}, {})
     with pytest.raises(ValueError, match="r1 has no start"):
-        team.batch_map(
+        teamslam.batch_map(
             {"r1": driven(np.zeros(3), 1, np.random.default_rng(1))[1]}, {"r1": SENSOR}, {}
         )
-    with pytest.raises(team.WireError):
-        team.submap_in(b"\x91\xa8submap/1")
+    with pytest.raises(teamslam.WireError):
+        teamslam.submap_in(b"\x91\xa8submap/1")
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +117,12 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_submaps_of_a_log_join_to_its_final_map(log: Path) -> None:
-    starts = [opened(sample)[2] for sample in team.open_log(log).samples([ch.START])]
-    (final,) = [opened(sample)[2] for sample in team.open_log(log).samples([ch.FINAL_MAP])]
+    starts = [opened(sample)[2] for sample in teamslam.open_log(log).samples([ch.START])]
+    (final,) = [opened(sample)[2] for sample in teamslam.open_log(log).samples([ch.FINAL_MAP])]
     initial = {
-        start.robot: team.InitialPose(pose=np.frombuffer(start.pose, "<f8")) for start in starts
+        start.robot: teamslam.InitialPose(pose=np.frombuffer(start.pose, "<f8")) for start in starts
     }
-    joined = team.join(team.submaps_in(log), initial)
+    joined = teamslam.join(teamslam.submaps_in(log), initial)
     np.testing.assert_array_equal(joined.landmarks.ids, np.frombuffer(final.ids, "<u4"))
     means = np.frombuffer(final.means, "<f8").reshape(-1, 2)
     np.testing.assert_allclose(joined.landmarks.means, means, atol=1e-4)

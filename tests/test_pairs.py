@@ -4,9 +4,9 @@ from typing import get_args
 
 import pytest
 
-from team.config import Estimator, FusionRule
-from team.pairs import ESTIMATORS, PAIRS, RULES
-from team.registry import is_installed
+from teamslam.team.config import Estimator, FusionRule
+from teamslam.team.pairs import ESTIMATORS, PAIRS, RULES
+from teamslam.team.registry import is_installed
 
 
 def test_the_names_of_the_rows_are_what_a_user_may_write() -> None:

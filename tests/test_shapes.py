@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.models import Increment
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.models import Increment
 from tests import shapes
 
 WRONG = np.zeros((3, 2))

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from team import shell
-from team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from teamslam.team import shell
+from teamslam.team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from tests import build
 
 

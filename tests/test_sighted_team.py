@@ -5,19 +5,19 @@ import random
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.ledger import ledger
-from central.desk.verification.recorded import recorded
-from central.desk.verification.verification import verify
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from team.robot.ledger import IN_SIGHTING
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.ledger import ledger
+from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.robot.ledger import IN_SIGHTING
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.teams import Team, driven, of, published
 

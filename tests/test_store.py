@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.store import SubmapStore
-from team.wire import messages as m
+from teamslam.team.store import SubmapStore
+from teamslam.team.wire import messages as m
 from tests import build
 from tests.support import packed, spd, submap
 

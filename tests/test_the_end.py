@@ -2,11 +2,11 @@
 
 import pytest
 
-from team.the_end import TheEnd
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Sample
-from team.wire.codec import encoded
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import example
 

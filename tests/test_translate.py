@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import translate
-from team.config import UNNAMED, RobotConfig
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
-from team.estimation.submap import LocalMap, Unnamed
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import decoded, encoded
-from team.wire.digest import NO_MAP, configured, digest_of
+from teamslam.team import translate
+from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
+from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.digest import NO_MAP, configured, digest_of
 from tests import build
 from tests.estimation.submap_world import correlated
 

@@ -9,10 +9,10 @@ from collections.abc import Collection
 
 import msgspec
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError
 
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORDER)
 _NAMES = frozenset(channel.name for channel in LISTENS)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from central.desk.drawing import (
+from teamslam.central.desk.drawing import (
     BLUE,
     GREY,
     TRUTH_COLOUR,
@@ -16,11 +16,11 @@ from central.desk.drawing import (
     landmark_blocks,
     robot_colours,
 )
-from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
-from central.desk.names import OUTSIDE, in_order
-from central.desk.pictures.run import new_figure
-from central.desk.pictures.style import save
-from central.desk.report.tables import format_figure
+from teamslam.central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from teamslam.central.desk.names import OUTSIDE, in_order
+from teamslam.central.desk.pictures.run import new_figure
+from teamslam.central.desk.pictures.style import save
+from teamslam.central.desk.report.tables import format_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

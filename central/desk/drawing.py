@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.names import in_order
+from teamslam.central.desk.names import in_order
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from central.desk.names import in_order
-from central.desk.verification.recorded import Recorded, RerunError
-from central.desk.verification.robot import dispositions
-from team.robot.ledger import IN_SIGHTING
-from team.store import Stream
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.verification.recorded import Recorded, RerunError
+from teamslam.central.desk.verification.robot import dispositions
+from teamslam.team.robot.ledger import IN_SIGHTING
+from teamslam.team.store import Stream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 IN_SUBMAP = "in a submap"
 OPEN = "open"

@@ -6,15 +6,15 @@ import re
 import time
 from collections.abc import Iterator
 
-from central.desk.evaluation.verdicts import pair_of
-from central.desk.names import in_order
-from team.keys.roster import ROBOT
-from team.peers.members import Member, about
-from team.peers.proofs import Signs, signed_order
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, Outgoing, sound
-from team.wire.codec import encoded
+from teamslam.central.desk.evaluation.verdicts import pair_of
+from teamslam.central.desk.names import in_order
+from teamslam.team.keys.roster import ROBOT
+from teamslam.team.peers.members import Member, about
+from teamslam.team.peers.proofs import Signs, signed_order
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, Outgoing, sound
+from teamslam.team.wire.codec import encoded
 
 CENTRE_S = 10.0
 """Time [s] within which a running centre or robot is detected."""

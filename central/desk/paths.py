@@ -2,7 +2,7 @@
 
 The final map has poses at submap ends. The windows between them are recomputed from the recorded
 measurements, and each window path is fitted between its ends
-(`team.estimation.hybrid_slam.window_path`).
+(`teamslam.team.estimation.hybrid_slam.window_path`).
 """
 
 from collections.abc import Callable, Mapping
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.verification.recorded import Recorded, RerunError
-from team import translate
-from team.containment import Boundary
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.window_path import Ends, placed, window_path
-from team.robot.node import robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
+from teamslam.central.desk.verification.recorded import Recorded, RerunError
+from teamslam.team import translate
+from teamslam.team.containment import Boundary
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed, window_path
+from teamslam.team.robot.node import robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from collections.abc import Collection, Iterable, Iterator
 
 import msgspec
 
-from central.desk.agreement import LISTENS as OF_AGREEMENT
-from central.desk.agreement import Agreement, as_centre_final
-from central.team_config import team_config
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.central.desk.agreement import LISTENS as OF_AGREEMENT
+from teamslam.central.desk.agreement import Agreement, as_centre_final
+from teamslam.central.team_config import team_config
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import WireError, decoded, encoded
 
 _CENTRE = frozenset({ch.FUSED_MAP.key(), ch.FINAL_MAP.key()})
 _TOKEN = ch.ALIVE.key("central")

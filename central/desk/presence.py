@@ -4,11 +4,11 @@ import time
 from dataclasses import dataclass, field
 from statistics import median
 
-from central.desk.names import in_order
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, sound
-from team.wire.newer import later_head
+from teamslam.central.desk.names import in_order
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, sound
+from teamslam.team.wire.newer import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0

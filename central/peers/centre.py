@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import msgspec
 
-from central.config import CentralConfig
-from central.peers.peer import CENTRE, Peer
-from team.peers.proofs import Proofs, Signs
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.peer import CENTRE, Peer
+from teamslam.team.peers.proofs import Proofs, Signs
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 
 class PeerCentre(Peer):

@@ -10,15 +10,15 @@ contradicting itself does not block its peers.
 import hashlib
 from typing import Literal
 
-from central.config import CentralConfig
-from central.node import CentralNode
-from team.containment import Boundary
-from team.door import MOST_COUNT
-from team.peers.node import PeerNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode
+from teamslam.team.containment import Boundary
+from teamslam.team.door import MOST_COUNT
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
 
 FoldWhen = Literal["always", "request", "end"]
 """When a peer folds: as the set grows; on request and once the set is complete; or only then."""

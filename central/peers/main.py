@@ -6,20 +6,20 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from central.config import CentralConfig
-from central.peers.centre import PeerCentre
-from central.peers.fold import FoldWhen
-from central.peers.peer import CENTRE
-from central.peers.robot import PeerRobot
-from team.config import Exchange, RobotConfig
-from team.peers.members import Member
-from team.peers.proofs import Signs
-from team.peers.set_file import Keeper
-from team.robot.main import SECOND_PATIENCE_S, RobotShell
-from team.shell import Shell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, Tap
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.fold import FoldWhen
+from teamslam.central.peers.peer import CENTRE
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.peers.members import Member
+from teamslam.team.peers.proofs import Signs
+from teamslam.team.peers.set_file import Keeper
+from teamslam.team.robot.main import SECOND_PATIENCE_S, RobotShell
+from teamslam.team.shell import Shell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, Tap
 
 LINGER_S = 5.0
 """Time [s] for which a robot stays once all have concluded, so that others receive its

@@ -6,16 +6,16 @@ its own name. A subclass adds the rest, such as an estimator.
 
 from collections.abc import Iterable, Sequence
 
-from central.config import CentralConfig
-from central.peers.fold import FoldWhen, PeerFold
-from team.containment import Boundary, reply_sample
-from team.peers.members import CHANNELS, Member, about
-from team.peers.node import PeerNode
-from team.peers.proofs import OPERATOR, Proofs
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample, sound
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.fold import FoldWhen, PeerFold
+from teamslam.team.containment import Boundary, reply_sample
+from teamslam.team.peers.members import CHANNELS, Member, about
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.peers.proofs import OPERATOR, Proofs
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample, sound
+from teamslam.team.wire.codec import decoded, encoded
 
 SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """Channels of the set for its traffic figures, requests included."""

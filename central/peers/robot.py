@@ -9,17 +9,17 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from central.config import CentralConfig
-from central.peers.fold import FoldWhen
-from central.peers.peer import Peer, member_in
-from team.config import Exchange, RobotConfig
-from team.peers.members import CHANNELS, Member
-from team.peers.proofs import Proofs, Signs, signed_by
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.fold import FoldWhen
+from teamslam.central.peers.peer import Peer, member_in
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.peers.members import CHANNELS, Member
+from teamslam.team.peers.proofs import Proofs, Signs, signed_by
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 
 _OF_THE_FOLD = {
     ch.FUSED_MAP: ch.TEAM_MAP,

@@ -19,26 +19,26 @@ from math import hypot
 import msgspec
 import numpy as np
 
-from central.config import CentralConfig
-from central.desk.evaluation.errors import TRUTH_GAP_NS, Path
-from sim.calibration import claims, clocks, motion, sensor
-from sim.calibration.consistency import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS, Path
+from teamslam.sim.calibration import claims, clocks, motion, sensor
+from teamslam.sim.calibration.consistency import (
     central_figures,
     factor_by_cost,
 )
-from sim.calibration.data import Reference, references, true_paths
-from sim.calibration.detections import claim_notes, detection_figures, windows_of
-from sim.calibration.figures import (
+from teamslam.sim.calibration.data import Reference, references, true_paths
+from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
+from teamslam.sim.calibration.figures import (
     CalibrationError,
     Figure,
     jackknife,
     with_figures,
 )
-from sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
-from sim.calibration.own import marker_spread, own_constants
-from sim.scenarios.scenario import Scenario
-from sim.world.streams import WorldStreams
-from team.config import MotionModel, MotionNoise
+from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
+from teamslam.sim.calibration.own import marker_spread, own_constants
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import MotionModel, MotionNoise
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sim.calibration.data import Reference, poses_at, sensor_poses
-from sim.calibration.figures import huber
-from team.config import Sensor
-from team.estimation.consistency import chi2_quantile
-from team.estimation.models import Increment, corrected
-from team.estimation.se2 import between, logarithm
+from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
+from teamslam.sim.calibration.figures import huber
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.consistency import chi2_quantile
+from teamslam.team.estimation.models import Increment, corrected
+from teamslam.team.estimation.se2 import between, logarithm
 
 SPAN_NS = 10_000_000_000
 LEAST = 30

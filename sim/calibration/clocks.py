@@ -5,8 +5,8 @@ motion τ looks like a mount moved forward by v τ, so mount pose and range offs
 jointly; turns and speed changes separate them. Odometry is compared with the path's turn, with free
 scale.
 
-`central.desk.evaluation.clocks` needs no truth, but its σ is about three times larger (11 ms
-against 4 ms over four minutes of two robots).
+`teamslam.central.desk.evaluation.clocks` needs no truth, but its σ is about three times larger (11
+ms against 4 ms over four minutes of two robots).
 
 `RobotConfig.clock_offset_s` moves odometry to the detections' clock: τ of the detections less that
 of the odometry.
@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.evaluation.errors import Path, on_circle
-from sim.calibration.claims import measured_and_true
-from sim.calibration.data import Reference, poses_at
-from sim.calibration.figures import Figure, huber, jackknife
-from sim.world.streams import RobotStream, WorldStreams
-from team.config import Sensor
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.sim.calibration.claims import measured_and_true
+from teamslam.sim.calibration.data import Reference, poses_at
+from teamslam.sim.calibration.figures import Figure, huber, jackknife
+from teamslam.sim.world.streams import RobotStream, WorldStreams
+from teamslam.team.config import Sensor
 
 LEAST = 200
 """Least number of detections, and of odometry turns."""

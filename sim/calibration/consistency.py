@@ -19,18 +19,23 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
-from central.config import CentralConfig
-from central.desk.evaluation.errors import map_errors, rigid_alignment, transform_points
-from central.tick_fold import join_settings
-from sim.calibration.figures import Figure, nest_figures
-from sim.scenarios.scenario import Scenario
-from team.estimation.consistency import covariance_scale
-from team.estimation.contribution import InitialPoseFactor, Stream
-from team.estimation.map_joining.gauss_newton import Island, JoinSettings, joint_marginal, settled
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.marginals import joint_cost
-from team.estimation.map_joining.merging import ages
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.evaluation.errors import map_errors, rigid_alignment, transform_points
+from teamslam.central.tick_fold import join_settings
+from teamslam.sim.calibration.figures import Figure, nest_figures
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.team.estimation.consistency import covariance_scale
+from teamslam.team.estimation.contribution import InitialPoseFactor, Stream
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    Island,
+    JoinSettings,
+    joint_marginal,
+    settled,
+)
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.marginals import joint_cost
+from teamslam.team.estimation.map_joining.merging import ages
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
 
 LEAST_LANDMARKS = 3
 """Two landmarks have one invariant only, their distance."""

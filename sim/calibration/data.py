@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from central.desk.evaluation.errors import Path, on_circle
-from sim.world.streams import (
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.sim.world.streams import (
     Detections,
     Intervals,
     ObservationMeasurement,
@@ -15,9 +15,9 @@ from sim.world.streams import (
     RobotStream,
     WorldStreams,
 )
-from team.config import UNNAMED, MotionModel, RobotConfig
-from team.estimation.odometry import OdometryInterval, moved, steered
-from team.estimation.scans import Scan, point_scan, polar_scan
+from teamslam.team.config import UNNAMED, MotionModel, RobotConfig
+from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
+from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0

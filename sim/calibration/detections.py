@@ -1,6 +1,6 @@
 """Calibrate clutter and miss rates from detections without identities.
 
-Each window is associated anew without identities (`team.estimation.association`). After a
+Each window is associated anew without identities (`teamslam.team.estimation.association`). After a
 landmark's first detection, each scan that covers its place is a trial: of n trials, v detections
 are binomial with detection probability p. A scan covers a place within the range and bearing span
 of the other landmarks it detected; including the landmark itself would bias p upward. Clutter
@@ -18,15 +18,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sim.calibration.data import interval_of, scan_of
-from sim.calibration.figures import Figure, left_out
-from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream
-from team.config import AssociationSettings, RobotConfig
-from team.estimation.association.certainty import estimate_view
-from team.estimation.association.clustering import Clusters, cluster_window
-from team.estimation.association.scans import UNASSIGNED, Scans, relative_to
-from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
+from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.figures import Figure, left_out
+from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream
+from teamslam.team.config import AssociationSettings, RobotConfig
+from teamslam.team.estimation.association.certainty import estimate_view
+from teamslam.team.estimation.association.clustering import Clusters, cluster_window
+from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relative_to
+from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
+from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 
 LEAST_TRIALS = 50
 LEAST_SEEN = 3

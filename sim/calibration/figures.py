@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from sim.calibration.data import Reference
-from sim.scenarios.scenario import Scenario
-from team.config import MotionModel, Sensor
+from teamslam.sim.calibration.data import Reference
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.team.config import MotionModel, Sensor
 
 GROUPS = 5
 """Least number of parts left out in turn; fewer robots are cut into equal time stretches."""

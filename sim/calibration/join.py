@@ -7,13 +7,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.config import CentralConfig
-from central.desk.evaluation.errors import Path, on_circle
-from central.tick_fold import join_settings
-from sim.calibration.data import interval_of, scan_of
-from sim.calibration.figures import CalibrationError
-from sim.scenarios.scenario import Scenario
-from sim.world.streams import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.central.tick_fold import join_settings
+from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.figures import CalibrationError
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.streams import (
     OBSERVATIONS,
     ODOMETRY,
     ObservationMeasurement,
@@ -21,12 +21,12 @@ from sim.world.streams import (
     RobotStream,
     WorldStreams,
 )
-from team.config import RobotConfig
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.map_joining.auditing import fold_tick
-from team.estimation.map_joining.joining import (
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,
@@ -36,7 +36,7 @@ from team.estimation.map_joining.joining import (
     folded,
     started,
 )
-from team.estimation.se2 import compose
+from teamslam.team.estimation.se2 import compose
 
 LONGEST_NS = 250_000_000
 """Longest merged arc interval, since windows close at interval ends."""

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize
 
-from central.desk.evaluation.errors import on_circle
-from sim.calibration.data import Reference, poses_at, sinc
-from sim.calibration.figures import CalibrationError, huber
-from sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
+from teamslam.central.desk.evaluation.errors import on_circle
+from teamslam.sim.calibration.data import Reference, poses_at, sinc
+from teamslam.sim.calibration.figures import CalibrationError, huber
+from teamslam.sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
 
 STEPS = 40
 """Steps of a span, each an arc (or rotation and chord) of the true path."""

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import f as f_distribution
 
-from sim.calibration.data import Reference
-from sim.calibration.figures import CalibrationError, Figure, groups_of
-from sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
+from teamslam.sim.calibration.data import Reference
+from teamslam.sim.calibration.figures import CalibrationError, Figure, groups_of
+from teamslam.sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
 
 LEAST_ROBOTS = 3
 LEAST_LANDMARKS = 4

@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from central.config import CentralConfig
-from sim.calibration.calibrate import Calibration
-from sim.calibration.figures import Figure, nest_figures
-from sim.scenarios.document import own_document
-from sim.scenarios.scenario import Scenario, builtin_names
-from sim.world.config import FolderWorld, LiveWorld
-from team.config import AssociationSettings, MotionModel, Sensor
+from teamslam.central.config import CentralConfig
+from teamslam.sim.calibration.calibrate import Calibration
+from teamslam.sim.calibration.figures import Figure, nest_figures
+from teamslam.sim.scenarios.document import own_document
+from teamslam.sim.scenarios.scenario import Scenario, builtin_names
+from teamslam.sim.world.config import FolderWorld, LiveWorld
+from teamslam.team.config import AssociationSettings, MotionModel, Sensor
 
 Fields = dict[str, Any]
 

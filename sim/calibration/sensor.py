@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.optimize import least_squares, minimize
 
-from central.desk.evaluation.errors import on_circle
-from sim.calibration.data import Reference, poses_at, sensor_poses
-from sim.calibration.figures import CalibrationError, huber
-from team.config import Sensor
-from team.estimation.models import corrected
+from teamslam.central.desk.evaluation.errors import on_circle
+from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
+from teamslam.sim.calibration.figures import CalibrationError, huber
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.models import corrected
 
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4

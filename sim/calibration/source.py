@@ -4,13 +4,13 @@ from pathlib import Path
 
 import msgspec
 
-from sim.datasets.kinds import UTIAS_MARKER
-from sim.datasets.tables import open_data_set as opened_set
-from sim.datasets.utias_log import present_robots
-from sim.recorded.streams import measurements_in
-from sim.scenarios.scenario import Scenario, builtin_names, load, with_options
-from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
-from sim.world.streams import WorldStreams
+from teamslam.sim.datasets.kinds import UTIAS_MARKER
+from teamslam.sim.datasets.tables import open_data_set as opened_set
+from teamslam.sim.datasets.utias_log import present_robots
+from teamslam.sim.recorded.streams import measurements_in
+from teamslam.sim.scenarios.scenario import Scenario, builtin_names, load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.world.streams import WorldStreams
 
 
 def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from sim.world.streams import RobotStream
+from teamslam.sim.world.streams import RobotStream
 
 SPAN_S = 10.0
 """Stretch length [s] for errors: errors of one command are correlated for seconds."""

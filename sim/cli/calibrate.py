@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
 
 app = typer.Typer()
 
@@ -39,15 +39,15 @@ def calibrate(
     from rich.console import Console
     from rich.table import Table
 
-    from sim.calibration.calibrate import calibrate_models
-    from sim.calibration.figures import CalibrationError
-    from sim.calibration.scenario import scenario_toml, within
-    from sim.calibration.source import measurements_of, own_scenario
-    from sim.cli.importing import readable
-    from sim.cli.options import scenario_of, warn_of_holes
-    from sim.scenarios.scenario import Scenario, builtin_names
-    from sim.world.streams import WorldStreams
-    from team.recording.reader import open_log
+    from teamslam.sim.calibration.calibrate import calibrate_models
+    from teamslam.sim.calibration.figures import CalibrationError
+    from teamslam.sim.calibration.scenario import scenario_toml, within
+    from teamslam.sim.calibration.source import measurements_of, own_scenario
+    from teamslam.sim.cli.importing import readable
+    from teamslam.sim.cli.options import scenario_of, warn_of_holes
+    from teamslam.sim.scenarios.scenario import Scenario, builtin_names
+    from teamslam.sim.world.streams import WorldStreams
+    from teamslam.team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from central.desk.pictures.style import Form
-from sim.cli.help import Command
-from sim.cli.options import WRONG_USE, JsonFile, fail, warn_of_holes, write_json
+from teamslam.central.desk.pictures.style import Form
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import WRONG_USE, JsonFile, fail, warn_of_holes, write_json
 
 app = typer.Typer()
 FEWEST = 2
@@ -27,9 +27,9 @@ def compare(
     from rich.table import Table
     from rich.text import Text
 
-    from central.desk.compare import compare_figures, compare_picture, compare_rows
-    from central.desk.evaluation.evaluation import evaluate
-    from team.recording.reader import open_log
+    from teamslam.central.desk.compare import compare_figures, compare_picture, compare_rows
+    from teamslam.central.desk.evaluation.evaluation import evaluate
+    from teamslam.team.recording.reader import open_log
 
     if len(runs) < FEWEST:
         fail("one run alone is compared with nothing: give two or more", WRONG_USE)

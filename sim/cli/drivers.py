@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.help import NETWORK, RARE, Command
-from sim.cli.options import FAILED, LOOPBACK, WRONG_USE, Connect, Keys, fail, over_tls, parsed_start
+from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.options import (
+    FAILED,
+    LOOPBACK,
+    WRONG_USE,
+    Connect,
+    Keys,
+    fail,
+    over_tls,
+    parsed_start,
+)
 
 if TYPE_CHECKING:
-    from team.ros2_driver import Ros2Driver
+    from teamslam.team.ros2_driver import Ros2Driver
 
 app = typer.Typer()
 
@@ -93,13 +102,13 @@ def driver(
     """
     import numpy as np
 
-    from team.driver.driver import Driver, DriverError
-    from team.driver.measured import DriverWarning, MeasurementError
-    from team.ros2.topics import TopicsError, load_topics
-    from team.ros2_answers import LiveAnswers, RosPublisher
-    from team.ros2_driver import Ros2Driver
-    from team.shell import process
-    from team.wire.zenoh.foreign import ForeignKeys
+    from teamslam.team.driver.driver import Driver, DriverError
+    from teamslam.team.driver.measured import DriverWarning, MeasurementError
+    from teamslam.team.ros2.topics import TopicsError, load_topics
+    from teamslam.team.ros2_answers import LiveAnswers, RosPublisher
+    from teamslam.team.ros2_driver import Ros2Driver
+    from teamslam.team.shell import process
+    from teamslam.team.wire.zenoh.foreign import ForeignKeys
 
     logging.captureWarnings(True)
     # A detector lists its tags in any order; measurements stay with their names.

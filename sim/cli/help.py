@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from sim.scenarios.checks import close
+from teamslam.sim.scenarios.checks import close
 
 OPTIONS = "Options"
 """Section of the options that most users need."""

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
 
 app = typer.Typer()
 ROS2_PROFILE = b"ros2"
@@ -57,8 +57,8 @@ def import_(
     """Convert logs to a data set for launch, calibrate, rerun and batch-reference."""
     import re
 
-    from sim.datasets.folder_files import ROBOT_NAME
-    from sim.importing.source import Request, import_data, proposal
+    from teamslam.sim.datasets.folder_files import ROBOT_NAME
+    from teamslam.sim.importing.source import Request, import_data, proposal
 
     if output is None:
         fail(proposal(source[0]) + "give the folder for the data set: -o FOLDER", WRONG_USE)
@@ -104,7 +104,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 def imported_into(path: Path, folder: Path) -> Path:
     """Import a bag or log and print a summary; returns the folder."""
-    from sim.importing.source import Request, import_data
+    from teamslam.sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
         fail(f"{folder} is not empty: give another --output", WRONG_USE)
@@ -119,14 +119,14 @@ def readable(path: Path) -> Iterator[Path]:
     """Import a ROS 2 bag into a temporary data set; other paths are returned unchanged."""
     from tempfile import TemporaryDirectory
 
-    from team.recording.reader import log_file
+    from teamslam.team.recording.reader import log_file
 
     if log_file(path).is_file():  # a run's folder, or a file
         path = log_file(path)
     if not (path.suffix == ".db3" or _is_bag_folder(path) or _is_ros2_mcap(path)):
         yield path
         return
-    from sim.importing.source import Request, import_data
+    from teamslam.sim.importing.source import Request, import_data
 
     with TemporaryDirectory() as place:
         folder = Path(place) / path.stem
@@ -144,10 +144,10 @@ def _is_ros2_mcap(path: Path) -> bool:
 
 def _as_read(folder: Path) -> list[str]:
     """Measurements of each robot, and notes on unusable rows."""
-    from central.desk.evaluation.clocks import separate_times_warning
-    from sim.datasets.tables import DatasetError
-    from sim.scenarios.scenario import load, with_options
-    from sim.scenarios.source import scenario_beside, streams_of
+    from teamslam.central.desk.evaluation.clocks import separate_times_warning
+    from teamslam.sim.datasets.tables import DatasetError
+    from teamslam.sim.scenarios.scenario import load, with_options
+    from teamslam.sim.scenarios.source import scenario_beside, streams_of
 
     streams = streams_of(with_options(load(scenario_beside(folder)), dataset=folder))
     if not any(len(stream.intervals.end_ns) for stream in streams.streams):

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import WRONG_USE, Robots, fail, scenario_of
-from sim.scenarios.scenario import with_options
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import WRONG_USE, Robots, fail, scenario_of
+from teamslam.sim.scenarios.scenario import with_options
 
 app = typer.Typer()
 
@@ -51,8 +51,8 @@ def keys(
     Existing certificates are kept, so a robot is added by naming it.
     docs/security.md lists which files go where.
     """
-    from team.keys.authority import make_keys
-    from team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of
+    from teamslam.team.keys.authority import make_keys
+    from teamslam.team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of
 
     if not TEAM.fullmatch(team):
         fail(f"{team!r} is no team's name: letters, digits, dot, dash and underscore", WRONG_USE)

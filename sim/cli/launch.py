@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from central.desk.names import data_set_name
-from sim.cli.help import NETWORK, RARE, Command
-from sim.cli.importing import imported_into, is_foreign
-from sim.cli.options import (
+from teamslam.central.desk.names import data_set_name
+from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.importing import imported_into, is_foreign
+from teamslam.sim.cli.options import (
     ANY_PORT,
     ASSUMED_NAME,
     FAILED,
@@ -39,18 +39,18 @@ from sim.cli.options import (
     scenario_of,
     set_aside,
 )
-from sim.cli.results import print_evaluation, print_nis, print_written, read_run
-from sim.cli.steps import Steps
-from sim.cli.view import FoxglovePort, Open, Port, shown_on_page
-from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
+from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
+from teamslam.sim.cli.steps import Steps
+from teamslam.sim.cli.view import FoxglovePort, Open, Port, shown_on_page
+from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from central.desk.report.run import Run
-    from sim.launch.launch import Outcome
-    from sim.launch.plan import Plan
-    from sim.world.streams import WorldStreams
+    from teamslam.central.desk.report.run import Run
+    from teamslam.sim.launch.launch import Outcome
+    from teamslam.sim.launch.plan import Plan
+    from teamslam.sim.world.streams import WorldStreams
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, by the shell's convention."""
@@ -192,7 +192,7 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
-    from sim.launch.plan import Plan
+    from teamslam.sim.launch.plan import Plan
 
     plan = Plan(
         scenario=resolved,
@@ -230,9 +230,9 @@ def _name_of(scenario: Scenario) -> str:
 
 
 def _launched(plan: "Plan") -> "Outcome":
-    from sim.launch.launch import LaunchError, launch
-    from sim.launch.live import shown
-    from sim.launch.processes import Starter
+    from teamslam.sim.launch.launch import LaunchError, launch
+    from teamslam.sim.launch.live import shown
+    from teamslam.sim.launch.processes import Starter
 
     scenario = plan.scenario
     try:
@@ -247,7 +247,7 @@ def _launched(plan: "Plan") -> "Outcome":
 
 def _keep_showing(url: str, log: Path) -> None:
     """Serve the page until the user ends the command."""
-    from team.shell import process
+    from teamslam.team.shell import process
 
     with process("launch", endless=True) as stop:  # Ctrl-C may follow the line at once
         typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
@@ -259,11 +259,11 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
 
     A data set is read before any process starts; a simulated world is not.
     """
-    from sim.world.config import LiveWorld, SimulatedWorld
+    from teamslam.sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
         return scenario, None, None
-    from sim.scenarios.source import streams_of, with_present_robots
+    from teamslam.sim.scenarios.source import streams_of, with_present_robots
 
     present, missing = with_present_robots(scenario)
     return present, missing, streams_of(present)
@@ -272,8 +272,8 @@ def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStre
 def _time_warnings(streams: "WorldStreams | None") -> list[str]:
     if streams is None:
         return []
-    from central.desk.evaluation.clocks import separate_times_warning
-    from sim.datasets.folder_odometry import PACE
+    from teamslam.central.desk.evaluation.clocks import separate_times_warning
+    from teamslam.sim.datasets.folder_odometry import PACE
 
     notes = ((each.robot, note) for each in streams.streams for note in each.notes)
     paces = [f"{robot}: {note}" for robot, note in notes if note.startswith(PACE)]
@@ -283,7 +283,7 @@ def _time_warnings(streams: "WorldStreams | None") -> list[str]:
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
     """Advice on calibrating models for a data set without any."""
-    from sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+    from teamslam.sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
 
     found = moving_stretches(streams.streams)
     if found >= LEAST_SPANS:
@@ -339,7 +339,7 @@ def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
-        from team.recording.part_files import part_of, parts_of
+        from teamslam.team.recording.part_files import part_of, parts_of
 
         parts = parts_of(log)
         aside = set_aside(log)
@@ -351,7 +351,7 @@ def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
     """Write the report and print its files; an error, such as a full disk, fails the run."""
-    from central.desk.report.page import write_report
+    from teamslam.central.desk.report.page import write_report
 
     try:
         print_written(write_report(run, outcome.folder, figures), console)
@@ -368,12 +368,12 @@ def _conclude(
     """Evaluate the log, print the result and write the report; exits with 1 on failure."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
-    from central.desk.evaluation.states import not_in_the_map
-    from central.desk.names import in_order
-    from central.desk.report.run import run_figures
-    from team.recording.parts import join
-    from team.recording.reader import LogError, open_log
+    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate, to_json
+    from teamslam.central.desk.evaluation.states import not_in_the_map
+    from teamslam.central.desk.names import in_order
+    from teamslam.central.desk.report.run import run_figures
+    from teamslam.team.recording.parts import join
+    from teamslam.team.recording.reader import LogError, open_log
 
     console = Console()
     join(outcome.log)  # joined here, where it may take long

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.help import Command, Group
-from sim.cli.options import (
+from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
     JsonFile,
@@ -21,17 +21,17 @@ from sim.cli.options import (
     warn_of_holes,
     write_json,
 )
-from sim.cli.recorded import repair
-from team.extras import install_command
-from team.wire.text import one_line
+from teamslam.sim.cli.recorded import repair
+from teamslam.team.extras import install_command
+from teamslam.team.wire.text import one_line
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from team.recording.reader import Log
-    from team.recording.summary import KeySummary
-    from team.recording.tables import Exported
-    from team.wire.channels import Channel
+    from teamslam.team.recording.reader import Log
+    from teamslam.team.recording.summary import KeySummary
+    from teamslam.team.recording.tables import Exported
+    from teamslam.team.wire.channels import Channel
 
 NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.", metavar="FILE")]
 ChannelNames = Annotated[
@@ -70,9 +70,9 @@ def info(
     from rich.console import Console
     from rich.text import Text
 
-    from team.recording.check import holes
-    from team.recording.reader import open_log
-    from team.recording.summary import summarise_log
+    from teamslam.team.recording.check import holes
+    from teamslam.team.recording.reader import open_log
+    from teamslam.team.recording.summary import summarise_log
 
     opened = open_log(log)
     lacks = holes(opened)
@@ -112,8 +112,8 @@ def check(log: LogArgument) -> None:
 
     Exit status 1 if anything is wrong; each finding is one line.
     """
-    from team.recording.check import check_log
-    from team.recording.reader import open_log
+    from teamslam.team.recording.check import check_log
+    from teamslam.team.recording.reader import open_log
 
     findings = check_log(open_log(log))
     for finding in findings:
@@ -141,8 +141,8 @@ def cut(
     """
     import math
 
-    from team.recording.cut import cut as cut_log
-    from team.recording.reader import open_log
+    from teamslam.team.recording.cut import cut as cut_log
+    from teamslam.team.recording.reader import open_log
 
     bounds = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
     given = [s for s in (from_s, to_s) if s is not None]
@@ -161,8 +161,8 @@ def merge(
     output: NewLog,
 ) -> None:
     """Merge logs by team time; messages that several logs have are written once."""
-    from team.recording.merge import merge as merge_logs
-    from team.recording.reader import open_log
+    from teamslam.team.recording.merge import merge as merge_logs
+    from teamslam.team.recording.reader import open_log
 
     refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
@@ -187,10 +187,10 @@ def export(
     """Write a log as tables, its paths for evo, or its measurements and truth as a UTIAS data
     set.
     """
-    from central.desk.export.rosbag2 import export_rosbag2
-    from central.desk.export.tum import export_tum
-    from sim.recorded.utias_set import export_utias
-    from team.recording.reader import open_log
+    from teamslam.central.desk.export.rosbag2 import export_rosbag2
+    from teamslam.central.desk.export.tum import export_tum
+    from teamslam.sim.recorded.utias_set import export_utias
+    from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)
     chosen = _channels(channels)
@@ -220,8 +220,8 @@ def export(
 
 def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
     """Table exporter; exits if it is not installed."""
-    from team.recording.csv_tables import export_csv
-    from team.recording.parquet_tables import export_parquet
+    from teamslam.team.recording.csv_tables import export_csv
+    from teamslam.team.recording.parquet_tables import export_parquet
 
     if form is Format.CSV:
         return export_csv
@@ -233,7 +233,7 @@ def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Expo
 def _channels(names: str | None) -> "list[Channel] | None":
     if names is None:
         return None
-    from team.wire.channels import CHANNELS
+    from teamslam.team.wire.channels import CHANNELS
 
     known = {channel.name: channel for channel in CHANNELS if channel.recorded}
     given = [name.strip() for name in names.split(",")]

@@ -11,23 +11,23 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
-from sim.cli.calibrate import app as calibrate_commands  # noqa: E402
-from sim.cli.compare import app as compare_commands  # noqa: E402
-from sim.cli.drivers import app as driver_commands  # noqa: E402
-from sim.cli.help import WIDE, Group  # noqa: E402
-from sim.cli.importing import app as import_commands  # noqa: E402
-from sim.cli.keys import app as key_commands  # noqa: E402
-from sim.cli.launch import app as launch_commands  # noqa: E402
-from sim.cli.log import app as log_tools  # noqa: E402
-from sim.cli.nodes import app as node_commands  # noqa: E402
-from sim.cli.options import FAILED, WRONG_USE  # noqa: E402
-from sim.cli.orders import app as order_commands  # noqa: E402
-from sim.cli.recorded import app as recorded_commands  # noqa: E402
-from sim.cli.rerun import app as rerun_commands  # noqa: E402
-from sim.cli.scenarios import app as scenario_commands  # noqa: E402
-from sim.cli.status import app as status_commands  # noqa: E402
-from sim.cli.studies import add_studies  # noqa: E402
-from sim.cli.view import app as view_commands  # noqa: E402
+from teamslam.sim.cli.calibrate import app as calibrate_commands  # noqa: E402
+from teamslam.sim.cli.compare import app as compare_commands  # noqa: E402
+from teamslam.sim.cli.drivers import app as driver_commands  # noqa: E402
+from teamslam.sim.cli.help import WIDE, Group  # noqa: E402
+from teamslam.sim.cli.importing import app as import_commands  # noqa: E402
+from teamslam.sim.cli.keys import app as key_commands  # noqa: E402
+from teamslam.sim.cli.launch import app as launch_commands  # noqa: E402
+from teamslam.sim.cli.log import app as log_tools  # noqa: E402
+from teamslam.sim.cli.nodes import app as node_commands  # noqa: E402
+from teamslam.sim.cli.options import FAILED, WRONG_USE  # noqa: E402
+from teamslam.sim.cli.orders import app as order_commands  # noqa: E402
+from teamslam.sim.cli.recorded import app as recorded_commands  # noqa: E402
+from teamslam.sim.cli.rerun import app as rerun_commands  # noqa: E402
+from teamslam.sim.cli.scenarios import app as scenario_commands  # noqa: E402
+from teamslam.sim.cli.status import app as status_commands  # noqa: E402
+from teamslam.sim.cli.studies import add_studies  # noqa: E402
+from teamslam.sim.cli.view import app as view_commands  # noqa: E402
 
 app = typer.Typer(
     cls=Group,
@@ -69,7 +69,7 @@ def main() -> None:
     try:
         command()()
     except Exception as error:
-        from team.wire.text import lines
+        from teamslam.team.wire.text import lines
 
         advice = _advice(error)
         if advice is None:
@@ -84,13 +84,13 @@ def _advice(error: Exception) -> tuple[int, str] | None:
 
     Exception modules are imported only if raised there: a router needs no SciPy.
     """
-    from sim.datasets.tables import DatasetError
-    from sim.scenarios.checks import ScenarioError
-    from team.keys.roster import KeysError
-    from team.recording.reader import LogError
-    from team.recording.recorder import RecorderError
-    from team.shell import FaultyRunError
-    from team.wire.bus import BusError
+    from teamslam.sim.datasets.tables import DatasetError
+    from teamslam.sim.scenarios.checks import ScenarioError
+    from teamslam.team.keys.roster import KeysError
+    from teamslam.team.recording.reader import LogError
+    from teamslam.team.recording.recorder import RecorderError
+    from teamslam.team.shell import FaultyRunError
+    from teamslam.team.wire.bus import BusError
 
     if isinstance(error, ScenarioError | DatasetError | LogError | BusError | KeysError):
         return WRONG_USE, str(error)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from sim.cli.help import RARE, Command
-from sim.cli.options import (
+from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -34,15 +34,15 @@ from sim.cli.options import (
     scenario_of,
     signer_of,
 )
-from sim.scenarios.scenario import Scenario, scenario_warnings, with_options
+from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
 if TYPE_CHECKING:
     import threading
 
-    from central.main import CentralShell
-    from central.peers.main import CentreShell, PeerShell
-    from team.config import RobotConfig
-    from team.wire.bus import Bus
+    from teamslam.central.main import CentralShell
+    from teamslam.central.peers.main import CentreShell, PeerShell
+    from teamslam.team.config import RobotConfig
+    from teamslam.team.wire.bus import Bus
 
 _LOG = logging.getLogger("teamslam")
 
@@ -72,9 +72,9 @@ def router(
     With --keys it admits nodes with a certificate, each of which may publish on
     its own keys only.
     """
-    from team.keys.roster import load_roster
-    from team.shell import process
-    from team.wire.zenoh.router import router as zenoh_router
+    from teamslam.team.keys.roster import load_roster
+    from teamslam.team.shell import process
+    from teamslam.team.wire.zenoh.router import router as zenoh_router
 
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     own = None if keys is None else (own_keys(keys, "router"), load_roster(keys))
@@ -119,9 +119,9 @@ def world(
     dataset: Dataset = None,
 ) -> None:
     """Run the world: a simulator or a data set that publishes every robot's measurements."""
-    from sim.publisher.main import run_world
-    from sim.scenarios.source import streams_of
-    from team.shell import process
+    from teamslam.sim.publisher.main import run_world
+    from teamslam.sim.scenarios.source import streams_of
+    from teamslam.team.shell import process
 
     pace = parsed_speed(speed)
     resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
@@ -178,9 +178,9 @@ def robot(
     """
     from contextlib import nullcontext
 
-    from team.recording.own_log import own_log
-    from team.robot.main import RobotShell
-    from team.shell import process
+    from teamslam.team.recording.own_log import own_log
+    from teamslam.team.robot.main import RobotShell
+    from teamslam.team.shell import process
 
     resolved = with_options(
         scenario_of(scenario),
@@ -217,10 +217,10 @@ def _peer_shell(
     fold: str,
     keys: Path | None,
 ) -> "PeerShell":
-    from central.peers.fold import FoldWhen
-    from central.peers.main import PeerShell
-    from sim.radio.bus import behind_radio
-    from team.peers.set_file import SetFileError
+    from teamslam.central.peers.fold import FoldWhen
+    from teamslam.central.peers.main import PeerShell
+    from teamslam.sim.radio.bus import behind_radio
+    from teamslam.team.peers.set_file import SetFileError
 
     if fold not in get_args(FoldWhen):
         fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
@@ -275,8 +275,8 @@ def central(
 
     With --peers it is one more peer, which may join and leave at any time.
     """
-    from team.peers.set_file import SetFileError
-    from team.shell import process
+    from teamslam.team.peers.set_file import SetFileError
+    from teamslam.team.shell import process
 
     resolved = with_options(
         scenario_of(scenario),
@@ -305,8 +305,8 @@ def _central_shell(
     patience: float | None,
     keys: Path | None,
 ) -> "CentralShell | CentreShell":
-    from central.main import CentralShell
-    from central.peers.main import CentreShell
+    from teamslam.central.main import CentralShell
+    from teamslam.central.peers.main import CentreShell
 
     names = [config.id for config in scenario.robots]
     if not scenario.peers:
@@ -354,14 +354,14 @@ def record(
     messages; at the end the parts are joined. Restarted after the end, it
     completes an interrupted join.
     """
-    from sim.scenarios.scenario import dumps
-    from team.recording.part_files import parts_of
-    from team.recording.parts import check_continues, next_part
-    from team.recording.provenance import provenance
-    from team.recording.reader import LogError
-    from team.recording.shell import record as record_until_end
-    from team.shell import process
-    from team.wire.channels import robot_node
+    from teamslam.sim.scenarios.scenario import dumps
+    from teamslam.team.recording.part_files import parts_of
+    from teamslam.team.recording.parts import check_continues, next_part
+    from teamslam.team.recording.provenance import provenance
+    from teamslam.team.recording.reader import LogError
+    from teamslam.team.recording.shell import record as record_until_end
+    from teamslam.team.shell import process
+    from teamslam.team.wire.channels import robot_node
 
     resolved = scenario_of(scenario)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -386,7 +386,7 @@ def record(
     expected += [] if resolved.is_live else ["world"]
     configurations = []
     if resolved.is_live:  # saves other teams' recorders its 105 MB
-        from team.wire.digest import configured
+        from teamslam.team.wire.digest import configured
 
         configurations = [configured("world", 0, 0, resolved)]
     with (
@@ -416,7 +416,7 @@ def record(
 
 def _joined(log: Path) -> list[Path]:
     """Join the parts of a log; name remaining parts, with the remedy."""
-    from team.recording.parts import join
+    from teamslam.team.recording.parts import join
 
     parts = join(log)
     if len(parts) > 1:
@@ -438,11 +438,11 @@ def _fail_if_provisional(parts: Sequence[Path]) -> None:
 
 def _lacking_in(parts: Sequence[Path]) -> str:
     """Robots missing in the final map of a log, as text."""
-    from team.recording.reader import LogError, open_log
-    from team.shell import lacking
-    from team.wire.channels import FINAL_MAP, TEAM_FINAL
-    from team.wire.codec import WireError, decoded
-    from team.wire.messages import FusedMap
+    from teamslam.team.recording.reader import LogError, open_log
+    from teamslam.team.shell import lacking
+    from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL
+    from teamslam.team.wire.codec import WireError, decoded
+    from teamslam.team.wire.messages import FusedMap
 
     for part in parts:
         try:

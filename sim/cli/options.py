@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
-from sim.cli.help import NETWORK, RARE
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import Scenario, load, loads
-from sim.world.config import UnlabelledWorld
-from team.config import Estimator, FusionRule
-from team.wire.text import lines, one_line
+from teamslam.sim.cli.help import NETWORK, RARE
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.scenario import Scenario, load, loads
+from teamslam.sim.world.config import UnlabelledWorld
+from teamslam.team.config import Estimator, FusionRule
+from teamslam.team.wire.text import lines, one_line
 
 if TYPE_CHECKING:
-    from team.keys.credentials import Credentials
-    from team.keys.signing import Signer
-    from team.recording.check import Finding
-    from team.recording.reader import Log
-    from team.wire.zenoh.bus import ZenohBus
+    from teamslam.team.keys.credentials import Credentials
+    from teamslam.team.keys.signing import Signer
+    from teamslam.team.recording.check import Finding
+    from teamslam.team.recording.reader import Log
+    from teamslam.team.wire.zenoh.bus import ZenohBus
 
 MOST_HOLES = 5
 """Most log gaps that a command prints; `teamslam log check` prints all."""
@@ -150,7 +150,7 @@ def connect_bus(
 
     stop: ends the wait of a team process for a silent router.
     """
-    from team.wire.zenoh.bus import ZenohBus
+    from teamslam.team.wire.zenoh.bus import ZenohBus
 
     own = None if keys is None else own_keys(keys, node, team)
     return ZenohBus(team, over_tls(connect) if keys else connect, keys=own, stop=stop)
@@ -158,7 +158,7 @@ def connect_bus(
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
     """Checked certificate and key of the node; warns of near expiry."""
-    from team.keys.credentials import credentials_of
+    from teamslam.team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
     for warning in own.warnings():
@@ -215,7 +215,7 @@ def refuse_existing(path: Path) -> None:
 
 def warn_of_holes(log: "Log") -> None:
     """Warn on stderr of missing messages, which results lack."""
-    from team.recording.check import holes
+    from teamslam.team.recording.check import holes
 
     tell_holes(log.path, holes(log))
 
@@ -273,7 +273,7 @@ def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
 
 def scenario_for(dataset: Path) -> str:
     """Scenario for a data set without one; prints its name."""
-    from sim.scenarios.source import scenario_beside
+    from teamslam.sim.scenarios.source import scenario_beside
 
     name = scenario_beside(dataset)
     if name == ASSUMED_NAME:
@@ -296,7 +296,7 @@ def scenario_of(name: str) -> Scenario:
 
 def check_names(team: str, robot: str | None = None) -> None:
     """Exit if a robot's or team's name is invalid."""
-    from team.keys.roster import ROBOT, TEAM
+    from teamslam.team.keys.roster import ROBOT, TEAM
 
     if robot is not None and not ROBOT.fullmatch(robot):
         fail(f"{robot!r} is no robot's name", WRONG_USE)
@@ -306,6 +306,6 @@ def check_names(team: str, robot: str | None = None) -> None:
 
 def signer_of(keys: Path | None, node: str, team: str) -> "Signer | None":
     """Signer of a node's messages; None without keys."""
-    from team.keys.signing import Signer
+    from teamslam.team.keys.signing import Signer
 
     return None if keys is None else Signer(own_keys(keys, node, team))

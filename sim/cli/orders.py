@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import (
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -17,7 +17,7 @@ from sim.cli.options import (
     fail,
     signer_of,
 )
-from team.wire.arrays import ids
+from teamslam.team.wire.arrays import ids
 
 Reason = Annotated[str, typer.Option(help="Why, for the log.")]
 
@@ -35,11 +35,11 @@ def map_(
     ] = 60.0,
 ) -> None:
     """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
-    from team.wire.arrays import floats
-    from team.wire.bus import BusError
-    from team.wire.channels import FOLD
-    from team.wire.codec import decoded
-    from team.wire.messages import FoldRequest, FusedMap
+    from teamslam.team.wire.arrays import floats
+    from teamslam.team.wire.bus import BusError
+    from teamslam.team.wire.channels import FOLD
+    from teamslam.team.wire.codec import decoded
+    from teamslam.team.wire.messages import FoldRequest, FusedMap
 
     with connect_bus(team, connect, keys, "operator") as bus:
         try:
@@ -70,8 +70,8 @@ def withdraw(
 
     The order is recorded and cannot be undone.
     """
-    from central.desk.orders import WithdrawError
-    from central.desk.orders import withdraw as order
+    from teamslam.central.desk.orders import WithdrawError
+    from teamslam.central.desk.orders import withdraw as order
 
     check_names(team, robot)
     with connect_bus(team, connect, keys, "operator") as bus:
@@ -104,9 +104,9 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is
     recorded and holds until it is withdrawn.
     """
-    from central.desk.evaluation.verdicts import contradicting, in_words
-    from central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
-    from team.wire.messages import Judgement
+    from teamslam.central.desk.evaluation.verdicts import contradicting, in_words
+    from teamslam.central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
+    from teamslam.team.wire.messages import Judgement
 
     if word not in ("same", "different"):
         fail(f"{word!r} is no verdict: same or different", WRONG_USE)
@@ -169,7 +169,7 @@ def end(
     with status 1. The router keeps the order until the end of the run, for a
     restarted centre.
     """
-    from central.desk.orders import WithdrawError, end_team, give_up
+    from teamslam.central.desk.orders import WithdrawError, end_team, give_up
 
     check_names(team, without)
     with connect_bus(team, connect, keys, "operator") as bus:

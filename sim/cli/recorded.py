@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
-from sim.cli.help import NETWORK, RARE, Command
-from sim.cli.options import (
+from teamslam.central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
+from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -25,11 +25,11 @@ from sim.cli.options import (
     warn_of_holes,
     write_json,
 )
-from sim.cli.results import print_evaluation, print_nis, print_written, read_run
-from sim.cli.steps import Steps
+from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
+from teamslam.sim.cli.steps import Steps
 
 if TYPE_CHECKING:
-    from team.recording.reader import Log
+    from teamslam.team.recording.reader import Log
 
 PICTURES = "Pictures for a paper or a talk"
 app = typer.Typer()
@@ -75,10 +75,10 @@ def replay(
     """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
     from contextlib import nullcontext
 
-    from team.recording.reader import open_log
-    from team.recording.shell import replay as replay_samples
-    from team.shell import process
-    from team.wire.zenoh.router import router
+    from teamslam.team.recording.reader import open_log
+    from teamslam.team.recording.shell import replay as replay_samples
+    from teamslam.team.shell import process
+    from teamslam.team.wire.zenoh.router import router
 
     pace = parsed_speed(speed)
     if connect is None:
@@ -152,10 +152,10 @@ def report(
     """Write page, pictures, tables and figures of a run from its log."""
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import add_holes, evaluate, to_json
-    from central.desk.report.page import write_pictures, write_report
-    from central.desk.report.run import run_figures
-    from team.recording.reader import open_log
+    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate, to_json
+    from teamslam.central.desk.report.page import write_pictures, write_report
+    from teamslam.central.desk.report.run import run_figures
+    from teamslam.team.recording.reader import open_log
 
     output = output or _folder_of(log)
     _check_folder(output)
@@ -195,7 +195,7 @@ def report(
 
 def _folder_of(log: Path) -> Path:
     """Folder of a run's report: the run's own, or one beside a log of another name."""
-    from team.recording.reader import IN_FOLDER
+    from teamslam.team.recording.reader import IN_FOLDER
 
     if log.is_dir():
         return log
@@ -229,10 +229,10 @@ def repair(
     ],
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
-    from sim.importing.source import is_own_log
-    from team.recording.bag_repair import repair_bag
-    from team.recording.reader import log_file
-    from team.recording.repair import repair_log
+    from teamslam.sim.importing.source import is_own_log
+    from teamslam.team.recording.bag_repair import repair_bag
+    from teamslam.team.recording.reader import log_file
+    from teamslam.team.recording.repair import repair_log
 
     refuse_existing(output)
     log = log_file(log)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.help import RARE, Command
-from sim.cli.options import (
+from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
     EstimatorOption,
@@ -20,14 +20,14 @@ from sim.cli.options import (
     warn_of_holes,
     write_json,
 )
-from sim.recorded.changes import Changes
+from teamslam.sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import Evaluation
-    from central.desk.evaluation.history import History
-    from central.desk.verification.verification import Verification
+    from teamslam.central.desk.evaluation.evaluation import Evaluation
+    from teamslam.central.desk.evaluation.history import History
+    from teamslam.central.desk.verification.verification import Verification
 
 app = typer.Typer()
 
@@ -178,7 +178,7 @@ def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
 
 
 def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
-    from sim.recorded.noise import KINDS
+    from teamslam.sim.recorded.noise import KINDS
 
     factors: dict[str, float] = {}
     for text in asked:
@@ -203,15 +203,20 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from rich.table import Table
     from rich.text import Text
 
-    from central.desk.compare import compare_rows, draw_maps, largest_move_m, same_final_map
-    from central.desk.evaluation.evaluation import evaluate, to_json
-    from central.desk.evaluation.history import history
-    from central.desk.evaluation.states import not_in_the_map
-    from central.desk.verification.recorded import RerunError
-    from sim.cli.importing import readable
-    from sim.recorded.changed_run import changed_run
-    from sim.recorded.data_set import DataSetRun, log_or_run
-    from team.recording.reader import Log
+    from teamslam.central.desk.compare import (
+        compare_rows,
+        draw_maps,
+        largest_move_m,
+        same_final_map,
+    )
+    from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+    from teamslam.central.desk.evaluation.history import history
+    from teamslam.central.desk.evaluation.states import not_in_the_map
+    from teamslam.central.desk.verification.recorded import RerunError
+    from teamslam.sim.cli.importing import readable
+    from teamslam.sim.recorded.changed_run import changed_run
+    from teamslam.sim.recorded.data_set import DataSetRun, log_or_run
+    from teamslam.team.recording.reader import Log
 
     with readable(path) as source:
         log = log_or_run(source)
@@ -258,7 +263,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
 def _print_warnings(
     recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
 ) -> None:
-    from central.desk.report.run import nis_line
+    from teamslam.central.desk.report.run import nis_line
 
     lines = [f"warning: {warning}" for warning in changed.warnings]
     lines += [f"note: {note}" for note in dict.fromkeys((*recorded.notes, *changed.notes))]
@@ -267,9 +272,9 @@ def _print_warnings(
 
 
 def _verify(path: Path, json_file: Path | None) -> None:
-    from central.desk.verification.recorded import RerunError
-    from central.desk.verification.verification import verify
-    from team.recording.reader import open_log
+    from teamslam.central.desk.verification.recorded import RerunError
+    from teamslam.central.desk.verification.verification import verify
+    from teamslam.team.recording.reader import open_log
 
     log = open_log(path)
     warn_of_holes(log)
@@ -307,7 +312,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         if row.first is not None:
             console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)
     if result.other_platform:
-        from central.desk.verification.differences import RELATIVE
+        from teamslam.central.desk.verification.differences import RELATIVE
 
         differing = ", ".join(result.other_platform)
         note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
@@ -335,11 +340,11 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
 
-    from central.desk.ledger import ledger
-    from central.desk.names import in_order
-    from central.desk.report.tables import disposition_sheet, terminal_table
-    from central.desk.verification.recorded import RerunError, recorded
-    from team.recording.reader import open_log
+    from teamslam.central.desk.ledger import ledger
+    from teamslam.central.desk.names import in_order
+    from teamslam.central.desk.report.tables import disposition_sheet, terminal_table
+    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.team.recording.reader import open_log
 
     try:
         opened = open_log(log)

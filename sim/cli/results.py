@@ -4,23 +4,23 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim.cli.steps import Steps
+from teamslam.sim.cli.steps import Steps
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from central.desk.evaluation.evaluation import Evaluation
-    from central.desk.report.run import Run
-    from team.recording.reader import Log
+    from teamslam.central.desk.evaluation.evaluation import Evaluation
+    from teamslam.central.desk.report.run import Run
+    from teamslam.team.recording.reader import Log
 
 
 def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":
     """Read a report's contents from a log; proves_ledger: also prove its ledger."""
-    from central.desk.evaluation.history import history
-    from central.desk.export.take_home import take_home
-    from central.desk.ledger import ledger
-    from central.desk.report.run import Run
-    from central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.desk.evaluation.history import history
+    from teamslam.central.desk.export.take_home import take_home
+    from teamslam.central.desk.ledger import ledger
+    from teamslam.central.desk.report.run import Run
+    from teamslam.central.desk.verification.recorded import RerunError, recorded
 
     steps.begin("reading the robots' inputs")
     messages = recorded(log)
@@ -39,7 +39,7 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
 
 def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
     """Print a run's tables and notes."""
-    from central.desk.report.tables import summary_tables
+    from teamslam.central.desk.report.tables import summary_tables
 
     for table in summary_tables(evaluation):
         console.print(table)
@@ -49,7 +49,7 @@ def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
 
 def print_nis(run: "Run", console: "Console") -> None:
     """Print the NIS per degree of freedom of every robot, if any."""
-    from central.desk.report.run import nis_line
+    from teamslam.central.desk.report.run import nis_line
 
     if (line := nis_line(run.history)) is not None:
         console.print(line, highlight=False, soft_wrap=True)

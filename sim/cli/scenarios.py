@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import (
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import (
     WRONG_USE,
     IdentitiesOption,
     Robots,
@@ -17,7 +17,7 @@ from sim.cli.options import (
     fail,
     scenario_of,
 )
-from sim.scenarios.scenario import builtin_names, load, with_options
+from teamslam.sim.scenarios.scenario import builtin_names, load, with_options
 
 app = typer.Typer()
 
@@ -33,7 +33,7 @@ def scenarios(
         if show not in builtin_names():
             known = ", ".join(builtin_names())
             fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        text = files("sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
+        text = files("teamslam.sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
         typer.echo(text, nl=False)
         return
     for name in builtin_names():
@@ -56,10 +56,10 @@ def simulate(
     points, covariances, detections without identities (their labels are in a
     separate file).
     """
-    from sim.datasets.folder_writer import write_folder
-    from sim.datasets.utias_writer import beyond_utias, write_utias
-    from sim.scenarios.source import streams_of
-    from sim.scenarios.toml import data_set_scenario, folder_scenario
+    from teamslam.sim.datasets.folder_writer import write_folder
+    from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
+    from teamslam.sim.scenarios.source import streams_of
+    from teamslam.sim.scenarios.toml import data_set_scenario, folder_scenario
 
     if output.exists() and any(output.iterdir()):
         fail(f"{output} is not empty: give a new folder", WRONG_USE)

@@ -4,9 +4,9 @@ from typing import Annotated, Any
 
 import typer
 
-from central.desk.names import in_order
-from sim.cli.help import Command
-from sim.cli.options import (
+from teamslam.central.desk.names import in_order
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     Connect,
@@ -36,7 +36,7 @@ def status(
     from rich.console import Console
     from rich.table import Table
 
-    from central.desk.presence import Presence
+    from teamslam.central.desk.presence import Presence
 
     check_names(team)
     presence = Presence()

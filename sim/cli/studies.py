@@ -4,9 +4,9 @@ from importlib import import_module
 
 import typer
 
-from sim.cli.options import WRONG_USE, fail
+from teamslam.sim.cli.options import WRONG_USE, fail
 
-STUDIES = "sim.studies"
+STUDIES = "teamslam.sim.studies"
 COMMANDS = ("experiment", "batch-reference", "limit")
 
 

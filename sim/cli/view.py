@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.help import RARE, Command
-from sim.cli.options import (
+from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -27,8 +27,8 @@ from sim.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from central.desk.view.server import Shown
-    from team.recording.reader import Log
+    from teamslam.central.desk.view.server import Shown
+    from teamslam.team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
 Port = Annotated[
@@ -62,8 +62,8 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 
     The recorder stores them beside the team's messages. Ends after the final map.
     """
-    from central.desk.view.viewer import run_viewer
-    from team.shell import process
+    from teamslam.central.desk.view.viewer import run_viewer
+    from teamslam.team.shell import process
 
     resolved = scenario_of(scenario)
     with (
@@ -116,8 +116,8 @@ def view(
     and events, without remote content. Foxglove and Lichtblick can connect, too.
     Ends with Ctrl-C.
     """
-    from team.recording.reader import log_file, open_log
-    from team.shell import process
+    from teamslam.team.recording.reader import log_file, open_log
+    from teamslam.team.shell import process
 
     log = log_file(log)
     if export_video is not None:
@@ -146,7 +146,7 @@ def shown_on_page(
     log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
 ) -> Iterator["Shown"]:
     """Serve a log, print the address, and open the page on request or on a display."""
-    from central.desk.view.server import session
+    from teamslam.central.desk.view.server import session
 
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")
@@ -165,12 +165,12 @@ def _has_display() -> bool:
 
 
 def _write_video(log: Path, path: Path) -> None:
-    from central.desk.evaluation.evaluation import evaluate
-    from central.desk.pictures.film import draw_film, maps_over_time
-    from team.recording.reader import open_log
-    from team.wire.channels import FINAL_MAP, FUSED_MAP
-    from team.wire.codec import decoded
-    from team.wire.messages import FusedMap
+    from teamslam.central.desk.evaluation.evaluation import evaluate
+    from teamslam.central.desk.pictures.film import draw_film, maps_over_time
+    from teamslam.team.recording.reader import open_log
+    from teamslam.team.wire.channels import FINAL_MAP, FUSED_MAP
+    from teamslam.team.wire.codec import decoded
+    from teamslam.team.wire.messages import FusedMap
 
     if path.suffix != ".gif" or not path.parent.is_dir():
         fail(f"--export-video {path}: give a .gif in an existing folder", WRONG_USE)
@@ -183,9 +183,9 @@ def _write_video(log: Path, path: Path) -> None:
 
 
 def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
-    from central.desk.view.export import export_views
-    from central.desk.view.layout import layout as layout_of
-    from team.wire.channels import ROBOT_CONFIG
+    from teamslam.central.desk.view.export import export_views
+    from teamslam.central.desk.view.layout import layout as layout_of
+    from teamslam.team.wire.channels import ROBOT_CONFIG
 
     for path in (export, layout):
         if path is not None:

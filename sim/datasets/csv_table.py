@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.datasets.tables import LARGEST, DatasetError, File
+from teamslam.sim.datasets.tables import LARGEST, DatasetError, File
 
 T = TypeVar("T")
 NANO = Decimal(10**9)

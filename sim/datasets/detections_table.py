@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.datasets.csv_table import CsvTable, cells_of, read_table
-from sim.datasets.folder_files import name_table
-from sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
-from sim.datasets.scans import on_circle
-from sim.datasets.some_rows import covariances_of
-from sim.datasets.tables import File
-from sim.world.identities import in_order
-from sim.world.streams import NO_LABEL, Detections
+from teamslam.sim.datasets.csv_table import CsvTable, cells_of, read_table
+from teamslam.sim.datasets.folder_files import name_table
+from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from teamslam.sim.datasets.scans import on_circle
+from teamslam.sim.datasets.some_rows import covariances_of
+from teamslam.sim.datasets.tables import File
+from teamslam.sim.world.identities import in_order
+from teamslam.sim.world.streams import NO_LABEL, Detections
 
 COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m")
 LABELS = ("landmark",)

@@ -6,7 +6,7 @@ r1/odometry.csv       t_s with forward_m_s,yaw_rate_rad_s or x_m,y_m,theta_rad o
 r1/observations.csv   t_s,landmark with range_m,bearing_rad (with c_rr,c_rb,c_bb) or
                       x_m,y_m (with c_xx,c_xy,c_yy)
 r1/detections.csv     t_s,range_m,bearing_rad without identities, and r1/labels.csv for scoring
-                      (`sim.datasets.detections_table`)                   (optional)
+                      (`teamslam.sim.datasets.detections_table`)                   (optional)
 r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
 r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
 r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
@@ -21,23 +21,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64
 
-from sim.datasets import folder_tables as rows
-from sim.datasets.csv_table import CsvTable, read_table
-from sim.datasets.detections_table import detections_of, together
-from sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
-from sim.datasets.folder_odometry import intervals_of
-from sim.datasets.scans import Scans
-from sim.datasets.some_rows import POSE_COVARIANCE
-from sim.datasets.tables import DatasetError, File
-from sim.world.config import FolderWorld, starts_unknown
-from sim.world.streams import (
+from teamslam.sim.datasets import folder_tables as rows
+from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.detections_table import detections_of, together
+from teamslam.sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
+from teamslam.sim.datasets.folder_odometry import intervals_of
+from teamslam.sim.datasets.scans import Scans
+from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
+from teamslam.sim.datasets.tables import DatasetError, File
+from teamslam.sim.world.config import FolderWorld, starts_unknown
+from teamslam.sim.world.streams import (
     Detections,
     Intervals,
     RobotStream,
     StartPose,
     WorldStreams,
 )
-from team.config import RobotConfig
+from teamslam.team.config import RobotConfig
 
 COVARIANCE = POSE_COVARIANCE
 TABLES = {

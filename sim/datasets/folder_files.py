@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from sim.datasets.tables import DatasetError, File
-from team.keys.roster import ROBOT
+from teamslam.sim.datasets.tables import DatasetError, File
+from teamslam.team.keys.roster import ROBOT
 
 ROBOT_NAME = ROBOT.pattern
 STREAM_FILES = ("odometry.csv", "observations.csv")

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from sim.datasets.csv_table import CsvTable, conversion
-from sim.datasets.folder_tables import (
+from teamslam.sim.datasets.csv_table import CsvTable, conversion
+from teamslam.sim.datasets.folder_tables import (
     DEGREE,
     INCREMENTS,
     NOT_A_COVARIANCE,
@@ -13,11 +13,11 @@ from sim.datasets.folder_tables import (
     STEERED,
     Rows,
 )
-from sim.datasets.scans import on_circle
-from sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
-from sim.world.streams import Intervals, moved
-from team.config import Bounds
-from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
+from teamslam.sim.datasets.scans import on_circle
+from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
+from teamslam.sim.world.streams import Intervals, moved
+from teamslam.team.config import Bounds
+from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
 MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))

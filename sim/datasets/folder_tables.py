@@ -8,15 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.datasets.csv_table import CsvTable, conversion
-from sim.datasets.scans import Scans, count_note, first_of_each, on_circle
-from sim.datasets.some_rows import (
+from teamslam.sim.datasets.csv_table import CsvTable, conversion
+from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
+from teamslam.sim.datasets.some_rows import (
     POSE_COVARIANCE,
     covariances_of,
     numbers_in,
     pose_covariances,
 )
-from sim.world.streams import StartPose
+from teamslam.sim.world.streams import StartPose
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")

@@ -1,13 +1,13 @@
-"""Write streams bit-exactly as a data set of CSV tables for `sim.datasets.folder`."""
+"""Write streams bit-exactly as a data set of CSV tables for `teamslam.sim.datasets.folder`."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.csv_table import cells_of
-from sim.datasets.detections_table import rows_of, split
-from sim.datasets.folder_tables import (
+from teamslam.sim.datasets.csv_table import cells_of
+from teamslam.sim.datasets.detections_table import rows_of, split
+from teamslam.sim.datasets.folder_tables import (
     INCREMENTS,
     POINT_COVARIANCE,
     POINTS,
@@ -17,8 +17,8 @@ from sim.datasets.folder_tables import (
     SPEEDS,
     STEERED,
 )
-from sim.datasets.some_rows import POSE_COVARIANCE
-from sim.world.streams import Detections, RobotStream, WorldStreams
+from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
+from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 
 Row = Sequence[object]
 

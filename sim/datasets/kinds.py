@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
-from sim.datasets import folder_files, tables, unlabelled
-from sim.datasets.tables import DatasetError
+from teamslam.sim.datasets import folder_files, tables, unlabelled
+from teamslam.sim.datasets.tables import DatasetError
 
 Kind = Literal["utias", "folder", "unlabelled"]
 UTIAS_MARKER = "Barcodes.dat"

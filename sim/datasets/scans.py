@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.world.streams import Detections, grouped
+from teamslam.sim.world.streams import Detections, grouped
 
 
 @dataclass(frozen=True)

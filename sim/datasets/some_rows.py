@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from sim.datasets.csv_table import CsvTable
+from teamslam.sim.datasets.csv_table import CsvTable
 
 POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 

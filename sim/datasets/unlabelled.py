@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.datasets.csv_table import CsvTable, read_table
-from sim.datasets.detections_table import labels_of, scans_of
-from sim.datasets.folder_odometry import pace_notes
-from sim.datasets.tables import DatasetError
-from sim.world.config import UnlabelledWorld
-from sim.world.streams import (
+from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.detections_table import labels_of, scans_of
+from teamslam.sim.datasets.folder_odometry import pace_notes
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.world.config import UnlabelledWorld
+from teamslam.sim.world.streams import (
     NO_LABEL,
     Detections,
     Intervals,

@@ -13,13 +13,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.datasets.errata import erratum_of
-from sim.datasets.tables import EXPECTED, DatasetError, File, open_data_set, optional_table, table
-from sim.datasets.utias_log import Log, log_of, present_robots
-from sim.datasets.utias_rows import start_pose
-from sim.world.config import UtiasWorld, starts_unknown
-from sim.world.streams import RobotStream, StartPose, WorldStreams
-from team.config import RobotConfig
+from teamslam.sim.datasets.errata import erratum_of
+from teamslam.sim.datasets.tables import (
+    EXPECTED,
+    DatasetError,
+    File,
+    open_data_set,
+    optional_table,
+    table,
+)
+from teamslam.sim.datasets.utias_log import Log, log_of, present_robots
+from teamslam.sim.datasets.utias_rows import start_pose
+from teamslam.sim.world.config import UtiasWorld, starts_unknown
+from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
+from teamslam.team.config import RobotConfig
 
 ROBOTS = 5
 """Subjects 1 … 5 are robots, even without files; landmarks follow."""

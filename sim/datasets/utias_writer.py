@@ -1,12 +1,12 @@
-"""Write streams in the UTIAS MRCLAM format, for `sim.datasets.utias`."""
+"""Write streams in the UTIAS MRCLAM format, for `teamslam.sim.datasets.utias`."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.utias import ROBOTS
-from sim.world.streams import RobotStream, WorldStreams
+from teamslam.sim.datasets.utias import ROBOTS
+from teamslam.sim.world.streams import RobotStream, WorldStreams
 
 Row = tuple[str | float, ...]
 

@@ -5,21 +5,21 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.importing.bag_topics import UndecidedError, decide_topics, listing
-from sim.importing.tables import RobotTables
-from team.ros2.bags import Bag, opened_bag
-from team.ros2.decoding import (
+from teamslam.sim.importing.bag_topics import UndecidedError, decide_topics, listing
+from teamslam.sim.importing.tables import RobotTables
+from teamslam.team.ros2.bags import Bag, opened_bag
+from teamslam.team.ros2.decoding import (
     DamagedError,
     OdometryRecord,
     Record,
     TransformsRecord,
     decode,
 )
-from team.ros2.frames import Frames
-from team.ros2.keys import moving_topics, static_topics
-from team.ros2.owners import Owners
-from team.ros2.topics import Topics
-from team.ros2.translator import Translator
+from teamslam.team.ros2.frames import Frames
+from teamslam.team.ros2.keys import moving_topics, static_topics
+from teamslam.team.ros2.owners import Owners
+from teamslam.team.ros2.topics import Topics
+from teamslam.team.ros2.translator import Translator
 
 
 @dataclass

@@ -3,13 +3,19 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from sim.datasets.tables import DatasetError
-from sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
-from team.ros2.bags import Bag, Topic, opened_bag
-from team.ros2.decoding import READERS, DamagedError, OdometryRecord, TransformsRecord, decode
-from team.ros2.keys import STATIC
-from team.ros2.topics import RobotTopics, Topics
-from team.ros2.translator import TAG
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
+from teamslam.team.ros2.bags import Bag, Topic, opened_bag
+from teamslam.team.ros2.decoding import (
+    READERS,
+    DamagedError,
+    OdometryRecord,
+    TransformsRecord,
+    decode,
+)
+from teamslam.team.ros2.keys import STATIC
+from teamslam.team.ros2.topics import RobotTopics, Topics
+from teamslam.team.ros2.translator import TAG
 
 ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from sim.datasets import detections_table, folder
-from sim.datasets.csv_table import CsvTable
-from sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POLAR, POSES
-from sim.datasets.tables import DatasetError
-from sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
+from teamslam.sim.datasets import detections_table, folder
+from teamslam.sim.datasets.csv_table import CsvTable
+from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POLAR, POSES
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

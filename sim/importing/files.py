@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sim.datasets.csv_table import CsvTable, read_table
-from sim.datasets.folder_tables import (
+from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.folder_tables import (
     POINT_COVARIANCE,
     POINTS,
     POLAR,
     POLAR_COVARIANCE,
     POSES,
 )
-from sim.datasets.tables import DatasetError
-from sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
-from sim.importing.tables import RobotTables
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
+from teamslam.sim.importing.tables import RobotTables
 
 QUATERNION = 8
 """Columns of a TUM trajectory: t x y z qx qy qz qw."""

@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
-from sim.datasets.folder_tables import POSES
-from sim.datasets.folder_writer import write_folder
-from sim.datasets.kinds import kind_of
-from sim.datasets.tables import DatasetError
-from sim.importing.bag import import_bag
-from sim.importing.bag_topics import propose_topics
-from sim.importing.columns import load_map
-from sim.importing.files import import_files, trajectory
-from sim.importing.tables import RobotTables
-from sim.recorded.streams import measurements_in
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
-from sim.scenarios.toml import folder_scenario
-from sim.world.streams import StartPose, WorldStreams
-from team.recording.check import holes
-from team.recording.reader import LogError, open_log
-from team.ros2.bags import BagError, is_bag
-from team.ros2.topics import TopicsError, load_topics
+from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
+from teamslam.sim.datasets.folder_tables import POSES
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.datasets.kinds import kind_of
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.importing.bag import import_bag
+from teamslam.sim.importing.bag_topics import propose_topics
+from teamslam.sim.importing.columns import load_map
+from teamslam.sim.importing.files import import_files, trajectory
+from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.recorded.streams import measurements_in
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.scenarios.toml import folder_scenario
+from teamslam.sim.world.streams import StartPose, WorldStreams
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.ros2.bags import BagError, is_bag
+from teamslam.team.ros2.topics import TopicsError, load_topics
 
 TEAM_PROFILE = b"teamslam"
 HEAD = 64

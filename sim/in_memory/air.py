@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from sim.scenarios.scenario import Scenario
-from sim.world.radio import Reach as WorldReach
-from sim.world.radio import reach_of
-from sim.world.streams import WorldStreams
-from team.estimation.randomness import generator
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.radio import Reach as WorldReach
+from teamslam.sim.world.radio import reach_of
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.estimation.randomness import generator
 
 Reach = Callable[[str, str, int], bool]
 """Whether two nodes reach each other at a team time [ns]."""

@@ -8,11 +8,11 @@ import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from team.estimation.randomness import generator
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 
 RESEND_NS = 1_000_000_000
 """A lost submap is sent again after this time."""

@@ -7,23 +7,23 @@ import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from central.peers.centre import PeerCentre
-from central.peers.peer import CENTRE
-from central.peers.robot import PeerRobot
-from sim.in_memory.air import Air
-from sim.in_memory.team import ROUND_S, World
-from sim.publisher.node import WorldNode, expected_nodes
-from sim.scenarios.scenario import Scenario
-from sim.scenarios.source import tells_map
-from sim.world.streams import WorldStreams
-from team.config import RobotConfig
-from team.containment import Boundary
-from team.peers.members import Member
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.peer import CENTRE
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.sim.in_memory.air import Air
+from teamslam.sim.in_memory.team import ROUND_S, World
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.source import tells_map
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import RobotConfig
+from teamslam.team.containment import Boundary
+from teamslam.team.peers.members import Member
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 
 AFTER_S = 3600.0
 """Team time [s] after the streams' end at which incomplete peers give up."""

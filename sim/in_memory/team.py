@@ -5,20 +5,20 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
-from central.config import CentralConfig
-from central.node import CentralNode, make_centre
-from sim.in_memory.links import Conditions, Link
-from sim.publisher.node import WorldNode, expected_nodes
-from sim.scenarios.scenario import Scenario
-from sim.scenarios.source import tells_map
-from sim.world.streams import WorldStreams
-from team.config import Exchange, RobotConfig
-from team.containment import Boundary
-from team.robot.node import RobotNode, robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.digest import configured
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode, make_centre
+from teamslam.sim.in_memory.links import Conditions, Link
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.source import tells_map
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.containment import Boundary
+from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from teamslam.team.wire.digest import configured
 
 ROUND_S = 1.0
 """Team time [s] of one round, which keeps robots within a window of each other's messages, as in

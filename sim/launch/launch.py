@@ -7,18 +7,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from central.desk.peers_as_centre import LISTENS, PeersAsCentre
-from sim.launch.plan import Plan
-from sim.launch.processes import Starter, Used
-from sim.launch.supervision import failure, lacking_in, names_only, supervise
-from sim.launch.supervisor import Ended, Supervised, end_all
-from sim.launch.watch import Watch
-from sim.scenarios.scenario import dumps
-from team.keys.credentials import Credentials, credentials_of
-from team.peers.proofs import Signs
-from team.wire import channels as ch
-from team.wire.bus import BusError
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre
+from teamslam.sim.launch.plan import Plan
+from teamslam.sim.launch.processes import Starter, Used
+from teamslam.sim.launch.supervision import failure, lacking_in, names_only, supervise
+from teamslam.sim.launch.supervisor import Ended, Supervised, end_all
+from teamslam.sim.launch.watch import Watch
+from teamslam.sim.scenarios.scenario import dumps
+from teamslam.team.keys.credentials import Credentials, credentials_of
+from teamslam.team.peers.proofs import Signs
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.zenoh.bus import ZenohBus
 
 ROUTER_PATIENCE_S = 20.0
 """Time [s] within which the router reports its endpoint; Python starts slowly on a busy machine."""
@@ -56,8 +56,8 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
     """Start router, recorder, world, centre and robots; return when all have ended.
 
     `show` repeatedly receives the team's state. A dead process is restarted or given up
-    (`sim.launch.supervision`). Raises BusError if the router cannot listen, LaunchError if it does
-    not start. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
+    (`teamslam.sim.launch.supervision`). Raises BusError if the router cannot listen, LaunchError if
+    it does not start. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
     """
     began = time.monotonic()
     resolved = plan.folder / "scenario.json"
@@ -146,7 +146,7 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
 
 def _signer(own: Credentials) -> Signs:
     """Signer of orders, imported only if there are keys."""
-    from team.keys.signing import Signer
+    from teamslam.team.keys.signing import Signer
 
     return Signer(own)
 

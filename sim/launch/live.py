@@ -14,14 +14,14 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from central.desk.evaluation.events import without_decimals
-from central.desk.names import in_order, short
-from sim.launch import progress
-from sim.launch.watch import DRIVERS, Watch
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.events import without_decimals
+from teamslam.central.desk.names import in_order, short
+from teamslam.sim.launch import progress
+from teamslam.sim.launch.watch import DRIVERS, Watch
+from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:
-    from sim.launch.truth import LiveErrors
+    from teamslam.sim.launch.truth import LiveErrors
 
 LINE_S = 5.0
 """Wall time between plain lines."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.scenario import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)

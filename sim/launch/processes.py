@@ -9,11 +9,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from team.shell import PARENT
-from team.the_end import SINCE
+from teamslam.team.shell import PARENT
+from teamslam.team.the_end import SINCE
 
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
-PROGRAM = (sys.executable, "-P", "-m", "sim")
+PROGRAM = (sys.executable, "-P", "-m", "teamslam")
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )

@@ -3,9 +3,9 @@
 import math
 import time
 
-from central.desk.names import in_order, not_joined
-from sim.launch.watch import DRIVERS, Watch, team_time
-from team.wire import messages as m
+from teamslam.central.desk.names import in_order, not_joined
+from teamslam.sim.launch.watch import DRIVERS, Watch, team_time
+from teamslam.team.wire import messages as m
 
 AHEAD_S = 10.0
 """Smallest reported lead of the world over the map [s]."""

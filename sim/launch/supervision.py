@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from central.desk.orders import publish_order
-from sim.launch.supervisor import Ended, Supervised
-from sim.launch.watch import TURN_S, Watch
-from team.shell import lacking
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, BusError, Outgoing
+from teamslam.central.desk.orders import publish_order
+from teamslam.sim.launch.supervisor import Ended, Supervised
+from teamslam.sim.launch.watch import TURN_S, Watch
+from teamslam.team.shell import lacking
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, BusError, Outgoing
 
 SILENT_S = 10.0
 """Silence [s] after which a running process is reported."""

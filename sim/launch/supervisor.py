@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.launch.processes import Starter, Used
-from team.wire.text import one_line
+from teamslam.sim.launch.processes import Starter, Used
+from teamslam.team.wire.text import one_line
 
 LAST_LINES = 12
 GRACE_S = 5.0

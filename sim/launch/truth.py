@@ -1,21 +1,21 @@
 """Compare a running team's poses and map with the truth as they arrive.
 
-The figures are those of `central.desk.evaluation` so far; empty without truth. Frames that no known
-initial pose fixes are not compared.
+The figures are those of `teamslam.central.desk.evaluation` so far; empty without truth. Frames that
+no known initial pose fixes are not compared.
 """
 
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from central.desk.evaluation.running import (
+from teamslam.central.desk.evaluation.running import (
     NeesTally,
     RunningErrors,
     TrueLandmarks,
     TruthFrames,
 )
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 
 EVERY_NS = 1_000_000_000
 """Least team time between a robot's compared poses; others are not decoded."""

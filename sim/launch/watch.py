@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from central.desk.names import in_order
-from central.desk.peers_as_centre import PeersAsCentre
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, Sample, shown
-from team.wire.codec import WireError
-from team.wire.newer import is_newer_map
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, Sample, shown
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.newer import is_newer_map
 
 if TYPE_CHECKING:
-    from sim.launch.truth import LiveErrors
-    from team.peers.proofs import Signs
+    from teamslam.sim.launch.truth import LiveErrors
+    from teamslam.team.peers.proofs import Signs
 
 TURN_S = 0.1
 DRIVERS = "drivers"
@@ -31,7 +31,7 @@ _PROGRESS = ("measurements", "submaps", "messages")
 
 def _no_errors() -> "LiveErrors":
     """Empty `LiveErrors`, imported here because the import outlasts the start of the processes."""
-    from sim.launch.truth import LiveErrors
+    from teamslam.sim.launch.truth import LiveErrors
 
     return LiveErrors()
 

@@ -8,7 +8,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 SHOWN = 3
 """Most differing fields in a warning."""

@@ -4,18 +4,18 @@ import logging
 import threading
 import time
 
-from sim.publisher.configurations import Configurations
-from sim.publisher.node import WorldNode, expected_nodes
-from sim.radio.bus import plan_of
-from sim.scenarios.scenario import Scenario
-from sim.scenarios.source import tells_map
-from sim.world.radio import reach_of
-from sim.world.streams import WorldStreams
-from team.shell import Shell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, Outgoing
-from team.wire.digest import configured
+from teamslam.sim.publisher.configurations import Configurations
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.radio.bus import plan_of
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.source import tells_map
+from teamslam.sim.world.radio import reach_of
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.shell import Shell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, Outgoing
+from teamslam.team.wire.digest import configured
 
 PACE_S = 0.002
 """Wait [s] for the clock or credit."""

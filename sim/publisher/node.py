@@ -12,21 +12,21 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from sim.publisher.configurations import Configurations
-from sim.publisher.source import TRUTH_BATCH_NS, Source, for_the_evaluator
-from sim.world.streams import WorldStreams
-from team.driver.source import (
+from teamslam.sim.publisher.configurations import Configurations
+from teamslam.sim.publisher.source import TRUTH_BATCH_NS, Source, for_the_evaluator
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.driver.source import (
     BATCH,
     CREDIT_MEASUREMENTS,
     CREDIT_RECORDER,
     FIRST_INCARNATION,
     answered,
 )
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded
 
 BLOCKED_S = 5.0
 """Duration [s] of missing credit after which a node is named in the status."""

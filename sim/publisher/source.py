@@ -5,13 +5,13 @@ from typing import TypedDict
 
 import numpy as np
 
-from sim.world import streams as s
-from sim.world.streams import RobotStream
-from team.driver.source import FIRST_INCARNATION
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Outgoing
+from teamslam.sim.world import streams as s
+from teamslam.sim.world.streams import RobotStream
+from teamslam.team.driver.source import FIRST_INCARNATION
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Outgoing
 
 TRUTH_BATCH_NS = 1_000_000_000
 _CHANNEL_OF_KIND = {

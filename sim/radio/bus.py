@@ -11,12 +11,12 @@ from collections.abc import Iterable
 from hashlib import blake2b
 from typing import cast
 
-from sim.world.config import Radio
-from sim.world.radio import Reach
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Answer, Bus, Outgoing, Sample, Tap
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.sim.world.config import Radio
+from teamslam.sim.world.radio import Reach
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Answer, Bus, Outgoing, Sample, Tap
+from teamslam.team.wire.codec import WireError, decoded, encoded
 
 _RADIO = {
     channel.name

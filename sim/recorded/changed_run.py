@@ -2,17 +2,17 @@
 
 import msgspec
 
-from sim.in_memory.links import Conditions, Partition
-from sim.in_memory.team import run_nodes
-from sim.recorded.changes import Changes, Span
-from sim.recorded.noise import with_noise
-from sim.recorded.unsafe import unsafe_robot
-from sim.recorded.world import RecordedWorld, Samples
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import Scenario, with_options
-from team.pairs import FEEDBACK
-from team.robot.node import robot_node
-from team.wire.bus import Sample
+from teamslam.sim.in_memory.links import Conditions, Partition
+from teamslam.sim.in_memory.team import run_nodes
+from teamslam.sim.recorded.changes import Changes, Span
+from teamslam.sim.recorded.noise import with_noise
+from teamslam.sim.recorded.unsafe import unsafe_robot
+from teamslam.sim.recorded.world import RecordedWorld, Samples
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.scenario import Scenario, with_options
+from teamslam.team.pairs import FEEDBACK
+from teamslam.team.robot.node import robot_node
+from teamslam.team.wire.bus import Sample
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:

@@ -3,13 +3,13 @@
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from sim.in_memory.team import run_team
-from sim.recorded.world import Samples
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
-from team.recording.reader import open_log
-from team.wire.bus import Sample
-from team.wire.channels import Channel, channel_of
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.recorded.world import Samples
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import Channel, channel_of
 
 
 class DataSetRun:

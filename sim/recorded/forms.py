@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.datasets.detections_table import together
-from sim.world.streams import NO_LABEL, Detections, Intervals
-from team import translate
-from team.estimation.scans import Scan
-from team.wire import messages as m
-from team.wire.arrays import floats, ids, stamps
+from teamslam.sim.datasets.detections_table import together
+from teamslam.sim.world.streams import NO_LABEL, Detections, Intervals
+from teamslam.team import translate
+from teamslam.team.estimation.scans import Scan
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids, stamps
 
 FORM_NAMES = {
     m.Odometry: "speeds",

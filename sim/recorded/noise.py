@@ -6,7 +6,7 @@ from typing import cast
 
 import msgspec
 
-from team.config import Alphas, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.config import Alphas, MotionModel, MotionNoise, RobotConfig, Sensor
 
 KINDS: Mapping[str, str] = MappingProxyType(
     {

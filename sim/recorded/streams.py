@@ -5,22 +5,22 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.datasets.scans import count_note
-from sim.recorded.forms import forms_of, intervals_of, landmarks_of
-from sim.scenarios.scenario import Scenario, ScenarioError, loads
-from sim.world.streams import (
+from teamslam.sim.datasets.scans import count_note
+from teamslam.sim.recorded.forms import forms_of, intervals_of, landmarks_of
+from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, loads
+from teamslam.sim.world.streams import (
     Detections,
     RobotStream,
     StartPose,
     WorldStreams,
     grouped,
 )
-from team import translate
-from team.recording.reader import LogError, open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, ids, stamps
-from team.wire.bus import opened
+from teamslam.team import translate
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids, stamps
+from teamslam.team.wire.bus import opened
 
 CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.WORLD_CONFIG)
 

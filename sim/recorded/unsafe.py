@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from team import translate
-from team.config import Exchange, RobotConfig
-from team.core import WholeMap, check_packed_covariance
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.map_joining.conditioning import RobotPrior
-from team.estimation.map_joining.whole_map import initial_map, joined
-from team.estimation.submap import LocalMap
-from team.robot.node import RobotNode
-from team.wire import messages as m
+from teamslam.team import translate
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.core import WholeMap, check_packed_covariance
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior
+from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import messages as m
 
 
 def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:

@@ -3,14 +3,14 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from sim.datasets.utias_writer import beyond_utias, write_utias
-from sim.recorded.streams import recorded_streams
-from team.driver.source import FIRST_INCARNATION
-from team.recording.reader import Log, LogError
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
-from team.wire.codec import WireError
+from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
+from teamslam.sim.recorded.streams import recorded_streams
+from teamslam.team.driver.source import FIRST_INCARNATION
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import WireError
 
 CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 

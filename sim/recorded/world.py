@@ -6,15 +6,15 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 import msgspec
 
-from central.desk.verification.recorded import RerunError
-from sim.scenarios.scenario import Scenario, loads
-from team.pairs import NEEDS_MAP
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats
-from team.wire.bus import Outgoing, Sample, opened
-from team.wire.codec import WireError
-from team.wire.digest import configured
+from teamslam.central.desk.verification.recorded import RerunError
+from teamslam.sim.scenarios.scenario import Scenario, loads
+from teamslam.team.pairs import NEEDS_MAP
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.bus import Outgoing, Sample, opened
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.digest import configured
 
 STEP_NS = 1_000_000_000
 """Team time between two checks of the nodes' answers."""

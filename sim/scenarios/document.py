@@ -2,12 +2,12 @@
 
 base = "thesis"            # optional: a built-in scenario that this file changes
 name, team, seed, estimator, fusion, exchange, peers, centre
-[world]      kind = "simulated" | "utias" | "folder", then the fields of sim.world.config
-[defaults]   fields of every robot (team.config.RobotConfig)
+[world]      kind = "simulated" | "utias" | "folder", then the fields of teamslam.sim.world.config
+[defaults]   fields of every robot (teamslam.team.config.RobotConfig)
 [[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
              world: its five; in a world of a folder: those that it has
-[radio]      fields of sim.world.config.Radio: who reaches whom where there is no centre
-[central]    fields of central.config.CentralConfig
+[radio]      fields of teamslam.sim.world.config.Radio: who reaches whom where there is no centre
+[central]    fields of teamslam.central.config.CentralConfig
 """
 
 import re
@@ -20,9 +20,9 @@ from typing import Any
 
 import msgspec
 
-from central.config import CentralConfig
-from sim.scenarios.checks import ScenarioError, check_fields, check_known, close, plain
-from team.config import RobotConfig
+from teamslam.central.config import CentralConfig
+from teamslam.sim.scenarios.checks import ScenarioError, check_fields, check_known, close, plain
+from teamslam.team.config import RobotConfig
 
 MAX_ROBOTS = 1_000
 UTIAS_ROBOTS = 5
@@ -34,7 +34,7 @@ Fields = dict[str, Any]
 
 def builtin_names() -> tuple[str, ...]:
     """Names of the installed scenarios."""
-    found = (entry.name for entry in files("sim.scenarios.builtin").iterdir())
+    found = (entry.name for entry in files("teamslam.sim.scenarios.builtin").iterdir())
     return tuple(sorted(name[:-5] for name in found if name.endswith(".toml")))
 
 
@@ -117,7 +117,7 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
     if count is not None:
         return [{}] * checked_count(count)
     if world.get("kind") == "folder":
-        from sim.datasets.folder_files import robots_of
+        from teamslam.sim.datasets.folder_files import robots_of
 
         path = world.get("path")
         named = robots_of(path) if isinstance(path, str) and path else (ANY_ROBOT,)
@@ -143,7 +143,7 @@ def checked_count(count: object) -> int:
 
 def _builtin(name: str) -> Fields:
     return _based(
-        _parsed(files("sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
+        _parsed(files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
     )
 
 

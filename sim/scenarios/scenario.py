@@ -1,7 +1,7 @@
 """A scenario: world, robots with models, centre and seed.
 
-Users write TOML (`sim.scenarios.document`); processes receive the resolved scenario as JSON
-(`dumps`, `loads`).
+Users write TOML (`teamslam.sim.scenarios.document`); processes receive the resolved scenario as
+JSON (`dumps`, `loads`).
 """
 
 import re
@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from central.team_config import TeamConfig
-from sim.scenarios.checks import ScenarioError, check_fields, plain, types_of
-from sim.scenarios.document import (
+from teamslam.central.team_config import TeamConfig
+from teamslam.sim.scenarios.checks import ScenarioError, check_fields, plain, types_of
+from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,
     Fields,
     builtin_names,
@@ -22,19 +22,19 @@ from sim.scenarios.document import (
     named_document,
     resolved,
 )
-from sim.scenarios.worlds import WORLDS, check_world
-from sim.world.config import (
+from teamslam.sim.scenarios.worlds import WORLDS, check_world
+from teamslam.sim.world.config import (
     LiveWorld,
     Radio,
     SimulatedWorld,
     UtiasWorld,
     World,
 )
-from team.association import DEFAULT_PROFILE, AssociationProfile, profile_for
-from team.config import Estimator, Exchange, FusionRule, RobotConfig
-from team.former_names import with_current_names
-from team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
-from team.registry import absence
+from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile, profile_for
+from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
+from teamslam.team.former_names import with_current_names
+from teamslam.team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
+from teamslam.team.registry import absence
 
 __all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads",
            "scenario_warnings", "with_options"]  # fmt: skip
@@ -116,7 +116,7 @@ def with_options(
         if identities == "hidden" and scenario.central.association == DEFAULT_PROFILE:
             fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario))
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
-        from sim.datasets.folder_files import robots_of
+        from teamslam.sim.datasets.folder_files import robots_of
 
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
     if robots is not None:
@@ -155,8 +155,8 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 def _kind_of(path: str, otherwise: str) -> str:
     """Kind of a data set; `otherwise` if undetermined, so that reading it reports the fault."""
-    from sim.datasets.kinds import kind_of
-    from sim.datasets.tables import DatasetError
+    from teamslam.sim.datasets.kinds import kind_of
+    from teamslam.sim.datasets.tables import DatasetError
 
     try:
         return kind_of(path)

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import msgspec
 
-from sim.datasets.folder import folder
-from sim.datasets.folder_files import robots_of, scenario_in
-from sim.datasets.kinds import UTIAS_MARKER, kind_of
-from sim.datasets.tables import open_data_set
-from sim.datasets.unlabelled import is_car, unlabelled
-from sim.datasets.utias import utias
-from sim.datasets.utias_log import present_robots
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import Scenario
-from sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UnlabelledWorld
-from sim.world.identities import Hiding, with_hidden_identities
-from sim.world.simulator import simulated
-from sim.world.streams import WorldStreams
-from team.pairs import NEEDS_MAP
+from teamslam.sim.datasets.folder import folder
+from teamslam.sim.datasets.folder_files import robots_of, scenario_in
+from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
+from teamslam.sim.datasets.tables import open_data_set
+from teamslam.sim.datasets.unlabelled import is_car, unlabelled
+from teamslam.sim.datasets.utias import utias
+from teamslam.sim.datasets.utias_log import present_robots
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UnlabelledWorld
+from teamslam.sim.world.identities import Hiding, with_hidden_identities
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.pairs import NEEDS_MAP
 
 
 def streams_of(scenario: Scenario) -> WorldStreams:

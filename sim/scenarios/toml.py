@@ -6,11 +6,11 @@ from typing import Any
 import msgspec
 import tomli_w
 
-from central.config import CentralConfig
-from sim.scenarios.checks import TOP_LEVEL
-from sim.scenarios.scenario import Scenario
-from sim.world.config import UtiasWorld, starts_unknown
-from team.config import RobotConfig
+from teamslam.central.config import CentralConfig
+from teamslam.sim.scenarios.checks import TOP_LEVEL
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.config import UtiasWorld, starts_unknown
+from teamslam.team.config import RobotConfig
 
 
 def data_set_scenario(scenario: Scenario) -> str:

@@ -1,8 +1,8 @@
 """Kinds of world, and the error for an unknown kind."""
 
-from sim.scenarios.checks import ScenarioError, check_fields, close, types_of
-from sim.scenarios.document import Fields, builtin_names
-from sim.world.config import (
+from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, types_of
+from teamslam.sim.scenarios.document import Fields, builtin_names
+from teamslam.sim.world.config import (
     FolderWorld,
     LiveWorld,
     SimulatedWorld,

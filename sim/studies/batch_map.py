@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
-from sim.studies.batch_reference import growing as batch
-from sim.studies.estimators.robot_step import RobotStep
-from team.config import Sensor
-from team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory
+from teamslam.sim.studies.batch_reference import growing as batch
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.config import Sensor
+from teamslam.team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory
 
 _BATCH_ITERATIONS, _BATCH_DECREMENT = 200, 1e-5
 
@@ -17,7 +17,7 @@ def solved_map(
     initial_poses: Mapping[str, InitialPose],
     robust_c: float | None,
 ) -> BatchMap:
-    """Solve for all poses and landmarks of a team; see `team.library.batch_map`."""
+    """Solve for all poses and landmarks of a team; see `teamslam.team.library.batch_map`."""
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
     robots = sorted(keyframes)
     steps = [

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from sim.cli.help import Command
-from sim.cli.options import FAILED, fail, warn_of_holes
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import FAILED, fail, warn_of_holes
 
 Noise = Annotated[
     Literal["white", "profile"],
@@ -34,12 +34,12 @@ def batch_reference(
     ] = None,
 ) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
-    from sim.cli.importing import readable
-    from sim.recorded.data_set import log_or_run
-    from sim.studies.batch_reference.g2o import g2o_lines
-    from sim.studies.batch_reference.measurements import BatchReferenceError
-    from sim.studies.batch_reference.reference import batch_map
-    from team.recording.reader import Log
+    from teamslam.sim.cli.importing import readable
+    from teamslam.sim.recorded.data_set import log_or_run
+    from teamslam.sim.studies.batch_reference.g2o import g2o_lines
+    from teamslam.sim.studies.batch_reference.measurements import BatchReferenceError
+    from teamslam.sim.studies.batch_reference.reference import batch_map
+    from teamslam.team.recording.reader import Log
 
     with readable(log) as source:
         run = log_or_run(source)

@@ -2,8 +2,8 @@
 
 import typer
 
-from sim.studies.batch_reference_command import app as batch_reference_commands
-from sim.studies.experiment_command import app as experiment_commands
+from teamslam.sim.studies.batch_reference_command import app as batch_reference_commands
+from teamslam.sim.studies.experiment_command import app as experiment_commands
 
 
 def register(app: typer.Typer) -> None:

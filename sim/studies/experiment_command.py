@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sim.cli.help import Command, Group
-from sim.cli.options import FAILED, WRONG_USE, fail
-from sim.studies.experiments.catalogue import ENTRIES, Entry
-from team.extras import install_command
+from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.options import FAILED, WRONG_USE, fail
+from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
+from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
-    from sim.studies.experiments.runner import Plan
+    from teamslam.sim.studies.experiments.runner import Plan
 
 app = typer.Typer(
     name="experiment",
@@ -112,8 +112,8 @@ def merge(
     Runs that failed in a shard are computed again.
     """
     _require_joblib()
-    from sim.studies.experiments.runner import tasks_by_name
-    from sim.studies.experiments.shards import (
+    from teamslam.sim.studies.experiments.runner import tasks_by_name
+    from teamslam.sim.studies.experiments.shards import (
         ShardError,
         collect_results,
         described_study,
@@ -159,8 +159,8 @@ class Asked:
 
     def plans(self) -> "list[Plan]":
         """Plans of the experiment, or of all."""
-        from sim.studies.experiments.experiment import Options
-        from sim.studies.experiments.runner import dataset, planned
+        from teamslam.sim.studies.experiments.experiment import Options
+        from teamslam.sim.studies.experiments.runner import dataset, planned
 
         datasets = tuple(dataset(path) for path in self.paths)
         entries = [entry for entry in ENTRIES if self.name in (entry.name, ALL)]
@@ -186,11 +186,11 @@ def _require_joblib() -> None:
 def _run_shard(asked: Asked, text: str) -> None:
     _require_joblib()
 
-    from sim.studies.experiments.cases import SchedulerError
-    from sim.studies.experiments.experiment import without_datasets
-    from sim.studies.experiments.progress import shown
-    from sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
-    from sim.studies.experiments.shards import (
+    from teamslam.sim.studies.experiments.cases import SchedulerError
+    from teamslam.sim.studies.experiments.experiment import without_datasets
+    from teamslam.sim.studies.experiments.progress import shown
+    from teamslam.sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
+    from teamslam.sim.studies.experiments.shards import (
         ShardError,
         Study,
         parsed_shard,
@@ -239,12 +239,12 @@ def _run(asked: Asked) -> None:
 
     _require_joblib()
 
-    from sim.studies.experiments.cases import SchedulerError
-    from sim.studies.experiments.experiment import without_datasets
-    from sim.studies.experiments.output import printed, to_json, write
-    from sim.studies.experiments.progress import shown
-    from sim.studies.experiments.runner import FAILURES, computed, cores
-    from team.recording.provenance import provenance
+    from teamslam.sim.studies.experiments.cases import SchedulerError
+    from teamslam.sim.studies.experiments.experiment import without_datasets
+    from teamslam.sim.studies.experiments.output import printed, to_json, write
+    from teamslam.sim.studies.experiments.progress import shown
+    from teamslam.sim.studies.experiments.runner import FAILURES, computed, cores
+    from teamslam.team.recording.provenance import provenance
 
     name = asked.name
     if asked.json_file is not None and not asked.json_file.absolute().parent.is_dir():

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from team.config import Fraction, NonNegative, Positive, RobotConfig
+from teamslam.team.config import Fraction, NonNegative, Positive, RobotConfig
 
 Identities = Literal["known", "hidden"]
 OutlierKind = Literal["measurement", "identity", "drop"]

@@ -7,9 +7,9 @@ points with covariance. The formulas are independent of the filter's.
 import numpy as np
 from jaxtyping import Float
 
-from sim.world.odometry import Column, deviation
-from sim.world.sensing import Visible
-from team.config import MotionModel, Sensor
+from teamslam.sim.world.odometry import Column, deviation
+from teamslam.sim.world.sensing import Visible
+from teamslam.team.config import MotionModel, Sensor
 
 Rows = Float[np.ndarray, "K 3"]
 

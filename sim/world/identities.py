@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
+from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 
 
 @dataclass(frozen=True)

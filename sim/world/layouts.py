@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from sim.world.config import SimulatedWorld
+from teamslam.sim.world.config import SimulatedWorld
 
 INNER = 0.1
 """Least wall distance of a landmark, as a share of a room's side."""

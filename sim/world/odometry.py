@@ -7,7 +7,7 @@ noise, converted back through its calibration. The formulas follow the sources, 
 import numpy as np
 from jaxtyping import Float
 
-from team.config import MotionModel, MotionNoise
+from teamslam.team.config import MotionModel, MotionNoise
 
 Column = Float[np.ndarray, " K"]
 

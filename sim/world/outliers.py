@@ -7,8 +7,8 @@ comparable.
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.world.config import OutlierKind
-from sim.world.streams import Detections
+from teamslam.sim.world.config import OutlierKind
+from teamslam.sim.world.streams import Detections
 
 
 def spoilt(

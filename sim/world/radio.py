@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from sim.world.config import Radio
-from sim.world.streams import RobotStream
+from teamslam.sim.world.config import Radio
+from teamslam.sim.world.streams import RobotStream
 
 PERIOD_NS = 1_000_000_000
 """Team time [ns] of constant reach."""

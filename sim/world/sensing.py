@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.config import Sensor
+from teamslam.team.config import Sensor
 
 SHORTEST_MEASUREMENT_M = 0.05
 """Least measured range [m]."""

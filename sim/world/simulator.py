@@ -13,13 +13,19 @@ from math import atan2, hypot
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.world.config import SimulatedWorld, starts_unknown
-from sim.world.forms import claimed, measured_increments, measured_steering, seen_from, with_errors
-from sim.world.layouts import laid_out
-from sim.world.odometry import measured_speeds, slip
-from sim.world.outliers import spoilt
-from sim.world.paths import Drive, Limits, Pose, Step, driven, followed
-from sim.world.sensing import (
+from teamslam.sim.world.config import SimulatedWorld, starts_unknown
+from teamslam.sim.world.forms import (
+    claimed,
+    measured_increments,
+    measured_steering,
+    seen_from,
+    with_errors,
+)
+from teamslam.sim.world.layouts import laid_out
+from teamslam.sim.world.odometry import measured_speeds, slip
+from teamslam.sim.world.outliers import spoilt
+from teamslam.sim.world.paths import Drive, Limits, Pose, Step, driven, followed
+from teamslam.sim.world.sensing import (
     SHORTEST_MEASUREMENT_M,
     Visible,
     measurements,
@@ -27,7 +33,7 @@ from sim.world.sensing import (
     persistent,
     visible,
 )
-from sim.world.streams import (
+from teamslam.sim.world.streams import (
     Detections,
     Intervals,
     RobotStream,
@@ -36,7 +42,7 @@ from sim.world.streams import (
     grouped,
     moved,
 )
-from team.config import RobotConfig, Sensor
+from teamslam.team.config import RobotConfig, Sensor
 
 LEAST_RADIUS = 1.5
 """Turning radius of a simulated car, in wheel bases."""

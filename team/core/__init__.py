@@ -24,7 +24,7 @@ def _levels() -> tuple[str, ...]:
 
 
 def _import_library() -> None:
-    """Import the library of the best level as `team.core._core`."""
+    """Import the library of the best level as `teamslam.team.core._core`."""
     for each in _levels():
         try:
             sys.modules[f"{__name__}._core"] = import_module(f"{__name__}._core_{each}")
@@ -39,7 +39,7 @@ def _import_library() -> None:
 
 _import_library()
 
-from team.core._core import (  # noqa: E402 - the level is chosen before
+from teamslam.team.core._core import (  # noqa: E402 - the level is chosen before
     LARGEST_RATIO,
     NEAREST_M,
     POSE_JITTER,

@@ -20,18 +20,18 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from team.config import Bounds
-from team.driver import journal as j
-from team.driver import measured
-from team.driver.link import Link
-from team.driver.measured import DriverWarning, MeasurementError
-from team.driver.motion import Odometer, Pose, between
-from team.driver.node import SourceNode
-from team.keys.roster import KeysError
-from team.wire import messages as m
-from team.wire.arrays import from_floats
-from team.wire.bus import BusError
-from team.wire.codec import encoded
+from teamslam.team.config import Bounds
+from teamslam.team.driver import journal as j
+from teamslam.team.driver import measured
+from teamslam.team.driver.link import Link
+from teamslam.team.driver.measured import DriverWarning, MeasurementError
+from teamslam.team.driver.motion import Odometer, Pose, between
+from teamslam.team.driver.node import SourceNode
+from teamslam.team.keys.roster import KeysError
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.codec import encoded
 
 CONNECT = "tcp/127.0.0.1:7447"
 REMIND_S = 10.0

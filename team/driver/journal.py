@@ -22,11 +22,11 @@ from typing import Any, Literal
 import msgpack
 import msgspec
 
-from team.driver.order import Sorter
-from team.driver.source import FIRST_INCARNATION
-from team.wall_clock import wall_clock, was_set_since
-from team.wire import messages as m
-from team.wire.codec import decoded
+from teamslam.team.driver.order import Sorter
+from teamslam.team.driver.source import FIRST_INCARNATION
+from teamslam.team.wall_clock import wall_clock, was_set_since
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded
 
 START, OBSERVATIONS, SIGHTINGS, ODOMETRY, MARK, POSE = range(6)
 """Kinds of records, in their order at equal stamps. MARK: state of the stream. POSE: a pose in the

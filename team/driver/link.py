@@ -8,16 +8,16 @@ from pathlib import Path
 
 import msgspec
 
-from team.door import MOST_LIVES
-from team.driver.node import SourceNode
-from team.keys.credentials import credentials_of
-from team.keys.roster import KeysError
-from team.shell import Shell
-from team.the_end import TheEnd
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import BusError
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.team.door import MOST_LIVES
+from teamslam.team.driver.node import SourceNode
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import KeysError
+from teamslam.team.shell import Shell
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.zenoh.bus import ZenohBus
 
 HEAD_S = 1.0
 """Wall time [s] between two stream heads."""

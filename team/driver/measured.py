@@ -8,9 +8,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import unsound
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import unsound
 
 M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"

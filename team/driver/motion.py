@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from team.config import Bounds
-from team.driver.measured import MeasurementError, wrapped
-from team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
+from teamslam.team.config import Bounds
+from teamslam.team.driver.measured import MeasurementError, wrapped
+from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 TOLERANCE = 0.1
 """Clock jitter: largest share of an interval between its start and the end of the last one."""

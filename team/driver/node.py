@@ -1,6 +1,6 @@
 """The driver's node: publish the file's measurements, answer requests, track the receivers.
 
-It is the source of one robot's stream, as the world is of all streams (`sim.publisher`).
+It is the source of one robot's stream, as the world is of all streams (`teamslam.sim.publisher`).
 """
 
 from collections.abc import Callable
@@ -9,15 +9,21 @@ from typing import ClassVar
 
 import msgspec
 
-from team.config import RobotConfig
-from team.door import absurd
-from team.driver.journal import Journal
-from team.driver.source import BATCH, CREDIT_MEASUREMENTS, CREDIT_RECORDER, answered, channel_of
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded
+from teamslam.team.config import RobotConfig
+from teamslam.team.door import absurd
+from teamslam.team.driver.journal import Journal
+from teamslam.team.driver.source import (
+    BATCH,
+    CREDIT_MEASUREMENTS,
+    CREDIT_RECORDER,
+    answered,
+    channel_of,
+)
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded
 
 DAY_NS = 86_400 * 10**9
 Stream = tuple[int, int]

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 
 CREDIT_MEASUREMENTS = 4096
 """Most measurements that a source is ahead of its robot, while that is present."""

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.estimation import dense
-from team.estimation.gaussian import cholesky_factor
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import cholesky_factor
 
 MEDIAN_PRICE = 1.3
 """Ratio of the scatter of a χ² median of a few degrees of freedom to that of its mean."""

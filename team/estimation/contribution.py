@@ -9,10 +9,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from team import core
-from team.config import Bias
-from team.estimation.gaussian import information
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.team import core
+from teamslam.team.config import Bias
+from teamslam.team.estimation.gaussian import information
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 Stream: TypeAlias = tuple[str, int]
 """(robot, incarnation): one unbroken life of a robot's sensor stream."""

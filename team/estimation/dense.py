@@ -5,7 +5,7 @@ product is one sum in the order of its index, whatever the shapes; parallel lane
 entries. Arrays of three and more axes are stacks of matrices, as in NumPy.
 """
 
-from team.core import (
+from teamslam.team.core import (
     cholesky,
     forward,
     inverse_of_factored,
@@ -13,7 +13,7 @@ from team.core import (
     solve,
     solve_factored,
 )
-from team.core import inverse_matrix as inverse
+from teamslam.team.core import inverse_matrix as inverse
 
 __all__ = [
     "cholesky",

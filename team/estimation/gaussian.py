@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team import core
-from team.estimation import dense
+from teamslam.team import core
+from teamslam.team.estimation import dense
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

@@ -13,13 +13,13 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.config import Sensor
-from team.estimation import dense
-from team.estimation.contribution import Stream, named
-from team.estimation.gaussian import information
-from team.estimation.models import NEAREST_M, Increment, noise
-from team.estimation.se2 import Pose, inverse, transformed, wrapped
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.gaussian import information
+from teamslam.team.estimation.models import NEAREST_M, Increment, noise
+from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
 
 SightingKey: TypeAlias = tuple[int, str, int, str]
 """(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""

@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from team import core
-from team.config import MotionModel, MotionNoise, Sensor
-from team.core import NEAREST_M, located, predicted
-from team.estimation.se2 import Pose
+from teamslam.team import core
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.core import NEAREST_M, located, predicted
+from teamslam.team.estimation.se2 import Pose
 
 __all__ = [
     "NEAREST_M",

@@ -8,11 +8,11 @@ the base's is m ∘ S ∘ m⁻¹, and a point p in the frame of the sensor's sta
 
 import numpy as np
 
-from team import core
-from team.estimation import dense
-from team.estimation.gaussian import PoseGaussian
-from team.estimation.models import Increment
-from team.estimation.se2 import Pose, compose, inverse
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import PoseGaussian
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import Pose, compose, inverse
 
 
 def of_sensor(step: Increment, mount: Pose) -> Increment:

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.config import MotionModel
-from team.estimation.models import Increment, increment_of, model_of
-from team.estimation.se2 import Pose, logarithm
+from teamslam.team import core
+from teamslam.team.config import MotionModel
+from teamslam.team.estimation.models import Increment, increment_of, model_of
+from teamslam.team.estimation.se2 import Pose, logarithm
 
 
 class Moved(NamedTuple):

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from team import core
-from team.config import Bounds
-from team.estimation import dense
-from team.estimation.contribution import InitialPoseFactor
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.submap import LocalMap
+from teamslam.team import core
+from teamslam.team.config import Bounds
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import InitialPoseFactor
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.submap import LocalMap
 
 Values = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]

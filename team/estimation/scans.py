@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from team import core
-from team.config import Bounds, Sensor
-from team.estimation.models import NEAREST_M
+from teamslam.team import core
+from teamslam.team.config import Bounds, Sensor
+from teamslam.team.estimation.models import NEAREST_M
 
 SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
 Own = Float[np.ndarray, "_ _"]

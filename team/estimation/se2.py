@@ -7,7 +7,7 @@ Perturbations are on the right, in the tangent space of the pose they perturb:
 import numpy as np
 from jaxtyping import Float
 
-from team.core import (
+from teamslam.team.core import (
     adjoint,
     between,
     compose,

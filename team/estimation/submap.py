@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from team import core
-from team.config import UNNAMED, Bias
+from teamslam.team import core
+from teamslam.team.config import UNNAMED, Bias
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))

@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from team.keys.credentials import CA
-from team.keys.roster import (
+from teamslam.team.keys.credentials import CA
+from teamslam.team.keys.roster import (
     ROSTER,
     KeysError,
     Roster,

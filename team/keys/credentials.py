@@ -15,7 +15,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 from cryptography.x509.oid import NameOID
 
-from team.keys.roster import KeysError
+from teamslam.team.keys.roster import KeysError
 
 CA = "ca.pem"
 SOON = timedelta(days=7)

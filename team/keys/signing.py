@@ -14,8 +14,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from team.keys.credentials import Credentials
-from team.keys.roster import ROSTER, Issued, KeysError, load_roster
+from teamslam.team.keys.credentials import Credentials
+from teamslam.team.keys.roster import ROSTER, Issued, KeysError, load_roster
 
 _ALGORITHM = ec.ECDSA(hashes.SHA256())
 

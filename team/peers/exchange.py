@@ -4,17 +4,17 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
-from team.door import MOST_LIVES
-from team.peers.members import Member
-from team.peers.replica import (
+from teamslam.team.door import MOST_LIVES
+from teamslam.team.peers.members import Member
+from teamslam.team.peers.replica import (
     MOST_INTERVALS,
     MOST_SEQUENCES,
     MOST_STREAMS,
     Replica,
     intervals,
 )
-from team.store import Stream
-from team.wire import messages as m
+from teamslam.team.store import Stream
+from teamslam.team.wire import messages as m
 
 MOST_REQUESTED = 64
 """Most intervals per request."""

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from team.peers.replica import Replica
-from team.store import Stream
-from team.wire import messages as m
+from teamslam.team.peers.replica import Replica
+from teamslam.team.store import Stream
+from teamslam.team.wire import messages as m
 
 
 def feed_order(message: m.Message) -> int:

@@ -9,9 +9,9 @@ import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import NO_COUNTER, Sample, opened
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
 
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
 STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CERTIFICATE)

@@ -9,17 +9,17 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from team.peers.exchange import is_oversized, list_requested, make_answer, make_request
-from team.peers.feed import feed_order, new_of_streams
-from team.peers.given import GIVEN_BYTES, Given
-from team.peers.members import CHANNELS, Member, member_of
-from team.peers.proofs import Proofs
-from team.peers.replica import SHARE, RefusedError, Replica
-from team.store import Stream
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.team.peers.exchange import is_oversized, list_requested, make_answer, make_request
+from teamslam.team.peers.feed import feed_order, new_of_streams
+from teamslam.team.peers.given import GIVEN_BYTES, Given
+from teamslam.team.peers.members import CHANNELS, Member, member_of
+from teamslam.team.peers.proofs import Proofs
+from teamslam.team.peers.replica import SHARE, RefusedError, Replica
+from teamslam.team.store import Stream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import WireError, decoded, encoded
 
 SUMMARY_S = 1.0
 """Shortest interval [s] between two summaries."""

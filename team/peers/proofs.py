@@ -15,10 +15,10 @@ the same for all peers, and prove nothing.
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
-from team.keys.roster import Issued
-from team.peers.members import Member, about
-from team.peers.replica import Replica
-from team.wire import messages as m
+from teamslam.team.keys.roster import Issued
+from teamslam.team.peers.members import Member, about
+from teamslam.team.peers.replica import Replica
+from teamslam.team.wire import messages as m
 
 MOST_SIGNATURES = 250_000
 """Most signatures stored per node; a robot has one per member."""
@@ -33,7 +33,7 @@ ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
 
 @runtime_checkable
 class Signs(Protocol):
-    """Sign as one node, and verify other nodes' signatures (`team.keys.signing.Signer`)."""
+    """Sign as one node, and verify other nodes' signatures (`team/keys/signing.py: Signer`)."""
 
     certificate: bytes
 

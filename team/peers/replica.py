@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeVar
 
-from team.door import MOST_COUNT, MOST_LIVES
-from team.peers.members import Member, about
-from team.store import Stream
-from team.wire import messages as m
+from teamslam.team.door import MOST_COUNT, MOST_LIVES
+from teamslam.team.peers.members import Member, about
+from teamslam.team.store import Stream
+from teamslam.team.wire import messages as m
 
 MOST_SEQUENCES = 200_000
 """Most submaps per incarnation."""

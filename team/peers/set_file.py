@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import msgpack
 
-from team.peers.members import LARGEST_MEMBER, Member, member_of
-from team.wire import messages as m
+from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
+from teamslam.team.wire import messages as m
 
 MAGIC = b"tmsset1\n"
 RETRY_S = 5.0

@@ -10,7 +10,7 @@ from mcap.records import Channel, Chunk, Header, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
-from team.recording.records import LogError
+from teamslam.team.recording.records import LogError
 
 _FAULTS = (McapError, ValueError, struct.error, RuntimeError, MemoryError, OverflowError)
 

@@ -5,18 +5,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from team.recording.counters import Counters
-from team.recording.cut import CUT
-from team.recording.declared import find_misdeclaration, read_declarations
-from team.recording.inventory import MISSING, Inventory
-from team.recording.last_words import LastWords
-from team.recording.reader import Log, LogError
-from team.recording.records import check_index
-from team.recording.repair import REPAIRED, read_undamaged
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError
+from teamslam.team.recording.counters import Counters
+from teamslam.team.recording.cut import CUT
+from teamslam.team.recording.declared import find_misdeclaration, read_declarations
+from teamslam.team.recording.inventory import MISSING, Inventory
+from teamslam.team.recording.last_words import LastWords
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.records import check_index
+from teamslam.team.recording.repair import REPAIRED, read_undamaged
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError
 
 FILE = "file"
 """Place of a finding without a key."""

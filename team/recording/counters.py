@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int64
 
-from team.recording.inventory import intervals
-from team.wire.bus import NO_COUNTER, Sample
-from team.wire.intervals import Interval, IntervalSet
+from teamslam.team.recording.inventory import intervals
+from teamslam.team.wire.bus import NO_COUNTER, Sample
+from teamslam.team.wire.intervals import Interval, IntervalSet
 
 Life = Int64[np.ndarray, "_"]
 """Positions of one life's publications, by counter."""

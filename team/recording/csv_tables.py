@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
-from team.recording.reader import Log
-from team.recording.tables import HEAD, Exported, numbers_of, table_of
-from team.wire.channels import Channel
-from team.wire.messages import Digest, Message
+from teamslam.team.recording.reader import Log
+from teamslam.team.recording.tables import HEAD, Exported, numbers_of, table_of
+from teamslam.team.wire.channels import Channel
+from teamslam.team.wire.messages import Digest, Message
 
 
 def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:

@@ -3,11 +3,11 @@
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from team.recording.reader import Log, LogError
-from team.recording.recorder import Recorder
-from team.recording.summary import summarise_log
-from team.wire import channels as ch
-from team.wire.bus import Sample
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.summary import summarise_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
 
 CUT = "cut"
 """Metadata name that marks a cut, with the original log."""

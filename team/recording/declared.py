@@ -11,8 +11,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from team.recording.reader import Log
-from team.recording.records import (
+from teamslam.team.recording.reader import Log
+from teamslam.team.recording.records import (
     MALFORMED,
     Frame,
     LogError,
@@ -20,9 +20,9 @@ from team.recording.records import (
     read_frames,
     read_records,
 )
-from team.recording.schemas import schema_of
-from team.wire.channels import VIEW, channel_of
-from team.wire.messages import Message, tag_of
+from teamslam.team.recording.schemas import schema_of
+from teamslam.team.wire.channels import VIEW, channel_of
+from teamslam.team.wire.messages import Message, tag_of
 
 
 class Declared(NamedTuple):

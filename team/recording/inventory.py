@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 
 import msgpack
 
-from team.recording.received import Received
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import NO_COUNTER, Sample, opened
-from team.wire.codec import WireError
+from teamslam.team.recording.received import Received
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
+from teamslam.team.wire.codec import WireError
 
 MISSING = "missing: "
 """Prefix of the recorder's last note, which lists missing messages."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from team.recording.counters import match_totals, split_lives
-from team.wire import channels as ch
-from team.wire.bus import NO_COUNTER, Sample
-from team.wire.messages import Tally
+from teamslam.team.recording.counters import match_totals, split_lives
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import NO_COUNTER, Sample
+from teamslam.team.wire.messages import Tally
 
 
 @dataclass

@@ -5,10 +5,10 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from team.recording.reader import Log, LogError
-from team.recording.recorder import Recorder
-from team.wire.bus import Sample
-from team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
 
 _BY_CONTENT = (*SENSORS, SUBMAP, SIGHTING_FACTOR)
 MERGED = "merged"

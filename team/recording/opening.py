@@ -11,8 +11,8 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 from mcap.writer import MCAP0_MAGIC
 
-from team.recording.recorder import METADATA
-from team.recording.records import FOOTER_SIZE, MALFORMED, LogError, read_frames
+from teamslam.team.recording.recorder import METADATA
+from teamslam.team.recording.records import FOOTER_SIZE, MALFORMED, LogError, read_frames
 
 
 @dataclass(frozen=True)

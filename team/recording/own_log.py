@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from team.recording.inventory import Inventory
-from team.recording.parts import join, next_part
-from team.recording.provenance import provenance
-from team.recording.recorder import Recorder, RecorderError
-from team.wire.bus import Sample
+from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.parts import join, next_part
+from teamslam.team.recording.provenance import provenance
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.wire.bus import Sample
 
 OWN = "own_log"
 """Metadata name that marks a single process's log."""

@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
-from team.recording.reader import Log
-from team.recording.tables import Exported, numbers_of, table_of, type_of_numbers
-from team.wire.channels import Channel
-from team.wire.messages import Digest, Message
+from teamslam.team.recording.reader import Log
+from teamslam.team.recording.tables import Exported, numbers_of, table_of, type_of_numbers
+from teamslam.team.wire.channels import Channel
+from teamslam.team.wire.messages import Digest, Message
 
 GROUP_ROWS = 20_000
 GROUP_BYTES = 32 * 2**20

@@ -7,8 +7,8 @@ log names its last part in JOINED; leftover files up to that part are not read.
 from contextlib import suppress
 from pathlib import Path
 
-from team.recording.opening import LogFile, open_file
-from team.recording.records import LogError
+from teamslam.team.recording.opening import LogFile, open_file
+from teamslam.team.recording.records import LogError
 
 LOG_ID = "log_id"
 """Metadata name of the identifier shared by all parts."""

@@ -1,9 +1,9 @@
 """A log in parts: a restarted recorder continues in a further file.
 
-Readers treat `log.mcap`, `log.part2.mcap`, … as one log (`team.recording.reader`). At the end of a
-run they are joined into `log.mcap` in order of arrival, unless the disk is full. The joined log
-replaces the first part in one step, so a crash at any time neither loses nor repeats samples, and
-joining can restart.
+Readers treat `log.mcap`, `log.part2.mcap`, … as one log (`teamslam.team.recording.reader`). At the
+end of a run they are joined into `log.mcap` in order of arrival, unless the disk is full. The
+joined log replaces the first part in one step, so a crash at any time neither loses nor repeats
+samples, and joining can restart.
 """
 
 import os
@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from team.recording.inventory import Inventory
-from team.recording.opening import LogFile
-from team.recording.part_files import (
+from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.opening import LogFile
+from teamslam.team.recording.part_files import (
     JOINED,
     LOG_ID,
     joined_leftovers,
@@ -25,11 +25,11 @@ from team.recording.part_files import (
     part_of,
     parts_of,
 )
-from team.recording.reader import Log, LogError, log_of, open_log
-from team.recording.recorder import Recorder, RecorderError
-from team.recording.repair import read_undamaged
-from team.wall_clock import wall_clock, was_set_since
-from team.wire.channels import FINAL_MAP, TEAM_FINAL
+from teamslam.team.recording.reader import Log, LogError, log_of, open_log
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.repair import read_undamaged
+from teamslam.team.wall_clock import wall_clock, was_set_since
+from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL
 
 LONGEST_AWAY_S = 3600.0
 """Age [s] beyond which a log belongs to another run."""

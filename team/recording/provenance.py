@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from platform import libc_ver, machine, platform, processor, python_version
 
-from team import core
+from teamslam.team import core
 
 ESTIMATION = Path(__file__).parents[1] / "estimation"
 _PACKAGES = ("teamslam", "numpy", "scipy", "eclipse-zenoh", "msgpack", "mcap")
@@ -30,7 +30,7 @@ def provenance() -> dict[str, str]:
 
 
 def estimation_digest() -> str:
-    """SHA-256 of all `team.estimation` sources in path order; 16 hex digits."""
+    """SHA-256 of all `team/estimation` sources in path order; 16 hex digits."""
     digest = hashlib.sha256()
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())

@@ -14,10 +14,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
 
-from team.recording.opening import LogFile, open_file
-from team.recording.part_files import open_part, parts_of
-from team.recording.recorder import Count
-from team.recording.records import (
+from teamslam.team.recording.opening import LogFile, open_file
+from teamslam.team.recording.part_files import open_part, parts_of
+from teamslam.team.recording.recorder import Count
+from teamslam.team.recording.records import (
     LARGEST_CHUNK,
     MALFORMED,
     REPAIR,
@@ -29,8 +29,8 @@ from team.recording.records import (
     read_frames,
     read_index,
 )
-from team.wire.bus import Sample
-from team.wire.channels import VIEW, Channel, channel_of
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import VIEW, Channel, channel_of
 
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 

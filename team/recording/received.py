@@ -7,9 +7,9 @@ filled later is another run.
 from collections import defaultdict
 from dataclasses import dataclass
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import NO_COUNTER, Sample
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import NO_COUNTER, Sample
 
 NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 """Channels with numbered messages, which the recorder reports as progress."""

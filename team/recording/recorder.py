@@ -17,11 +17,11 @@ from typing import IO, NamedTuple, Self
 
 from mcap.writer import Writer
 
-from team.recording.schemas import declaration_of
-from team.wire.bus import Sample
-from team.wire.channels import channel_of
-from team.wire.codec import tag_in
-from team.wire.messages import tag_of
+from teamslam.team.recording.schemas import declaration_of
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import channel_of
+from teamslam.team.wire.codec import tag_in
+from teamslam.team.wire.messages import tag_of
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000

@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
-from team.wire.codec import LARGEST_PAYLOAD
+from teamslam.team.wire.codec import LARGEST_PAYLOAD
 
 LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
 """Largest expanded chunk [bytes]: the largest message behind an almost full chunk."""

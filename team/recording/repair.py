@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from team.recording.reader import Log, LogError, open_log
-from team.recording.recorder import Recorder
-from team.wire.bus import Sample
+from teamslam.team.recording.reader import Log, LogError, open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire.bus import Sample
 
 REPAIRED = "repaired"
 """Metadata name that marks a repaired log, with the original."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 
-from team.wire.bus import Sample
+from teamslam.team.wire.bus import Sample
 
 
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:

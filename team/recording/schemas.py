@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from team.wire.channels import channel_of
-from team.wire.messages import Message, tag_of
-from team.wire.views import json_schema, view_of
+from teamslam.team.wire.channels import channel_of
+from teamslam.team.wire.messages import Message, tag_of
+from teamslam.team.wire.views import json_schema, view_of
 
 
 def schema_of(message: type[Message]) -> bytes:

@@ -8,12 +8,12 @@ from contextlib import closing, suppress
 
 import msgspec
 
-from team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
-from team.recording.recorder import Recorder, RecorderError
-from team.recording.replayer import schedule
-from team.the_end import TheEnd
-from team.wire.bus import Bus, Outgoing, Sample, opened
-from team.wire.channels import (
+from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.replayer import schedule
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
+from teamslam.team.wire.channels import (
     ALIVE,
     CHANNELS,
     CONCLUDED,
@@ -36,8 +36,8 @@ from team.wire.channels import (
     robot_of,
     row_of,
 )
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import (
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.messages import (
     Configuration,
     KeptRequest,
     Liveliness,
@@ -48,7 +48,7 @@ from team.wire.messages import (
     SubmapsRequest,
     Tally,
 )
-from team.wire.patience import Patience
+from teamslam.team.wire.patience import Patience
 
 NODE = "recorder"
 PROGRESS_EVERY = 256

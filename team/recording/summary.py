@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from team.recording.reader import Log, LogError
-from team.recording.repair import read_undamaged
-from team.wire.bus import Sample
-from team.wire.channels import SENSORS, VIEW, channel_of
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.repair import read_undamaged
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import SENSORS, VIEW, channel_of
 
 FOREIGN = "(no channel)"
 """Channel of a key without a row in the table."""

@@ -10,12 +10,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from team.recording.reader import Log
-from team.wire.arrays import floats, ids, octets, stamps
-from team.wire.bus import Sample, opened
-from team.wire.channels import Channel, channel_of
-from team.wire.codec import WireError
-from team.wire.messages import Message, tag_of
+from teamslam.team.recording.reader import Log
+from teamslam.team.wire.arrays import floats, ids, octets, stamps
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.channels import Channel, channel_of
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.messages import Message, tag_of
 
 HEAD = ("key", "counter", "wall_ns")
 _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {

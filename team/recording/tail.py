@@ -6,9 +6,9 @@ from pathlib import Path
 import zstandard
 from mcap.opcode import Opcode
 
-from team.recording.reader import Log, LogError, open_log
-from team.recording.records import FRAME_SIZE, MALFORMED, read_frames
-from team.wire.bus import Sample
+from teamslam.team.recording.reader import Log, LogError, open_log
+from teamslam.team.recording.records import FRAME_SIZE, MALFORMED, read_frames
+from teamslam.team.wire.bus import Sample
 
 MOST = 20_000
 """Approximate limit on samples per call."""

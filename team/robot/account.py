@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from team.robot.mapper import Mapper
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.team.robot.mapper import Mapper
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 
 @dataclass

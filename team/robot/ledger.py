@@ -3,9 +3,9 @@
 from collections import Counter
 from collections.abc import Callable, Iterable
 
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.rejection import Rejection
-from team.wire import messages as m
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.rejection import Rejection
+from teamslam.team.wire import messages as m
 
 IN_SIGHTING = "in a sighting factor"
 """The disposition of an inter-robot measurement that was used."""

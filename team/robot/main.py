@@ -10,15 +10,15 @@ from contextlib import suppress
 
 import msgspec
 
-from team.config import Exchange, RobotConfig
-from team.containment import reply_of
-from team.missing import ASK_TIMEOUT_S, MissingMeasurements
-from team.robot.node import robot_node
-from team.shell import RECORDER, Shell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Bus, BusError, Sample, Tap
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.containment import reply_of
+from teamslam.team.missing import ASK_TIMEOUT_S, MissingMeasurements
+from teamslam.team.robot.node import robot_node
+from teamslam.team.shell import RECORDER, Shell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, BusError, Sample, Tap
+from teamslam.team.wire.codec import WireError, decoded, encoded
 
 SECOND_PATIENCE_S = 6.0
 """Wait [s] for another process' token: that of a cut-off process lasts for its lease of 5 s."""

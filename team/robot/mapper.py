@@ -12,28 +12,28 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from team import translate
-from team.config import Exchange, RobotConfig
-from team.door import another_time
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.hybrid_slam.pose_grid import TeammateScan
-from team.estimation.odometry import OdometryInterval
-from team.estimation.plausible import start_beyond
-from team.estimation.scans import Scan, sensible
-from team.estimation.submap import LocalMap
-from team.rejection import UNMEASURED, Rejection
-from team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
-from team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
-from team.robot.poses import RunningPoses
-from team.robot.statements import MessageWriter
-from team.robot.submaps import Submaps
-from team.robot.warnings import slipped
-from team.stream.judge import StreamJudge
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.team import translate
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.door import another_time
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.plausible import start_beyond
+from teamslam.team.estimation.scans import Scan, sensible
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.rejection import UNMEASURED, Rejection
+from teamslam.team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
+from teamslam.team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
+from teamslam.team.robot.poses import RunningPoses
+from teamslam.team.robot.statements import MessageWriter
+from teamslam.team.robot.submaps import Submaps
+from teamslam.team.robot.warnings import slipped
+from teamslam.team.stream.judge import StreamJudge
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 MOST_SET_ASIDE = 8
 """After so many measurements of one window were set aside, the window is not computed again for

@@ -15,24 +15,24 @@ from typing import Any
 
 import msgspec
 
-from team import translate
-from team.config import Exchange, RobotConfig
-from team.door import absurd
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.pairs import COMPARISON_ROBOT, PAIRS
-from team.registry import loaded
-from team.robot.account import StreamAccount
-from team.robot.ledger import Ledger, OnDisposition
-from team.robot.mapper import Mapper, Replaced
-from team.robot.poses import RunningPoses
-from team.robot.status import status_of
-from team.robot.stream_end import EndOfStream
-from team.stream.inbox import Inbox
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import unsound
-from team.wire.digest import configured
+from teamslam.team import translate
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.door import absurd
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.pairs import COMPARISON_ROBOT, PAIRS
+from teamslam.team.registry import loaded
+from teamslam.team.robot.account import StreamAccount
+from teamslam.team.robot.ledger import Ledger, OnDisposition
+from teamslam.team.robot.mapper import Mapper, Replaced
+from teamslam.team.robot.poses import RunningPoses
+from teamslam.team.robot.status import status_of
+from teamslam.team.robot.stream_end import EndOfStream
+from teamslam.team.stream.inbox import Inbox
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import unsound
+from teamslam.team.wire.digest import configured
 
 AHEAD = 64
 """Number of submaps of an earlier process that the centre may have taken since it was asked for

@@ -10,21 +10,21 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.core import WholeMap
-from team.estimation import se2
-from team.estimation.gaussian import (
+from teamslam.team import core
+from teamslam.team.core import WholeMap
+from teamslam.team.estimation import se2
+from teamslam.team.estimation.gaussian import (
     LandmarkGaussian,
     Matrix,
     NotACovarianceError,
     PoseGaussian,
 )
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.map_joining.conditioning import pose_now
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.map_joining.whole_map import initial_map, joined
-from team.estimation.plausible import are_landmarks
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.map_joining.conditioning import pose_now
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
+from teamslam.team.estimation.plausible import are_landmarks
+from teamslam.team.estimation.submap import LocalMap
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""

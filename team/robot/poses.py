@@ -13,18 +13,18 @@ from typing import Protocol, runtime_checkable
 import msgspec
 import numpy as np
 
-from team.config import RobotConfig
-from team.estimation.gaussian import NotACovarianceError, PoseGaussian
-from team.estimation.map_joining.gauss_newton import NotDeterminedError
-from team.estimation.plausible import prior_beyond
-from team.estimation.submap import LocalMap
-from team.robot.statements import MessageWriter
-from team.robot.submaps import Submaps
-from team.robot.team_map import TeamMap
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.newer import is_newer_prior
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
+from teamslam.team.estimation.plausible import prior_beyond
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.statements import MessageWriter
+from teamslam.team.robot.submaps import Submaps
+from teamslam.team.robot.team_map import TeamMap
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.newer import is_newer_prior
 
 
 @runtime_checkable

@@ -3,19 +3,19 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from team import translate
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pose_grid import NodeSighting
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.submap import Became
-from team.robot.own_map import Cloud
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing
-from team.wire.digest import NO_MAP
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.submap import Became
+from teamslam.team.robot.own_map import Cloud
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.digest import NO_MAP
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,10 @@
 
 from typing import Literal
 
-from team.robot.mapper import Mapper
-from team.robot.warnings import driver_away, unexpected
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.team.robot.mapper import Mapper
+from teamslam.team.robot.warnings import driver_away, unexpected
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 
 def status_of(

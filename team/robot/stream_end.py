@@ -1,9 +1,9 @@
 """The end of a robot's stream, as its world, its driver or an operator announces it."""
 
-from team.stream.inbox import Inbox
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.newer import later_end, later_head
+from teamslam.team.stream.inbox import Inbox
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.newer import later_end, later_head
 
 
 class EndOfStream:

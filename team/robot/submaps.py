@@ -15,13 +15,13 @@ from typing import overload
 
 import msgspec
 
-from team import translate
-from team.config import Exchange
-from team.estimation.submap import LocalMap
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from teamslam.team import translate
+from teamslam.team.config import Exchange
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
 
 _SUBMAP = msgspec.msgpack.Decoder(m.Submap)
 """Decodes without the checks of `decoded`: the payloads are this robot's own."""

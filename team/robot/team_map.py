@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from team import translate
-from team.estimation.gaussian import curved
-from team.estimation.map_joining.conditioning import (
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import curved
+from teamslam.team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
     RobotPrior,
@@ -15,10 +15,10 @@ from team.estimation.map_joining.conditioning import (
     is_majority,
     pose_now,
 )
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.map_joining.whole_map import initial_map
-from team.estimation.submap import LocalMap
-from team.wire import messages as m
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.map_joining.whole_map import initial_map
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.wire import messages as m
 
 CONDENSED = 16
 """Number of submaps that are condensed into the map behind them once as many follow them."""

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from team import core
-from team.config import Estimator
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.submap import Slipped
+from teamslam.team import core
+from teamslam.team.config import Estimator
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.submap import Slipped
 
 UNEXPECTED = 3.0
 """NIS per degree of freedom above which measurements contradict the models: 1 is right, and

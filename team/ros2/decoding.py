@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
-from team.ros2.definitions import types
+from teamslam.team.ros2.definitions import types
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from team.ros2.definitions import types
+from teamslam.team.ros2.definitions import types
 
 SIGMAS = 2.0
 """Radius of the ellipses in standard deviations: 86 % of a landmark's probability in the plane."""

@@ -6,7 +6,7 @@ from math import atan2, pi, remainder
 import numpy as np
 from jaxtyping import Float
 
-from team.ros2.decoding import Quaternion, Transform, Vector
+from teamslam.team.ros2.decoding import Quaternion, Transform, Vector
 
 DEEPEST = 32
 """Transforms between a sensor and its base at the most."""

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
-from team.ros2.frames import Frames
-from team.ros2.topics import RobotTopics
+from teamslam.team.ros2.frames import Frames
+from teamslam.team.ros2.topics import RobotTopics
 
 MOST_FRAMES = 10_000
 """Frames that are kept at the most."""

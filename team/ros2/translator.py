@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from typing import NamedTuple
 
-from team.ros2.decoding import (
+from teamslam.team.ros2.decoding import (
     OdometryRecord,
     PoseRecord,
     Record,
@@ -14,9 +14,9 @@ from team.ros2.decoding import (
     Transform,
     TransformsRecord,
 )
-from team.ros2.frames import BODY, OPTICAL, Frames, Mount, heading
-from team.ros2.owners import Owners
-from team.ros2.topics import RobotTopics
+from teamslam.team.ros2.frames import BODY, OPTICAL, Frames, Mount, heading
+from teamslam.team.ros2.owners import Owners
+from teamslam.team.ros2.topics import RobotTopics
 
 TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
 """A tag's name: its number, with its family before it (tag36h11:7) or alone."""

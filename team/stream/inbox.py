@@ -1,7 +1,7 @@
 """Put the measurements of one robot in the order of their counter."""
 
-from team.door import another_time
-from team.wire.messages import End, InitialPose, Measurement, StreamEnd
+from teamslam.team.door import another_time
+from teamslam.team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
 NEAR_LIVES = 16
 """Largest accepted step of the incarnation, which grows one by one, and seldom."""

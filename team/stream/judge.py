@@ -5,10 +5,10 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from team.config import Bounds
-from team.estimation.odometry import OdometryInterval
-from team.estimation.plausible import is_motion_spread as _spread
-from team.rejection import Rejection
+from teamslam.team.config import Bounds
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.plausible import is_motion_spread as _spread
+from teamslam.team.rejection import Rejection
 
 LONGEST_NS = 2**62
 """Bound on the distance of two stamps."""

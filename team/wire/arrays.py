@@ -7,7 +7,7 @@ import struct
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from team.core import check_finite
+from teamslam.team.core import check_finite
 
 if TYPE_CHECKING:
     import numpy as np

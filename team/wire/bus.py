@@ -1,8 +1,9 @@
 """The interface of a bus, which carries payloads by key, and a bus in memory.
 
-`team.wire.zenoh` has the bus over a network. A received `Sample` contains the relative key, the
-payload as published, the team time, and the publisher's wall clock and counter of this key. A node
-uses no bus: its shell receives and decodes the samples, and publishes the messages of the node.
+`teamslam.team.wire.zenoh` has the bus over a network. A received `Sample` contains the relative
+key, the payload as published, the team time, and the publisher's wall clock and counter of this
+key. A node uses no bus: its shell receives and decodes the samples, and publishes the messages of
+the node.
 """
 
 import re
@@ -15,10 +16,19 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
-from team.wire.channels import ALIVE, END_ORDER, KEPT, ORDER, REPLIES, VIEW, Channel, channel_of
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.logs import LOG
-from team.wire.messages import (
+from teamslam.team.wire.channels import (
+    ALIVE,
+    END_ORDER,
+    KEPT,
+    ORDER,
+    REPLIES,
+    VIEW,
+    Channel,
+    channel_of,
+)
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.messages import (
     Configuration,
     Fault,
     FusedMap,
@@ -39,7 +49,7 @@ from team.wire.messages import (
     Withdrawal,
     WithdrawalHeard,
 )
-from team.wire.text import readable
+from teamslam.team.wire.text import readable
 
 _IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, WithdrawalHeard)
 """Messages with texts for people."""

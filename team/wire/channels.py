@@ -6,7 +6,7 @@ operator `operator/…`, the others that of their name. A certificate for a pref
 authenticates a sender. The world is the source of every robot; the truth belongs to the world, too.
 
 `{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer`,
-`robot/<name>` or `source/<name>`, `{view}` for a view (`team.wire.views`). In the rates an
+`robot/<name>` or `source/<name>`, `{view}` for a view (`teamslam.team.wire.views`). In the rates an
 incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one instant of
 observation.
 """
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 Delivery = Literal["stream", "latest", "all"]
 """How a message is delivered. A publisher blocks while its link is busy. The router drops a message

@@ -10,8 +10,8 @@ from typing import Any, NoReturn, TypeVar, Union, cast
 
 import msgspec
 
-from team.wire.messages import BY_TAG, Message
-from team.wire.structure import SMALL, StructureError, check_structure, read_tag
+from teamslam.team.wire.messages import BY_TAG, Message
+from teamslam.team.wire.structure import SMALL, StructureError, check_structure, read_tag
 
 M = TypeVar("M", bound=Message)
 

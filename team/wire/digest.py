@@ -4,7 +4,7 @@ import hashlib
 
 import msgspec
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 NO_MAP = bytes(8)
 """The digest that stands for no map."""

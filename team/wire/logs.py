@@ -7,7 +7,7 @@ are escaped, so that a record is one line, of at most LONGEST characters.
 
 import logging
 
-from team.wire.text import cut, one_line
+from teamslam.team.wire.text import cut, one_line
 
 AT_ONCE = 50
 """Number of lines that one place in the program may log at once."""

@@ -7,7 +7,7 @@ of the same messages end with the same message, whatever the order of arrival.
 
 from collections.abc import Sequence
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 

@@ -20,7 +20,7 @@ _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
 
 
 class StructureError(ValueError):
-    """A payload whose structure no message has; reason and detail as in `team.wire.codec`."""
+    """A payload whose structure no message has; reason and detail as in `wire.codec`."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from team.wire.channels import VIEW
+from teamslam.team.wire.channels import VIEW
 
 MAP_FRAME = "map"
 

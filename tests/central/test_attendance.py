@@ -2,8 +2,8 @@
 
 import random
 
-from central.attendance import TeamAttendance
-from team.wire import messages as m
+from teamslam.central.attendance import TeamAttendance
+from teamslam.team.wire import messages as m
 from tests import build
 
 ROBOTS = [f"r{k}" for k in range(6)]

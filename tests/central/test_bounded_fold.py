@@ -6,17 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from central import checkpoints, tick_fold
-from central.checkpoints import NEAR, Checkpoint, thinned
-from central.config import CentralConfig
-from central.tick_fold import TickFold
-from team import translate
-from team.estimation.map_joining import landmark_view, marginals, refusal
-from team.estimation.map_joining.condensing import Limits
-from team.estimation.map_joining.joining import EMPTY_FOLD
-from team.wire.arrays import floats, from_floats
-from team.wire.codec import encoded
-from team.wire.digest import digest_of
+from teamslam.central import checkpoints, tick_fold
+from teamslam.central.checkpoints import NEAR, Checkpoint, thinned
+from teamslam.central.config import CentralConfig
+from teamslam.central.tick_fold import TickFold
+from teamslam.team import translate
+from teamslam.team.estimation.map_joining import landmark_view, marginals, refusal
+from teamslam.team.estimation.map_joining.condensing import Limits
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD
+from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 from tests.teams import Submaps, stream
 
 CONFIG = CentralConfig(tick_s=4.0)

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from central import tick_fold
-from central.config import CentralConfig
-from central.tick_fold import TickFold
-from team import translate
-from team.association import AssociationProfile
-from team.config import UNNAMED
-from team.estimation.map_joining import auditing, condensing, marginals
-from team.estimation.map_joining.condensing import Limits
-from team.estimation.submap import LocalMap, Unnamed
-from team.wire.codec import encoded
-from team.wire.digest import digest_of
+from teamslam.central import tick_fold
+from teamslam.central.config import CentralConfig
+from teamslam.central.tick_fold import TickFold
+from teamslam.team import translate
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.map_joining import auditing, condensing, marginals
+from teamslam.team.estimation.map_joining.condensing import Limits
+from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 from tests.estimation.association.unnamed_worlds import circle, drive, wrong
 
 PROFILE = AssociationProfile(recent=3, near=0.1, closure_pairs=5, audited=3, llr_loose=30.0)

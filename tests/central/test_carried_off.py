@@ -7,14 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.tick_fold import TickFold
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team import translate
-from team.estimation.se2 import compose, inverse
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, stamps
+from teamslam.central.tick_fold import TickFold
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team import translate
+from teamslam.team.estimation.se2 import compose, inverse
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, stamps
 from tests.central.test_withdrawal import messages, scenario, team_run
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 

@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.map_publisher import MapPublisher
-from central.submap_fold import SubmapFold
-from team.config import UNNAMED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_ids, ids
+from teamslam.central.config import CentralConfig
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_ids, ids
 from tests.teams import Submaps, of, published, stream
 
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}

@@ -9,25 +9,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from central import tick_fold
-from central.map_publisher import MapPublisher
-from central.submap_fold import SubmapFold
-from central.withdrawal import Trial, disagreement, hold_trial
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario
-from sim.world.simulator import simulated
-from team import translate
-from team.config import Exchange, RobotConfig
-from team.estimation.gaussian import deviation
-from team.estimation.map_joining.joining import converged
-from team.estimation.map_joining.marginals import Agreement, landmark_map
-from team.estimation.map_joining.nonlinearity import heading_sigma
-from team.estimation.plausible import with_least_spread
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, stamps
-from team.wire.bus import Outgoing, Sample, opened
+from teamslam.central import tick_fold
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.central.withdrawal import Trial, disagreement, hold_trial
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.simulator import simulated
+from teamslam.team import translate
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.estimation.gaussian import deviation
+from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
+from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
+from teamslam.team.estimation.plausible import with_least_spread
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, stamps
+from teamslam.team.wire.bus import Outgoing, Sample, opened
 from tests.central.test_withdrawal import messages, of_set, scenario, team_run
 
 LIES = ("still", "micrometre", "far", "modest", "swap")

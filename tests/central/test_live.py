@@ -2,11 +2,11 @@
 
 import pytest
 
-from central.config import CentralConfig
-from central.node import CentralNode
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 from tests import build
 from tests.teams import config, driven, of, published, stream
 

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.map_publisher import MapPublisher
-from central.submap_fold import SubmapFold
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.team import translate
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.teams import Submaps, of, published, stream
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
 from tests.trials.stress_world import MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(robots=2, landmarks=12, half_m=10.0, seconds=120.0)

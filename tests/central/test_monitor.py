@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from central.monitor import finding
-from team.estimation.consistency import covariance_scale
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.joining import JoinSettings, converged
+from teamslam.central.monitor import finding
+from teamslam.team.estimation.consistency import covariance_scale
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.joining import JoinSettings, converged
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 

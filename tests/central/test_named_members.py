@@ -2,18 +2,18 @@
 
 import numpy as np
 
-from central.unnamed_landmarks import SHOWN, memberships_of
-from team.config import UNNAMED
-from team.estimation.association.landmark_sets import (
+from teamslam.central.unnamed_landmarks import SHOWN, memberships_of
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     Landmarks,
     add_landmarks,
     merge_sets,
 )
-from team.estimation.association.member_log import MergeRecord
-from team.estimation.contribution import Contribution
-from team.estimation.submap import LocalMap
-from team.wire.arrays import ids
+from teamslam.team.estimation.association.member_log import MergeRecord
+from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.wire.arrays import ids
 
 
 def landmarks(submaps: int) -> Landmarks:

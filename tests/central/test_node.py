@@ -3,12 +3,12 @@
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.node import make_centre
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.digest import digest_of
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.digest import digest_of
 from tests import build
 from tests.teams import Submaps, of, published, stream
 

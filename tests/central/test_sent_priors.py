@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from central import sent_priors as priors
-from central.sent_priors import EVERY, SentPriors
-from sim.in_memory.team import run_team
-from sim.world.simulator import simulated
-from team.estimation.map_joining.marginals import LandmarkBlocks
-from team.wire import channels as ch
-from team.wire.bus import opened
+from teamslam.central import sent_priors as priors
+from teamslam.central.sent_priors import EVERY, SentPriors
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.estimation.map_joining.marginals import LandmarkBlocks
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import opened
 from tests.central.test_withdrawal import scenario
 
 HERE = np.zeros(3)

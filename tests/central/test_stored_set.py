@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from central.stored_set import StoredSet
-from team.peers.set_file import SetFileError
-from team.wire import channels as ch
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.stored_set import StoredSet
+from teamslam.team.peers.set_file import SetFileError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests.support import odometry, submap
 
 SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in range(3)]

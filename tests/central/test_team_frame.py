@@ -8,15 +8,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from central.node import CentralNode
-from team.driver.node import SourceNode
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, from_ids, ids
-from team.wire.bus import Outgoing
-from team.wire.newer import is_newer_map
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode
+from teamslam.team.driver.node import SourceNode
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_ids, ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.newer import is_newer_map
 from tests import build
 from tests.teams import config, published, stream
 

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from central.tick_fold import TickFold
-from team import translate
-from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
-from team.wire.codec import encoded
-from team.wire.digest import digest_of
+from teamslam.central.config import CentralConfig
+from teamslam.central.tick_fold import TickFold
+from teamslam.team import translate
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 from tests.teams import Submaps, stream
 
 CONFIG = CentralConfig(tick_s=4.0)

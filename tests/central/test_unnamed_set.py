@@ -6,13 +6,13 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.map_publisher import MapPublisher
-from central.submap_fold import RecordedFields, SubmapFold
-from team import translate
-from team.association import AssociationProfile
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.submap_fold import RecordedFields, SubmapFold
+from teamslam.team import translate
+from teamslam.team.association import AssociationProfile
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.estimation.association.unnamed_worlds import circle, drive
 

@@ -9,27 +9,32 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.desk.ledger import ledger
-from central.desk.verification.recorded import recorded
-from central.desk.verification.verification import verify
-from central.map_publisher import MapPublisher
-from central.node import CentralNode
-from central.submap_fold import SubmapFold
-from central.tick_fold import TickFold
-from central.withdrawal import disagreement, hold_trial
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, with_options
-from sim.world.config import OutlierKind, SimulatedWorld
-from sim.world.simulator import simulated
-from team import translate
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.map_joining.joining import converged
-from team.estimation.map_joining.marginals import Agreement, SubmapCost, joint_cost, landmark_map
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.ledger import ledger
+from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.verification import verify
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.node import CentralNode
+from teamslam.central.submap_fold import SubmapFold
+from teamslam.central.tick_fold import TickFold
+from teamslam.central.withdrawal import disagreement, hold_trial
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, with_options
+from teamslam.sim.world.config import OutlierKind, SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.team import translate
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.marginals import (
+    Agreement,
+    SubmapCost,
+    joint_cost,
+    landmark_map,
+)
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.sim.reruns import written
 

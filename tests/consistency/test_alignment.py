@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining.alignment import aligned
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining.alignment import aligned
 from tests.estimation.map_joining.test_alignment import (
     pairs,
 )

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.joining import JoinSettings
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.joining import JoinSettings
 from tests.estimation.hybrid_slam.test_sensitivity import (
     SIGMA,
     biased_team,

@@ -6,8 +6,8 @@ The mutants have another sensor or motion model than the simulation.
 import numpy as np
 import pytest
 
-from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.consistency import chi2_interval
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.consistency import chi2_interval
 from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, STEP_M, drive, driven
 
 

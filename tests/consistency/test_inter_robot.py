@@ -5,9 +5,9 @@ The mutant counts each measurement fourfold.
 
 from dataclasses import replace
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.marginals import joint_cost, landmark_map
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import solved
 

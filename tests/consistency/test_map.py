@@ -3,9 +3,9 @@
 The mutant counts each submap twice.
 """
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.marginals import (
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_map,
 )

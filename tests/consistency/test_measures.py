@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.special import chdtri, gammaincinv
 
-from team.core import chi2_quantiles
-from team.estimation.consistency import (
+from teamslam.team.core import chi2_quantiles
+from teamslam.team.estimation.consistency import (
     chi2_interval,
     chi2_limit,
     chi2_quantile,
@@ -13,9 +13,9 @@ from team.estimation.consistency import (
     nees,
     state_error,
 )
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.map_joining.conditioning import GATE
-from team.estimation.map_joining.nonlinearity import UNLIKELY
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.map_joining.conditioning import GATE
+from teamslam.team.estimation.map_joining.nonlinearity import UNLIKELY
 
 L = np.array([[0.5, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.1, 0.4, 0.1]])
 

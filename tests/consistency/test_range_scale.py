@@ -5,9 +5,9 @@ The mutants lack the state of an error, or evaluate the scale at measured ranges
 
 import numpy as np
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.joining import JoinSettings
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.joining import JoinSettings
 from tests.estimation.map_joining.test_range_scale import (
     COMMON,
     LANDMARKS,

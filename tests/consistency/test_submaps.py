@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.hybrid_slam import window as windows
 from tests.estimation.hybrid_slam.test_window import (
     ACCURATE,
     COARSE,

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.map_joining.conditioning import (
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining.conditioning import (
     SubmapCorrection,
 )
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.marginals import prior_for
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.marginals import prior_for
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.map_joining.test_conditioning import (
     joined,
     later,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from team import core
+from teamslam.team import core
 from tests.support import ROOT
 
 FOLDER = ROOT / "team" / "core"

@@ -7,7 +7,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
-from team import core
+from teamslam.team import core
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
 DIGITS = 45

@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from team import core
-from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.models import Increment, calibration_of, increment_of, model_of
-from team.estimation.mount import of_sensor
-from team.estimation.odometry import OdometryInterval, moved
-from team.estimation.se2 import adjoint, between, inverse
+from teamslam.team import core
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.models import Increment, calibration_of, increment_of, model_of
+from teamslam.team.estimation.mount import of_sensor
+from teamslam.team.estimation.odometry import OdometryInterval, moved
+from teamslam.team.estimation.se2 import adjoint, between, inverse
 
 MOTION = MotionModel(
     forward=MotionNoise(per_s=0.05, per_m=0.02),

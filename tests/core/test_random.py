@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from team import core
-from team.estimation.consistency import chi2_quantile
+from teamslam.team import core
+from teamslam.team.estimation.consistency import chi2_quantile
 
 KEY = bytes(range(16))
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.core import Cholesky, NotPositiveDefiniteError, Pattern, minimum_degree
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.core import Cholesky, NotPositiveDefiniteError, Pattern, minimum_degree
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
 from tests.estimation.submap_world import team
 
 BIG_ROWS, BLOCK = 256, 48

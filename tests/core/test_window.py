@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import core
+from teamslam.team import core
 
 NOISE = (0.04, 0.001, 1.0, 0.003, 1.0)
 CONSTANT = (0.04, 0.001, 0.5, 0.003, 0.7)

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.scenarios.scenario import load
-from team import Driver, DriverError, DriverWarning, MeasurementError
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, ids
-from team.wire.bus import Outgoing, opened
-from team.wire.codec import decoded, encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam import Driver, DriverError, DriverWarning, MeasurementError
+from teamslam.sim.cli.main import app
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids
+from teamslam.team.wire.bus import Outgoing, opened
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.support import ROOT, wait_until
 

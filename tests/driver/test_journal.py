@@ -7,11 +7,11 @@ import msgpack
 import msgspec
 import pytest
 
-from team.driver import journal as j
-from team.driver.journal import Journal, JournalError, opened
-from team.driver.node import SourceNode
-from team.driver.order import Sorter
-from team.wire.codec import encoded
+from teamslam.team.driver import journal as j
+from teamslam.team.driver.journal import Journal, JournalError, opened
+from teamslam.team.driver.node import SourceNode
+from teamslam.team.driver.order import Sorter
+from teamslam.team.wire.codec import encoded
 from tests import build
 
 LATENCY_NS = 200_000_000

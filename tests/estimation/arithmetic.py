@@ -8,8 +8,8 @@ import json
 
 import numpy as np
 
-from team import core
-from team.estimation import dense
+from teamslam.team import core
+from teamslam.team.estimation import dense
 
 SIZES = (3, 40, 130)
 """Dense matrices: by loops, by a part of a tile, by several tiles and blocks."""

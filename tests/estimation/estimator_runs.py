@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.scenarios import scenario
-from sim.world.simulator import simulated
-from team.estimation.models import Increment, corrected, increment_of
+from teamslam.sim.scenarios import scenario
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.estimation.models import Increment, corrected, increment_of
 
 
 class Keyframe(NamedTuple):

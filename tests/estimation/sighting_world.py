@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import correlated, drawn, local_truth, seen_from, wrap
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.map_joining.gauss_newton import settled
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.submap import LocalMap
 
 
 @dataclass

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sim.studies.estimators.robot_step import RobotStep
-from team.config import Sensor
-from team.estimation.models import Increment
-from team.estimation.se2 import compose, exponential
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import compose, exponential
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.01)
 OTHER = Sensor(range_sigma=0.3, bearing_sigma=0.005)

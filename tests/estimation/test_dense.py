@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from team.estimation import dense
+from teamslam.team.estimation import dense
 
 SHAPES = [
     ((3,), (3,)),

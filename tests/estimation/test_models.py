@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import core
-from team.config import Lens, MotionModel, MotionNoise, Sensor
-from team.estimation import models
-from team.estimation.models import Increment, increment_of
-from team.estimation.randomness import generator
-from team.estimation.se2 import compose, exponential, inverse, logarithm
+from teamslam.team import core
+from teamslam.team.config import Lens, MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation import models
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.se2 import compose, exponential, inverse, logarithm
 
 quick = settings(deadline=None, max_examples=60)
 turns = st.floats(-2.5, 2.5)

@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from team.config import MotionModel, MotionNoise
-from team.estimation.models import Increment, increment_of
-from team.estimation.odometry import OdometryInterval, moved, steered
-from team.estimation.se2 import between, compose, exponential, logarithm
+from teamslam.team.config import MotionModel, MotionNoise
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
+from teamslam.team.estimation.se2 import between, compose, exponential, logarithm
 
 SECOND = 1_000_000_000
 NOISY = MotionModel(

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from team import core
-from team.config import Bounds, Sensor
-from team.core import landmarks_along_paths
-from team.estimation.hybrid_slam.fastslam import noise_of
-from team.estimation.models import predicted
-from team.estimation.scans import (
+from teamslam.team import core
+from teamslam.team.config import Bounds, Sensor
+from teamslam.team.core import landmarks_along_paths
+from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
+from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.scans import (
     POINT,
     POLAR,
     point_scan,

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from team.estimation import se2
+from teamslam.team.estimation import se2
 
 metres = st.floats(-100.0, 100.0)
 angles = st.floats(-3.1, 3.1)

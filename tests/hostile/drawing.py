@@ -12,15 +12,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from central.config import CentralConfig
-from central.node import CentralNode
-from team.config import RobotConfig
-from team.robot.node import RobotNode, robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Outgoing
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode
+from teamslam.team.config import RobotConfig
+from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.support import examples
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from team.recording.reader import LogError
-from team.recording.recorder import RecorderError
+from teamslam.sim.cli.main import app
+from teamslam.team.recording.reader import LogError
+from teamslam.team.recording.recorder import RecorderError
 
 COMMANDS = {
     "info": ["log", "info", "LOG"],

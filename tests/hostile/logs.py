@@ -11,10 +11,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import encoded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import packed, spd
 

@@ -7,25 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.verification.verification import verify
-from central.main import CentralShell
-from central.map_publisher import MapPublisher
-from central.node import CentralNode
-from sim.in_memory.team import final_map
-from team.containment import Boundary
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.recording.recorder import Recorder
-from team.recording.shell import RecordLoop
-from team.rejection import Rejection
-from team.robot.main import RobotShell
-from team.robot.node import RobotNode
-from team.shell import FaultyRunError, Shell
-from team.store import SubmapStore
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.codec import encoded
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.verification.verification import verify
+from teamslam.central.main import CentralShell
+from teamslam.central.map_publisher import MapPublisher
+from teamslam.central.node import CentralNode
+from teamslam.sim.in_memory.team import final_map
+from teamslam.team.containment import Boundary
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.shell import RecordLoop
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.main import RobotShell
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.shell import FaultyRunError, Shell
+from teamslam.team.store import SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.support import submap
@@ -210,7 +210,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
     assert (fault.origin, fault.text) == ("status", "no word")
     assert isinstance(status, m.Status)
     assert status.figures["faults"] == 1.0
-    assert "status: RuntimeError at team.shell:Shell.contained:" in status.warnings[-1]
+    assert "status: RuntimeError at teamslam.team.shell:Shell.contained:" in status.warnings[-1]
 
 
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:

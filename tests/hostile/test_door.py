@@ -3,18 +3,18 @@
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.node import CentralNode
-from sim.publisher.node import WorldNode
-from team.config import RobotConfig
-from team.containment import Boundary, Handler
-from team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import CentralNode
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.team.config import RobotConfig
+from teamslam.team.containment import Boundary, Handler
+from teamslam.team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.support import example, submap
 from tests.teams import Submaps, of, published, stream, world_of

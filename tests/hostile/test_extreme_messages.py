@@ -16,22 +16,22 @@ from random import Random
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.desk.view.node import ViewerNode
-from central.node import CentralNode
-from central.peers.centre import PeerCentre
-from central.peers.robot import PeerRobot
-from team.config import FrontEnd, RobotConfig
-from team.containment import Boundary
-from team.recording.check import check_log
-from team.recording.reader import open_log
-from team.recording.recorder import Recorder
-from team.recording.shell import RecordLoop
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.view.node import ViewerNode
+from teamslam.central.node import CentralNode
+from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.team.config import FrontEnd, RobotConfig
+from teamslam.team.containment import Boundary
+from teamslam.team.recording.check import check_log
+from teamslam.team.recording.reader import open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.shell import RecordLoop
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.hostile.drawing import CHANNELS, ROBOTS, S, mutated
 from tests.hostile.drawing import extreme_samples as samples

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from team.recording import records
-from team.recording.reader import LogError, open_log
+from teamslam.team.recording import records
+from teamslam.team.recording.reader import LogError, open_log
 from tests.hostile.logs import KINDS, LARGEST_FILE, many_small
 from tests.support import ROOT
 

@@ -5,20 +5,20 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.peers.centre import PeerCentre
-from central.peers.fold import PeerFold
-from team.door import MOST_LIVES
-from team.keys.roster import Issued
-from team.peers.exchange import MOST_ASKED
-from team.peers.members import LARGEST_SIGNATURE
-from team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
-from team.peers.proofs import LARGEST_OF_ROBOT, Proofs
-from team.peers.replica import MOST_INTERVALS, MOST_STREAMS
-from team.peers.set_file import SetFile
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.fold import PeerFold
+from teamslam.team.door import MOST_LIVES
+from teamslam.team.keys.roster import Issued
+from teamslam.team.peers.exchange import MOST_ASKED
+from teamslam.team.peers.members import LARGEST_SIGNATURE
+from teamslam.team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
+from teamslam.team.peers.proofs import LARGEST_OF_ROBOT, Proofs
+from teamslam.team.peers.replica import MOST_INTERVALS, MOST_STREAMS
+from teamslam.team.peers.set_file import SetFile
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.peers.teams import member, parcel, start
 

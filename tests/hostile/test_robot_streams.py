@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from team.config import (
+from teamslam.team.config import (
     Bounds,
     Estimator,
     FrontEnd,
@@ -18,10 +18,10 @@ from team.config import (
     MotionNoise,
     RobotConfig,
 )
-from team.rejection import Rejection
-from team.robot.node import RobotNode
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids, ids
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
 from tests import build
 from tests.hostile.drawing import S, hostile_stream, robot_session
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids, from_stamps
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, from_ids, from_stamps
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.hostile.drawing import (
     CONFIG,

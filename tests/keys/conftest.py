@@ -4,8 +4,8 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from team.keys.authority import make_keys
-from team.keys.roster import nodes_of
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.roster import nodes_of
 from tests.keys.certificates import TEAM, Folders
 
 

@@ -15,17 +15,17 @@ from shutil import copytree
 import msgspec
 import pytest
 
-from team.keys.authority import make_keys
-from team.keys.credentials import credentials_of
-from team.keys.roster import load_roster, nodes_of
-from team.the_end import TheEnd
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import BusError, Outgoing, Sample, opened, replied
-from team.wire.codec import encoded
-from team.wire.zenoh import session
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import load_roster, nodes_of
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened, replied
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh import session
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.keys.certificates import TEAM, Folders
 from tests.support import example, examples, odometry, submap, wait_until

@@ -9,13 +9,13 @@ import pytest
 import zenoh
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.cli.options import is_loopback
-from team.keys.authority import make_keys
-from team.keys.credentials import credentials_of
-from team.keys.roster import KeysError, load_roster, nodes_of
-from team.wire import channels as ch
-from team.wire.zenoh.access import owned
+from teamslam.sim.cli.main import app
+from teamslam.sim.cli.options import is_loopback
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import KeysError, load_roster, nodes_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.zenoh.access import owned
 from tests.keys.certificates import TEAM, Folders
 
 

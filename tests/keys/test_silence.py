@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from team.keys.credentials import credentials_of
-from team.keys.roster import load_roster
-from team.wire import channels as ch
-from team.wire.bus import BusError, Outgoing
-from team.wire.zenoh import session
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.handshake import examine
-from team.wire.zenoh.router import router
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import load_roster
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import BusError, Outgoing
+from teamslam.team.wire.zenoh import session
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.handshake import examine
+from teamslam.team.wire.zenoh.router import router
 from tests.keys.certificates import TEAM, Folders
 from tests.support import Link, submap, wait_until
 
@@ -38,7 +38,7 @@ def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
         examined.append(found.waits_for)
         return found
 
-    monkeypatch.setattr("team.wire.zenoh.handshake.examine", counted)
+    monkeypatch.setattr("teamslam.team.wire.zenoh.handshake.examine", counted)
     own = credentials_of(keys.own, "router"), load_roster(keys.own)
     centre, robot = (credentials_of(keys.own, node, TEAM) for node in ("central", "robot-r1"))
     with (
@@ -137,7 +137,7 @@ def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
 ) -> None:
     """A process of the team is restarted while the router stands still for longer than patience."""
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
-    monkeypatch.setattr("team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
+    monkeypatch.setattr("teamslam.team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
     caplog.set_level(logging.WARNING, "teamslam")
     own = (credentials_of(keys.own, "router"), load_roster(keys.own)) if with_keys else None
     robot = credentials_of(keys.own, "robot-r1", TEAM) if with_keys else None

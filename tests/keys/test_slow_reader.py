@@ -15,12 +15,12 @@ import pytest
 import zenoh
 from zenoh.handlers import Callback
 
-from team.keys.credentials import Credentials, credentials_of
-from team.wire import channels as ch
-from team.wire.bus import Sample
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
-from team.wire.zenoh.session import client
+from teamslam.team.keys.credentials import Credentials, credentials_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
+from teamslam.team.wire.zenoh.session import client
 from tests.keys.certificates import TEAM, Folders
 from tests.support import ROOT, Link, wait_until
 
@@ -33,9 +33,9 @@ readers cost if the others wait for them: 5 s and more."""
 ROUTER = """
 import sys, threading
 from pathlib import Path
-from team.keys.credentials import credentials_of
-from team.keys.roster import load_roster
-from team.wire.zenoh.router import router
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import load_roster
+from teamslam.team.wire.zenoh.router import router
 own = Path(sys.argv[1]) if sys.argv[1] else None
 listen = "tls/127.0.0.1:0" if own else "tcp/127.0.0.1:0"
 with router(listen, (credentials_of(own, "router"), load_roster(own)) if own else None) as endpoint:
@@ -46,8 +46,8 @@ READER = """
 import sys, threading
 from pathlib import Path
 from zenoh.handlers import Callback
-from team.keys.credentials import credentials_of
-from team.wire.zenoh.session import client
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.wire.zenoh.session import client
 own = credentials_of(Path(sys.argv[1]), "viewer") if sys.argv[1] else None
 with client(sys.argv[2], 60.0, own) as session:
     callback = Callback(lambda sample: None, indirect=False)

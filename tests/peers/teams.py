@@ -6,13 +6,13 @@ from functools import cache
 
 import msgspec
 
-from team.peers.members import Member, about
-from team.peers.node import PeerNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
+from teamslam.team.peers.members import Member, about
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.support import packed, spd, submap
 

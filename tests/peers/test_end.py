@@ -2,12 +2,12 @@
 
 import pytest
 
-from central.config import CentralConfig
-from central.peers.robot import PeerRobot
-from team.config import RobotConfig
-from team.wire import channels as ch
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.team.config import RobotConfig
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.peers.teams import member
 

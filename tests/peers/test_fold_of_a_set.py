@@ -4,13 +4,13 @@ import random
 
 import pytest
 
-from central.config import CentralConfig
-from central.peers.fold import PeerFold
-from team.peers.members import Member
-from team.peers.node import PeerNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.fold import PeerFold
+from teamslam.team.peers.members import Member
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.peers.teams import done, member, parcel, start
 

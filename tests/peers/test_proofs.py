@@ -6,19 +6,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.peers.robot import PeerRobot
-from team.config import RobotConfig
-from team.keys.authority import make_keys
-from team.keys.credentials import credentials_of
-from team.keys.roster import nodes_of
-from team.keys.signing import Signer
-from team.peers.members import Member
-from team.peers.node import PeerNode
-from team.peers.proofs import OPERATOR, Proofs, signed_order
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.team.config import RobotConfig
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import nodes_of
+from teamslam.team.keys.signing import Signer
+from teamslam.team.peers.members import Member
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.peers.proofs import OPERATOR, Proofs, signed_order
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.peers.teams import member, parcel, start
 

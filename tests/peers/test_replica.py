@@ -5,17 +5,17 @@ import random
 import msgspec
 import pytest
 
-from central.config import CentralConfig
-from central.peers.fold import PeerFold
-from team.door import MOST_COUNT
-from team.peers.exchange import MOST_ASKED, make_answer, make_request
-from team.peers.given import GIVEN_BYTES
-from team.peers.members import LARGEST_MEMBER, Member, member_of
-from team.peers.node import PeerNode
-from team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.peers.fold import PeerFold
+from teamslam.team.door import MOST_COUNT
+from teamslam.team.peers.exchange import MOST_ASKED, make_answer, make_request
+from teamslam.team.peers.given import GIVEN_BYTES
+from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
+from teamslam.team.peers.node import PeerNode
+from teamslam.team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.peers.teams import done, member, parcel, said, start
 from tests.support import example

@@ -11,12 +11,12 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from team.peers.members import member_of
-from team.peers.replica import Replica
-from team.peers.set_file import MAGIC, Keeper, SetFile, SetFileError, record_of
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.team.peers.members import member_of
+from teamslam.team.peers.replica import Replica
+from teamslam.team.peers.set_file import MAGIC, Keeper, SetFile, SetFileError, record_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.peers.teams import said
 
@@ -181,7 +181,7 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
         return pwrite(file, data[: max(taken // 2, 1)], at)  # in pieces, too
 
     monkeypatch.setattr(os, "pwrite", into_room)
-    monkeypatch.setattr("team.peers.set_file.RETRY_S", 0.0)
+    monkeypatch.setattr("teamslam.team.peers.set_file.RETRY_S", 0.0)
     keeper = Keeper(path)
     several = [MEMBERS[k % len(MEMBERS)] for k in range(60)]
     for each in several[:50]:

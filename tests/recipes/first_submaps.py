@@ -4,17 +4,17 @@ import math
 
 import numpy as np
 
-from central.fused import fused_message, version_entry
-from central.join_messages import Tail
-from central.node import CentralNode
-from central.submap_fold import RecordedFields, SubmapFold
-from team import translate
-from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.se2 import transformed
-from team.wire import channels as ch
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
-from team.wire.digest import digest_of
+from teamslam.central.fused import fused_message, version_entry
+from teamslam.central.join_messages import Tail
+from teamslam.central.node import CentralNode
+from teamslam.central.submap_fold import RecordedFields, SubmapFold
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.estimation.se2 import transformed
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 
 
 class FirstSubmaps(SubmapFold):

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from sim.studies.robots.estimator import NOTHING_NEW, Estimates, KnownMap
-from team.config import RobotConfig
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.odometry import OdometryInterval
-from team.estimation.scans import Scan
-from team.rejection import Rejection
-from team.robot.own_map import InitialPose
+from teamslam.sim.studies.robots.estimator import NOTHING_NEW, Estimates, KnownMap
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.scans import Scan
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.own_map import InitialPose
 
 
 class Standing:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import team
+import teamslam.team
 
 ROWS = {
     "ESTIMATORS: Mapping[str, EstimatorRow] = MappingProxyType(\n    {\n": (
@@ -21,23 +21,23 @@ ROWS = {
 
 
 def add_rows() -> None:
-    """`team.pairs` as it is with the rows in it, before anything imports it."""
-    path = Path(team.__file__).parent / "pairs.py"
+    """`teamslam.team.pairs` as it is with the rows in it, before anything imports it."""
+    path = Path(teamslam.team.__file__).parent / "pairs.py"
     source = path.read_text()
     for before, row in ROWS.items():
         assert source.count(before) == 1, before
         source = source.replace(before, before + row)
-    module = ModuleType("team.pairs")
-    sys.modules["team.pairs"] = module
+    module = ModuleType("teamslam.team.pairs")
+    sys.modules["teamslam.team.pairs"] = module
     exec(compile(source, str(path), "exec"), vars(module))
-    team.pairs = module
+    teamslam.team.pairs = module
 
 
 def main(folder: Path) -> None:
     """Says of each run what its final map has and what the verification finds."""
     add_rows()
-    from central.desk.verification.verification import verify
-    from sim.in_memory.team import final_map
+    from teamslam.central.desk.verification.verification import verify
+    from teamslam.sim.in_memory.team import final_map
     from tests.sim.reruns import team_samples, thesis, written
 
     ours = thesis(24, fusion="first-submaps"), thesis(24, estimator="standing", fusion="alone")

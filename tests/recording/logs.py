@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from team.recording.reader import Log, open_log
-from team.recording.recorder import Recorder
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from teamslam.team.recording.reader import Log, open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 from tests.support import examples, on_its_key
 
 

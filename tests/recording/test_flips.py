@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from mcap.opcode import Opcode
 
-from team.recording.reader import LogError, open_log
-from team.recording.recorder import Recorder
-from team.recording.records import read_frames
-from team.recording.repair import read_undamaged
-from team.wire import channels as c
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.records import read_frames
+from teamslam.team.recording.repair import read_undamaged
+from teamslam.team.wire import channels as c
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests.support import odometry, submap
 
 SECOND = 10**9

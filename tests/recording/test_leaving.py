@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 
-from team import shell
-from team.recording.check import holes
-from team.recording.inventory import Inventory
-from team.recording.reader import open_log
-from team.recording.received import Received
-from team.recording.recorder import Recorder
-from team.recording.shell import RecordLoop
-from team.shell import Shell
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team import shell
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.reader import open_log
+from teamslam.team.recording.received import Received
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.shell import RecordLoop
+from teamslam.team.shell import Shell
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.recording.test_shell import FINAL, logged
 from tests.support import wait_until

@@ -16,14 +16,14 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from team import core
-from team.recording.provenance import estimation_digest, provenance
-from team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogError, open_log
-from team.recording.recorder import Recorder, RecorderError
-from team.recording.repair import repair_log
-from team.wire import channels as c
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.team import core
+from teamslam.team.recording.provenance import estimation_digest, provenance
+from teamslam.team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogError, open_log
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.repair import repair_log
+from teamslam.team.wire import channels as c
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.support import ROOT, odometry, submap, wait_until
@@ -159,7 +159,7 @@ def test_a_closed_recorder_takes_nothing(path: Path) -> None:
 def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path: Path) -> None:
     program = (
         "import resource; from tests.recording.test_log import stream\n"
-        "from team.recording.recorder import Recorder, RecorderError\n"
+        "from teamslam.team.recording.recorder import Recorder, RecorderError\n"
         "from tests.support import wait_until\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))\n"
         f"recorder = Recorder({str(path)!r}, 't', {{}})\n"
@@ -188,7 +188,7 @@ def killed(path: Path, count: int) -> Log:
     """The log of a recorder that was killed some time after it had written `count` samples."""
     program = (
         "import sys, threading; from pathlib import Path\n"
-        "from team.recording.recorder import Recorder\n"
+        "from teamslam.team.recording.recorder import Recorder\n"
         "from tests.recording.test_log import stream\n"
         f"recorder = Recorder(Path({str(path)!r}), 't', {{'seed': '7'}})\n"
         f"recorder.write(stream({count})); print('ready', flush=True); sys.stdin.read()"

@@ -3,14 +3,14 @@
 import threading
 from pathlib import Path
 
-from team.recording.merge import merge
-from team.recording.own_log import own_log
-from team.recording.reader import open_log
-from team.wire import channels as c
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.recording.merge import merge
+from teamslam.team.recording.own_log import own_log
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as c
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.support import odometry, received, submap
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli import log as cli_log
-from sim.cli.main import app
-from team.recording import parquet_tables
-from team.recording.parquet_tables import export_parquet
-from team.recording.tables import numbers_of, table_of
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Sample
+from teamslam.sim.cli import log as cli_log
+from teamslam.sim.cli.main import app
+from teamslam.team.recording import parquet_tables
+from teamslam.team.recording.parquet_tables import export_parquet
+from teamslam.team.recording.tables import numbers_of, table_of
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.support import odometry
 

@@ -11,21 +11,21 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.scenarios.scenario import dumps, load
-from team.recording.check import check_log, holes
-from team.recording.inventory import Inventory
-from team.recording.part_files import part_of, parts_of
-from team.recording.parts import check_continues, join, next_part
-from team.recording.reader import LogError, open_log
-from team.recording.recorder import Recorder, RecorderError
-from team.recording.shell import RecordLoop, record
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
-from team.wire.codec import decoded, encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.sim.cli.main import app
+from teamslam.sim.scenarios.scenario import dumps, load
+from teamslam.team.recording.check import check_log, holes
+from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.part_files import part_of, parts_of
+from teamslam.team.recording.parts import check_continues, join, next_part
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.shell import RecordLoop, record
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, wait_until
@@ -118,7 +118,7 @@ def test_a_log_that_is_not_of_this_run_is_not_continued(
     else:
         killed_part(path, samples_of(1))
     if wrong == "old":
-        monkeypatch.setattr("team.recording.parts.LONGEST_AWAY_S", -1.0)
+        monkeypatch.setattr("teamslam.team.recording.parts.LONGEST_AWAY_S", -1.0)
     scenario = "another" if wrong == "another scenario" else "s"
     with pytest.raises(LogError, match=r"exists.*choose another name or remove it"):
         check_continues(path, "t", {"scenario": scenario})
@@ -276,7 +276,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
     path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr("team.recording.shell._RETRY_S", 0.0)
+    monkeypatch.setattr("teamslam.team.recording.shell._RETRY_S", 0.0)
     network = MemoryNetwork()
     bus, world = MemoryBus(network), MemoryBus(network)
 

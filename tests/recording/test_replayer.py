@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.recording.replayer import schedule
-from team.wire.bus import Sample
+from teamslam.team.recording.replayer import schedule
+from teamslam.team.wire.bus import Sample
 
 
 def at(*stamps: int) -> list[Sample]:

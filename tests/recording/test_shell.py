@@ -9,17 +9,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from team.recording import recorder as recorder_module
-from team.recording.check import holes
-from team.recording.reader import open_log
-from team.recording.recorder import Recorder
-from team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.codec import decoded, encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.recording import recorder as recorder_module
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.reader import open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.support import Link, example, odometry, received, submap, wait_until
 

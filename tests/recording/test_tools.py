@@ -14,22 +14,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from team.recording.check import check_log
-from team.recording.counters import Counters
-from team.recording.csv_tables import export_csv
-from team.recording.cut import cut
-from team.recording.declared import find_misdeclaration, read_declarations
-from team.recording.merge import MERGED, merge
-from team.recording.reader import Log, LogError, open_log
-from team.recording.recorder import Recorder, RecorderError
-from team.recording.schemas import schema_of
-from team.recording.summary import summarise_log
-from team.recording.tables import table_of
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import NO_COUNTER, Sample
-from team.wire.codec import encoded
+from teamslam.team.recording.check import check_log
+from teamslam.team.recording.counters import Counters
+from teamslam.team.recording.csv_tables import export_csv
+from teamslam.team.recording.cut import cut
+from teamslam.team.recording.declared import find_misdeclaration, read_declarations
+from teamslam.team.recording.merge import MERGED, merge
+from teamslam.team.recording.reader import Log, LogError, open_log
+from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.schemas import schema_of
+from teamslam.team.recording.summary import summarise_log
+from teamslam.team.recording.tables import table_of
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import NO_COUNTER, Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.recording.test_log import chunks_of

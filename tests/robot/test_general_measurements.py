@@ -6,19 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.verification.verification import verify
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.batch_reference.measurements import Scan, chains_of
-from sim.studies.batch_reference.reference import NoiseKind, batch_map
-from team import translate
-from team.config import MotionModel, MotionNoise, Sensor
-from team.rejection import Rejection
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.batch_reference.measurements import Scan, chains_of
+from teamslam.sim.studies.batch_reference.reference import NoiseKind, batch_map
+from teamslam.team import translate
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.rejection import Rejection
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 from tests.sim.reruns import written
 
 MOUNT = (0.8, -0.3, 0.2)

@@ -8,13 +8,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from team.recording.own_log import own_log
-from team.rejection import Rejection
-from team.robot.main import RobotShell
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
-from team.wire.codec import decoded, encoded
+from teamslam.team.recording.own_log import own_log
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.main import RobotShell
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
+from teamslam.team.wire.codec import decoded, encoded
 from tests.support import odometry
 from tests.teams import config, published, stream, submaps_of
 

@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import translate
-from team.pairs import PAIRS
-from team.rejection import Rejection
-from team.robot import node as robot_node
-from team.robot.node import RobotNode
-from team.robot.node import robot_node as node_for
-from team.wire import channels as ch
-from team.wire import codec
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats, from_ids, ids
-from team.wire.bus import Outgoing
-from team.wire.codec import decoded, encoded
-from team.wire.digest import digest_of
+from teamslam.team import translate
+from teamslam.team.pairs import PAIRS
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot import node as robot_node
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.robot.node import robot_node as node_for
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import codec
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.digest import digest_of
 from tests.support import fused_map, packed, spd
 from tests.teams import config, driven, of, published, stream
 

@@ -5,14 +5,14 @@ import random
 import msgspec
 import pytest
 
-from central.desk.verification.verification import verify
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, ScenarioError, dumps, loads
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
-from team.wire.codec import encoded
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, dumps, loads
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import encoded
 from tests.sim.reruns import written
 from tests.teams import Team, driven, of, published
 from tests.test_sighted_team import CENTRE, SCENARIO, STREAMS

@@ -5,14 +5,14 @@ import gc
 import msgspec
 import numpy as np
 
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.submap import LocalMap
-from team.robot.node import RobotNode
-from team.robot.submaps import Submaps
-from team.robot.team_map import CONDENSED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.robot.submaps import Submaps
+from teamslam.team.robot.team_map import CONDENSED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
 from tests.support import submap
 from tests.teams import config, driven, of, published, stream
 

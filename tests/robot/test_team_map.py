@@ -4,15 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from team import translate
-from team.config import Bounds
-from team.estimation.gaussian import PoseGaussian, curved
-from team.estimation.map_joining.conditioning import followed
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.plausible import prior_beyond
-from team.robot.team_map import CONDENSED, TeamMap
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from teamslam.team import translate
+from teamslam.team.config import Bounds
+from teamslam.team.estimation.gaussian import PoseGaussian, curved
+from teamslam.team.estimation.map_joining.conditioning import followed
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.plausible import prior_beyond
+from teamslam.team.robot.team_map import CONDENSED, TeamMap
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
 from tests import build
 from tests.estimation.submap_world import team
 from tests.support import packed, spd
@@ -54,7 +54,7 @@ def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.M
         solved_at_once.append(len(pending))
         return followed(whole, pending)
 
-    monkeypatch.setattr("team.robot.team_map.followed", counted)
+    monkeypatch.setattr("teamslam.team.robot.team_map.followed", counted)
     often, seldom = TeamMap(), TeamMap()
     for known in range(1, len(submaps) + 1):
         last = often.join(told, submaps[:known]).whole
@@ -94,7 +94,7 @@ def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(
         tried.append(1)
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("team.robot.team_map.followed", unsolvable)
+    monkeypatch.setattr("teamslam.team.robot.team_map.followed", unsolvable)
     kept, told = TeamMap(), prior(1)
     for _ in range(5):
         with pytest.raises(UNSOLVABLE):

@@ -4,17 +4,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.verification.verification import verify
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.config import UNNAMED
-from team.rejection import Rejection
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import ids, octets, stamps
-from team.wire.bus import opened
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.config import UNNAMED
+from teamslam.team.rejection import Rejection
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids, octets, stamps
+from teamslam.team.wire.bus import opened
 from tests.sim.reruns import written
 
 STEPS = 50

@@ -8,16 +8,16 @@ import pytest
 import zenoh
 from rosbags.highlevel import AnyReader
 
-from central.desk.export.rosbag2 import export_rosbag2
-from team.ros2.definitions import types
-from team.ros2.encoding import compose, ellipse, inverse, names_of
-from team.ros2.keys import of_rmw, of_token
-from team.ros2.topics import RobotTopics
-from team.ros2_answers import Answers, LiveAnswers, RosPublisher
-from team.translate import landmark_blocks_of
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.zenoh.foreign import ForeignKeys
+from teamslam.central.desk.export.rosbag2 import export_rosbag2
+from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.encoding import compose, ellipse, inverse, names_of
+from teamslam.team.ros2.keys import of_rmw, of_token
+from teamslam.team.ros2.topics import RobotTopics
+from teamslam.team.ros2_answers import Answers, LiveAnswers, RosPublisher
+from teamslam.team.translate import landmark_blocks_of
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.zenoh.foreign import ForeignKeys
 from tests.ros2.conftest import Network
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import example, packed, spd, wait_until

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from team.ros2 import decoding as d
-from team.ros2.frames import BODY, Frames, heading
-from team.ros2.topics import RobotTopics
-from team.ros2.translator import Pose, Seen, Speeds, Translator
+from teamslam.team.ros2 import decoding as d
+from teamslam.team.ros2.frames import BODY, Frames, heading
+from teamslam.team.ros2.topics import RobotTopics
+from teamslam.team.ros2.translator import Pose, Seen, Speeds, Translator
 from tests.ros2 import messages as ros
 
 AT = 1_700_000_000_123_456_789

@@ -13,17 +13,17 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from team.config import RobotConfig, Sensor
-from team.driver.journal import Journal
-from team.driver.measured import MeasurementError
-from team.driver.node import SourceNode
-from team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
-from team.ros2.keys import of_rmw, of_token
-from team.ros2.topics import RobotTopics, TopicsError, load_topics
-from team.ros2.translator import Measured
-from team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
-from team.wire.digest import configured
-from team.wire.zenoh.foreign import ForeignKeys, ForeignSample
+from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.driver.journal import Journal
+from teamslam.team.driver.measured import MeasurementError
+from teamslam.team.driver.node import SourceNode
+from teamslam.team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
+from teamslam.team.ros2.keys import of_rmw, of_token
+from teamslam.team.ros2.topics import RobotTopics, TopicsError, load_topics
+from teamslam.team.ros2.translator import Measured
+from teamslam.team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
+from teamslam.team.wire.digest import configured
+from teamslam.team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.ros2.conftest import Network
 from tests.support import wait_until
@@ -343,12 +343,12 @@ def test_what_waits_is_handed_over_in_the_order_of_its_stamps() -> None:
 def test_a_driver_that_falls_behind_says_so_in_its_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("team.ros2.arrivals.MOST_WAITING", 3)
+    monkeypatch.setattr("teamslam.team.ros2.arrivals.MOST_WAITING", 3)
     driver = Ros2Driver(Robot(), TOPICS)
     for k in range(1, 6):
         driver.put(ForeignSample(by_rmw("/r1/odom", ODOMETRY), odometry(k)))
     now = time.monotonic()
-    monkeypatch.setattr("team.ros2.arrivals.time.monotonic", lambda: now + 5.0 * BEHIND_S)
+    monkeypatch.setattr("teamslam.team.ros2.arrivals.time.monotonic", lambda: now + 5.0 * BEHIND_S)
     node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
     node.fed = driver.figures(), driver.warnings()
     status = node.status()
@@ -367,7 +367,7 @@ def test_odometry_that_does_not_come_is_named_with_what_to_look_at(
     heard.deliver()
     assert not silent.warnings()
     now = time.monotonic()
-    monkeypatch.setattr("team.ros2_driver.time.monotonic", lambda: now + 2.0 * SILENT_S)
+    monkeypatch.setattr("teamslam.team.ros2_driver.time.monotonic", lambda: now + 2.0 * SILENT_S)
     assert not heard.warnings()
     (said,) = silent.warnings()
     assert "/r1/odom: no message yet: look at its name, at `domain`" in said

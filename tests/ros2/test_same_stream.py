@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.datasets.folder import folder
-from sim.importing.bag import import_bag
-from sim.publisher.node import WorldNode
-from sim.world.config import FolderWorld
-from team.config import RobotConfig
-from team.driver.driver import Driver
-from team.ros2.topics import RobotTopics, Topics
-from team.ros2_driver import Ros2Driver
-from team.wire import messages as m
-from team.wire.codec import encoded
-from team.wire.zenoh.foreign import ForeignSample
+from teamslam.sim.datasets.folder import folder
+from teamslam.sim.importing.bag import import_bag
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.sim.world.config import FolderWorld
+from teamslam.team.config import RobotConfig
+from teamslam.team.driver.driver import Driver
+from teamslam.team.ros2.topics import RobotTopics, Topics
+from teamslam.team.ros2_driver import Ros2Driver
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh.foreign import ForeignSample
 from tests import build
 from tests.ros2 import messages as ros
 from tests.teams import world_of

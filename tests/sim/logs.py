@@ -5,19 +5,19 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from sim.publisher.node import WorldNode
-from sim.scenarios.scenario import Scenario, with_options
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from sim.world.streams import WorldStreams
-from team import translate
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing, Sample, opened
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.sim.scenarios.scenario import Scenario, with_options
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team import translate
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing, Sample, opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.support import fused_map
 

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import msgspec
 
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from team.recording.provenance import provenance
-from team.recording.reader import Log, open_log
-from team.recording.recorder import Recorder
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.recording.provenance import provenance
+from teamslam.team.recording.reader import Log, open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests.teams import Team
 
 Change = Callable[[m.Message], m.Message | None]

@@ -3,9 +3,9 @@
 import msgspec
 import numpy as np
 
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.estimation.consistency import chi2_interval
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.estimation.consistency import chi2_interval
 from tests.trials.online_bound import bounds
 
 SEEDS = range(2000, 2020)

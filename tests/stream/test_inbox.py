@@ -3,8 +3,8 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.stream.inbox import Inbox
-from team.wire import messages as m
+from teamslam.team.stream.inbox import Inbox
+from teamslam.team.wire import messages as m
 from tests import build
 
 

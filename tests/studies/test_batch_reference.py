@@ -11,21 +11,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from central.desk.evaluation.errors import Path
-from sim.scenarios.scenario import Scenario
-from sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
-from sim.studies.batch_reference.measurements import (
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
+from teamslam.sim.studies.batch_reference.measurements import (
     BatchReferenceError,
     Chain,
     Scan,
     anchored,
     chains_of,
 )
-from sim.studies.batch_reference.reference import BatchReference, batch_map
-from team.config import MotionModel, MotionNoise, RobotConfig
-from team.estimation.models import increment_of
-from team.estimation.se2 import between, compose, exponential, tangent
-from team.wire import channels as ch
+from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
+from teamslam.team.estimation.models import increment_of
+from teamslam.team.estimation.se2 import between, compose, exponential, tangent
+from teamslam.team.wire import channels as ch
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
 
 small = st.floats(-0.3, 0.3)

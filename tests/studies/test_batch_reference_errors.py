@@ -8,16 +8,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from central.config import BiasSigmas
-from sim.scenarios.scenario import Scenario
-from sim.studies.batch_reference.errors import add_errors, bias_key, detections_of, profile_graph
-from sim.studies.batch_reference.graph import pose_key, values_of
-from sim.studies.batch_reference.measurements import Chain, Scan, chains_of
-from sim.studies.batch_reference.reference import batch_map
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.hybrid_slam.pose_grid import NodeSighting
-from team.estimation.models import increment_of, noise, predicted
-from team.estimation.se2 import Pose
+from teamslam.central.config import BiasSigmas
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.studies.batch_reference.errors import (
+    add_errors,
+    bias_key,
+    detections_of,
+    profile_graph,
+)
+from teamslam.sim.studies.batch_reference.graph import pose_key, values_of
+from teamslam.sim.studies.batch_reference.measurements import Chain, Scan, chains_of
+from teamslam.sim.studies.batch_reference.reference import batch_map
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
+from teamslam.team.estimation.models import increment_of, noise, predicted
+from teamslam.team.estimation.se2 import Pose
 from tests.sim.logs import joined_log, scenario
 
 LANDMARKS = {7: np.array([4.0, 1.0]), 9: np.array([2.0, -3.0])}

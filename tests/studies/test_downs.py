@@ -6,21 +6,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.datasets.utias import utias
-from sim.datasets.utias_writer import write_utias
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.experiments import downs_minima
-from sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
-from sim.studies.experiments.downs_joined import spherical_task
-from sim.studies.experiments.downs_simulated import (
+from teamslam.sim.datasets.utias import utias
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments import downs_minima
+from teamslam.sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
+from teamslam.sim.studies.experiments.downs_joined import spherical_task
+from teamslam.sim.studies.experiments.downs_simulated import (
     SIMULATED_5_1,
     WORLDS,
 )
-from sim.studies.experiments.experiment import Dataset, Options, Results
-from sim.studies.experiments.team_runs import Figures
-from sim.world.config import UtiasWorld
-from team.estimation.map_joining.alignment import procrustes
+from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.world.config import UtiasWorld
+from teamslam.team.estimation.map_joining.alignment import procrustes
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 

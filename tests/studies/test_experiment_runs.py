@@ -10,18 +10,18 @@ import msgspec
 import pytest
 from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
-from sim.datasets.tables import DatasetError
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments import xu_localisation
-from sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
-from sim.studies.experiments.catalogue import ENTRIES, Entry
-from sim.studies.experiments.experiment import Options, Outcome, Results
-from sim.studies.experiments.output import write
-from sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
-from sim.studies.experiments.task import ROOTS, Task
-from sim.studies.experiments.team_runs import team_run, team_task
-from sim.world.config import SimulatedWorld
-from team.sources import sources_of
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments import xu_localisation
+from teamslam.sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
+from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results
+from teamslam.sim.studies.experiments.output import write
+from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
+from teamslam.sim.studies.experiments.task import ROOTS, Task
+from teamslam.sim.studies.experiments.team_runs import team_run, team_task
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team.sources import sources_of
 
 WORK = "json:loads"
 """A function that a process imports at once."""
@@ -116,7 +116,7 @@ def test_a_result_of_another_program_does_not_count(
     assert done.result == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(2.0)) is None
-    monkeypatch.setattr("sim.studies.experiments.task.program_of", lambda _: "0" * 16)
+    monkeypatch.setattr("teamslam.sim.studies.experiments.task.program_of", lambda _: "0" * 16)
     assert Cases(tmp_path).found(counted(1.0)) is None
 
 
@@ -136,16 +136,16 @@ def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> N
 
 
 def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
-    sources = sources_of("sim.studies.experiments.team_runs", ROOTS)
+    sources = sources_of("teamslam.sim.studies.experiments.team_runs", ROOTS)
     wanted = {
-        "team.estimation.hybrid_slam.outliers",
-        "central.submap_fold",
-        "sim.studies.rules.svd_rule",  # found by the name that a table gives
-        "sim.studies.batch_reference.graph",
+        "teamslam.team.estimation.hybrid_slam.outliers",
+        "teamslam.central.submap_fold",
+        "teamslam.sim.studies.rules.svd_rule",  # found by the name that a table gives
+        "teamslam.sim.studies.batch_reference.graph",
         "sim",
     }
     assert wanted <= sources.keys()
-    assert "sim.studies.experiments.output" not in sources
+    assert "teamslam.sim.studies.experiments.output" not in sources
     assert not {name for name in sources if name.partition(".")[0] == "numpy"}
 
 

@@ -6,17 +6,24 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments import accuracy_few, accuracy_worlds
-from sim.studies.experiments.catalogue import ENTRIES, Entry
-from sim.studies.experiments.curves import curves_task
-from sim.studies.experiments.experiment import Goal, Options, Outcome, Picture, Results, Table
-from sim.studies.experiments.output import to_json, write
-from sim.studies.experiments.parameters import kinds_of
-from sim.studies.experiments.runner import Concluded, planned
-from sim.studies.experiments.team_runs import Figures, over_seeds
-from sim.studies.experiments.xu import with_particles
+from teamslam.sim.cli.main import app
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.experiments import accuracy_few, accuracy_worlds
+from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
+from teamslam.sim.studies.experiments.curves import curves_task
+from teamslam.sim.studies.experiments.experiment import (
+    Goal,
+    Options,
+    Outcome,
+    Picture,
+    Results,
+    Table,
+)
+from teamslam.sim.studies.experiments.output import to_json, write
+from teamslam.sim.studies.experiments.parameters import kinds_of
+from teamslam.sim.studies.experiments.runner import Concluded, planned
+from teamslam.sim.studies.experiments.team_runs import Figures, over_seeds
+from teamslam.sim.studies.experiments.xu import with_particles
 
 
 def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1) -> Figures:

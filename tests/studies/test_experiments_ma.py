@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.datasets.utias_writer import write_utias
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from sim.studies.experiments import ma, ma_errors, ma_maps
-from sim.studies.experiments.experiment import Dataset, Options, Results
-from sim.studies.experiments.runner import dataset
-from sim.studies.experiments.team_runs import Figures
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments import ma, ma_errors, ma_maps
+from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+from teamslam.sim.studies.experiments.runner import dataset
+from teamslam.sim.studies.experiments.team_runs import Figures
 
 FRAMES = 300
 

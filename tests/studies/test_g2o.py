@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
-from central.desk.evaluation.evaluation import evaluate
-from sim.cli.main import app
-from sim.in_memory.team import run_team
-from team.recording.recorder import Recorder
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.cli.main import app
+from teamslam.sim.in_memory.team import run_team
+from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import scenario, streams, world_log
 
 
@@ -77,7 +77,7 @@ def test_another_optimiser_finds_the_map_from_the_file(log: Path, tmp_path: Path
     file = tmp_path / "problem.g2o"
     done = CliRunner().invoke(app, ["batch-reference", str(log), "--g2o", str(file)])
     assert done.exit_code == 0, done.output
-    from team.recording.reader import open_log
+    from teamslam.team.recording.reader import open_log
 
     joined = evaluate(open_log(log).samples()).map
     assert joined is not None

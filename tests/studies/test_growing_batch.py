@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sim.studies.batch_reference import growing as batch
-from sim.studies.batch_reference.graph import FLOOR_SIGMAS
-from team import core
-from team.config import Sensor
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.models import noise
-from team.estimation.se2 import (
+from teamslam.sim.studies.batch_reference import growing as batch
+from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.models import noise
+from teamslam.team.estimation.se2 import (
     adjoint,
     between,
     compose,

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.studies.experiments import runner
-from sim.studies.experiments.catalogue import Entry
-from sim.studies.experiments.experiment import Options, Outcome, Results, Table
-from sim.studies.experiments.runner import Plan
-from sim.studies.experiments.shards import Shard, tasks_of
-from sim.studies.experiments.task import Task
+from teamslam.sim.cli.main import app
+from teamslam.sim.studies.experiments import runner
+from teamslam.sim.studies.experiments.catalogue import Entry
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.runner import Plan
+from teamslam.sim.studies.experiments.shards import Shard, tasks_of
+from teamslam.sim.studies.experiments.task import Task
 
 RUN = CliRunner()
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.evaluation import evaluate
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.source import streams_of
-from sim.studies.experiments.plain_cost import PlainCost
-from sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
-from team.estimation.map_joining.gauss_newton import Island, JoinSettings
-from team.estimation.map_joining.minima import minimum, searched
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.plain_cost import PlainCost
+from teamslam.sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
+from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from teamslam.team.estimation.map_joining.minima import minimum, searched
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
 from tests.studies.test_experiment_runs import short

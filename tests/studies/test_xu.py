@@ -9,14 +9,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.scenarios.scenario import Scenario, load, loads, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.experiments import xu, xu_localisation
-from sim.studies.experiments.curves import a_step_late, curves_run
-from sim.studies.experiments.experiment import Options, Results
-from sim.studies.experiments.team_runs import Figures
-from sim.studies.experiments.xu_errors import FIGURE_4_4, FIGURE_5_2
-from sim.world.config import SimulatedWorld
+from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments import xu, xu_localisation
+from teamslam.sim.studies.experiments.curves import a_step_late, curves_run
+from teamslam.sim.studies.experiments.experiment import Options, Results
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.xu_errors import FIGURE_4_4, FIGURE_5_2
+from teamslam.sim.world.config import SimulatedWorld
 
 STEPS = 40
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from team.wire.channels import Channel
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.channels import Channel
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.system.processes import until
 
 

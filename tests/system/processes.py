@@ -19,7 +19,7 @@ from typing import Self
 
 import pytest
 
-PROGRAM = (sys.executable, "-P", "-m", "sim")
+PROGRAM = (sys.executable, "-P", "-m", "teamslam")
 _PROC = Path("/proc")
 
 

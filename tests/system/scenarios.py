@@ -4,10 +4,10 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import dumps, load, loads, with_options
-from sim.scenarios.source import streams_of
-from team.wire.channels import FINAL_MAP
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire.channels import FINAL_MAP
 
 STEPS = 60
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from sim.datasets.utias_writer import write_utias
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
 from tests.support import ROOT, nobody_listens
 from tests.system.processes import Process, Processes
 from tests.system.scenarios import short

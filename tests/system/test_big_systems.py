@@ -9,7 +9,7 @@ from tests.support import ROOT
 DIGESTS = """
 import hashlib
 import numpy as np
-from team.core import Cholesky, Pattern
+from teamslam.team.core import Cholesky, Pattern
 
 n, root = 700, 600
 tied = np.ones((n, n), dtype=bool)

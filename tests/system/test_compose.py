@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 from tests.namespaces import network
 from tests.support import ROOT
 from tests.system.processes import PROGRAM, Process, Processes

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from sim.launch.supervisor import FRUITLESS
-from team.recording.reader import LogError, open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.sim.launch.supervisor import FRUITLESS
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 from tests.system.observer import Observer, endpoint_of
 from tests.system.processes import Process, Processes, until
 from tests.system.scenarios import final_map, map_in_memory, short

@@ -4,11 +4,11 @@ import time
 from itertools import islice
 from random import Random
 
-from sim.scenarios.scenario import load
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.hostile.drawing import OF_THE_RUN, mutated, payloads
 from tests.system.processes import Processes, until
 from tests.system.scenarios import short

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from sim.scenarios.scenario import builtin_names
-from team.recording.reader import open_log
+from teamslam.sim.scenarios.scenario import builtin_names
+from teamslam.team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.processes import Processes
 from tests.system.scenarios import short
 
-PACKAGES = ("team", "central", "sim")
+FOLDERS = ("team", "central", "sim")
 COMMAND = Path(sys.executable).with_name("teamslam")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 OFFLINE = ("--no-deps", "--no-index")
 
 
 async def test_a_user_s_own_folders_do_not_shadow_ours(team: Processes) -> None:
-    for package in PACKAGES:
+    for package in (*FOLDERS, "teamslam"):
         folder = team.folder / package
         folder.mkdir()
         (folder / "__init__.py").write_text("raise RuntimeError('this is the user\\'s own')\n")
@@ -51,9 +51,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for package in PACKAGES:
+    for package in (*FOLDERS, "teamslam"):
         leave = shutil.ignore_patterns("__pycache__", "*.so")
-        shutil.copytree(ROOT / package, source / package, ignore=leave)
+        shutil.copytree(ROOT / package, source / package, ignore=leave, symlinks=True)
     build = [
         *PIP,
         "wheel",
@@ -68,21 +68,23 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def test_the_wheel_holds_the_three_packages_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_holds_one_package_and_nothing_else(wheel: Path) -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     about = f"teamslam-{version}.dist-info/"
     with zipfile.ZipFile(wheel) as archive:
         shipped = {name for name in archive.namelist() if not name.startswith(about)}
         assert f"{about}licenses/LICENSE" in archive.namelist()
     expected = {
-        path.relative_to(ROOT).as_posix()
-        for package in PACKAGES
+        f"teamslam/{path.relative_to(ROOT).as_posix()}".replace("teamslam/teamslam/", "teamslam/")
+        for package in (*FOLDERS, "teamslam")
         for path in (ROOT / package).rglob("*")
         if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".css", ".svg"}
         or path.name == "py.typed"
     }
     modules = {
-        name for name in shipped if name.startswith("team/core/_core_") and name.endswith(".so")
+        name
+        for name in shipped
+        if name.startswith("teamslam/team/core/_core_") and name.endswith(".so")
     }
     assert modules
     assert shipped - modules == {name for name in expected if "team/core/building/" not in name}
@@ -98,7 +100,9 @@ async def test_the_wheel_runs_in_an_environment_of_its_own(team: Processes, whee
     (packages,) = fresh.glob("lib/python*/site-packages")
     (packages / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
-    where = await done(team, "where", [python, "-P", "-c", "import sim; print(sim.__file__)"])
+    where = await done(
+        team, "where", [python, "-P", "-c", "import teamslam; print(teamslam.__file__)"]
+    )
     assert Path(where.strip()).is_relative_to(fresh)
     teamslam = fresh / "bin" / "teamslam"
     version = await done(team, "version", [teamslam, "--version"])

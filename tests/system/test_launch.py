@@ -9,15 +9,15 @@ import msgspec
 import pytest
 import pytest_asyncio
 
-from central.stored_set import StoredSet
-from team.keys.authority import make_keys
-from team.keys.roster import nodes_of
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire.arrays import floats, from_floats
-from team.wire.bus import opened
-from team.wire.codec import encoded
-from team.wire.messages import Configuration, Submap
+from teamslam.central.stored_set import StoredSet
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.roster import nodes_of
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.messages import Configuration, Submap
 from tests.system.conftest import Launched
 from tests.system.processes import PROGRAM, Processes, Terminal
 from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short

@@ -7,13 +7,13 @@ import signal
 import sys
 from pathlib import Path
 
-from sim.datasets.folder_writer import write_folder
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.recording.check import holes
-from team.recording.reader import open_log
-from team.wire.channels import FINAL_MAP
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire.channels import FINAL_MAP
 from tests.support import ROOT, Link
 from tests.system.observer import endpoint_of
 from tests.system.processes import Processes, until

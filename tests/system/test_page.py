@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from central.desk.view.server import session
-from team.recording.recorder import Recorder
+from teamslam.central.desk.view.server import session
+from teamslam.team.recording.recorder import Recorder
 from tests.browser import Page, browsing, chromium
 from tests.crowd import crowd
 from tests.support import wait_until

@@ -4,11 +4,11 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim.scenarios.scenario import load
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded
 from tests.support import Link
 from tests.system.observer import Observer
 from tests.system.processes import Process, Processes

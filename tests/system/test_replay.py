@@ -6,10 +6,10 @@ from contextlib import contextmanager
 
 import zenoh
 
-from team.recording.reader import open_log
-from team.wire.bus import Sample
-from team.wire.zenoh.attachment import Attachment, pack
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.zenoh.attachment import Attachment, pack
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.system.conftest import Launched
 from tests.system.processes import Processes, until
 

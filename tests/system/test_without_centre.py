@@ -4,8 +4,8 @@ import json
 import subprocess
 from pathlib import Path
 
-from central.desk.verification.verification import verify
-from team.recording.reader import open_log
+from teamslam.central.desk.verification.verification import verify
+from teamslam.team.recording.reader import open_log
 from tests.system.processes import PROGRAM
 from tests.system.scenarios import map_in_memory, sha256, short
 

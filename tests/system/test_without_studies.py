@@ -6,12 +6,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from team.recording.reader import open_log
+from teamslam.team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.processes import Processes
 from tests.system.scenarios import short
 
-PACKAGES = ("team", "central", "sim")
+PACKAGES = ("team", "central", "sim", "teamslam")
 PATIENCE_S = 300.0
 """Time limit [s] of a command."""
 REMOVABLE = ("sim/studies",)
@@ -21,7 +21,7 @@ REMOVED = """import sys
 class Removed:
     @staticmethod
     def find_spec(name, path=None, target=None):
-        if f"{name}.".startswith("sim.studies."):
+        if f"{name}.".startswith("teamslam.sim.studies."):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         return None
 
@@ -36,7 +36,7 @@ a direct child of another, in the checkout.
 def without_studies(folder: Path) -> Path:
     """The sources without the removable folders."""
     for package in PACKAGES:
-        shutil.copytree(ROOT / package, folder / package)
+        shutil.copytree(ROOT / package, folder / package, symlinks=True)
     for name in REMOVABLE:
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / "sitecustomize.py").write_text(REMOVED)
@@ -47,7 +47,7 @@ async def done(
     team: Processes, sources: Path, name: str, words: Sequence[object], status: int = 0
 ) -> str:
     path = f"PYTHONPATH={sources}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    program = ["env", path, sys.executable, "-P", "-m", "sim"]
+    program = ["env", path, sys.executable, "-P", "-m", "teamslam"]
     process = await team.run(name, [*program, *(str(word) for word in words)])
     assert await process.ended(PATIENCE_S) == status, process.said()
     return process.said()

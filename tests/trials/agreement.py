@@ -22,21 +22,21 @@ from pathlib import Path
 
 import msgspec
 
-from central.node import CentralNode
-from central.peers.fold import FoldWhen
-from central.peers.peer import CENTRE
-from central.peers.robot import PeerRobot
-from sim.in_memory.air import Air
-from sim.in_memory.peers import PeerTeam, peer_world
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.streams import WorldStreams
-from team.config import RobotConfig
-from team.peers.members import CHANNELS, Member, about
-from team.wire import channels as ch
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
+from teamslam.central.node import CentralNode
+from teamslam.central.peers.fold import FoldWhen
+from teamslam.central.peers.peer import CENTRE
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.sim.in_memory.air import Air
+from teamslam.sim.in_memory.peers import PeerTeam, peer_world
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import RobotConfig
+from teamslam.team.peers.members import CHANNELS, Member, about
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests import build
 
 SECOND = 10**9

@@ -27,14 +27,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, dumps
-from sim.scenarios.source import streams_of
-from team.recording.reader import open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, dumps
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.recording.reader import open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.trials.agreement import WAYS, central_map, order_of, scenario_of
 from tests.trials.kills import PROGRAM, await_text, children
 

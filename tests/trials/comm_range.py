@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from sim.in_memory.air import air_of
-from sim.in_memory.peers import PeerTeam, peer_world
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.config import SimulatedWorld
-from sim.world.streams import RobotStream
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, ids
-from team.wire.codec import decoded
+from teamslam.sim.in_memory.air import air_of
+from teamslam.sim.in_memory.peers import PeerTeam, peer_world
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.streams import RobotStream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids
+from teamslam.team.wire.codec import decoded
 
 EVERY_S = 5.0
 Rows = dict[str, list[float]]

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from sim.scenarios.scenario import load
+from teamslam.sim.scenarios.scenario import load
 from tests.namespaces import NET, ip, network
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 

@@ -22,9 +22,9 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from sim.scenarios.scenario import load, with_options
-from team.recording.check import holes
-from team.recording.reader import open_log
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.reader import open_log
 from tests.namespaces import NET, ip, network
 from tests.trials.cuts import ONE_THREAD, PORT
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in

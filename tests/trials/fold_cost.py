@@ -16,17 +16,17 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from central.peers.fold import FoldWhen, PeerFold
-from central.peers.robot import PeerRobot
-from sim.in_memory.air import Air
-from sim.in_memory.peers import PeerTeam, peer_world
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.config import SimulatedWorld
-from team.config import RobotConfig
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from teamslam.central.peers.fold import FoldWhen, PeerFold
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.sim.in_memory.air import Air
+from teamslam.sim.in_memory.peers import PeerTeam, peer_world
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team.config import RobotConfig
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 
 T = TypeVar("T")
 

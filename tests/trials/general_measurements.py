@@ -20,15 +20,15 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from sim.calibration.data import interval_of, scan_of
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.se2 import between, inverse, transformed
+from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.se2 import between, inverse, transformed
 
 PROBABILITY = 0.999
 WINDOW_S = 8.0

@@ -27,14 +27,14 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
-from sim.scenarios.scenario import load
-from team.keys.authority import make_keys
-from team.keys.credentials import credentials_of
-from team.keys.roster import nodes_of
-from team.wire import channels as ch
-from team.wire.bus import BusError, Sample, opened
-from team.wire.codec import WireError
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.credentials import credentials_of
+from teamslam.team.keys.roster import nodes_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import BusError, Sample, opened
+from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.hostile.drawing import OF_THE_RUN, PAIR, mutated, payloads
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 

@@ -29,12 +29,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sim.scenarios.scenario import load
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import BusError, Sample
-from team.wire.codec import encoded
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import BusError, Sample
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests import build
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, shortened
 

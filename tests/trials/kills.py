@@ -33,18 +33,18 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from team.keys.authority import make_keys
-from team.keys.roster import nodes_of
-from team.recording.reader import LogError, open_log
-from team.wire import messages as m
-from team.wire.bus import opened
-from team.wire.channels import FINAL_MAP
-from team.wire.codec import WireError
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.roster import nodes_of
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.channels import FINAL_MAP
+from teamslam.team.wire.codec import WireError
 
-PROGRAM = (sys.executable, "-P", "-m", "sim")
+PROGRAM = (sys.executable, "-P", "-m", "teamslam")
 KINDS = ("robot", "central", "router", "record", "world", "viewer")
 PROC = Path("/proc")
 STOP_S = 12.0

@@ -16,10 +16,10 @@ import threading
 import time
 from collections.abc import Sequence
 
-from team.wire import channels as ch
-from team.wire.bus import Outgoing
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 
 MESSAGES = 24
@@ -85,7 +85,7 @@ def storm(joins: int, publishers: int, seed: int) -> tuple[int, int, float]:
     """Keys that stayed partial, keys that were asked for, the longest time of a join [s]."""
     rng = random.Random(seed)
     questions = Questions()
-    log = logging.getLogger("team.wire.zenoh.recovery")
+    log = logging.getLogger("teamslam.team.wire.zenoh.recovery")
     log.addHandler(questions)
     log.setLevel(logging.INFO)
     partial = asked = 0

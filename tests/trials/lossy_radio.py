@@ -28,9 +28,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sim.scenarios.scenario import load
-from team.keys.authority import make_keys
-from team.keys.roster import nodes_of
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.keys.authority import make_keys
+from teamslam.team.keys.roster import nodes_of
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, shortened
 
 HOME, AWAY = "10.213.78.1", "10.213.78.2"

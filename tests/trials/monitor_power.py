@@ -16,14 +16,14 @@ from pathlib import Path
 
 import msgspec
 
-from central.monitor import Finding, finding
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.experiments.true_minimum import final_fold
-from team.estimation.map_joining.gauss_newton import settled
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.marginals import joint_cost
+from teamslam.central.monitor import Finding, finding
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.true_minimum import final_fold
+from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.marginals import joint_cost
 
 SIMULATED = ("thesis", "thesis-b", "waypoints", "random-3")
 ROBUST = "robust"

@@ -19,11 +19,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.world import streams as s
-from sim.world.streams import RobotStream, WorldStreams
-from team.config import RobotConfig
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world import streams as s
+from teamslam.sim.world.streams import RobotStream, WorldStreams
+from teamslam.team.config import RobotConfig
 
 FAR = float(chi2.isf(1e-9, 3))
 """NEES of a pose that lies far outside its own covariance."""

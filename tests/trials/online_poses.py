@@ -22,15 +22,15 @@ from typing import Any
 
 import numpy as np
 
-from central.desk.evaluation.evaluation import evaluate
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.config import Exchange, RobotConfig
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 from tests.trials.online_bound import FAR, bounds, longest_s
 
 SCENARIOS = ("thesis", "thesis-b")

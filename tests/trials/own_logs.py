@@ -19,12 +19,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from sim.scenarios.scenario import load
-from team.recording.reader import LogError, open_log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.trials.agreement_processes import Watch
 from tests.trials.kills import PROGRAM, await_text, expected_of
 

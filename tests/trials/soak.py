@@ -28,8 +28,8 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rich.table import Table
 
-from sim.scenarios.scenario import dumps, load, with_options
-from sim.world.config import SimulatedWorld
+from teamslam.sim.scenarios.scenario import dumps, load, with_options
+from teamslam.sim.world.config import SimulatedWorld
 
 EVERY_S = 5.0
 """Wall time between two looks."""
@@ -127,7 +127,7 @@ def main() -> int:
         file, run = Path(place) / "soak.json", Path(place) / "run"
         file.write_text(dumps(scenario))
         words = ["launch", str(file), "--speed", str(told.speed), "-o", str(run)]
-        command = [sys.executable, "-P", "-m", "sim", *words]
+        command = [sys.executable, "-P", "-m", "teamslam", *words]
         with (Path(place) / "output").open("wb") as output:
             launch = subprocess.Popen(command, stdout=output, stderr=output)  # our own program
             found = watched(launch, seconds)

@@ -37,17 +37,17 @@ import msgspec
 import numpy as np
 import zenoh
 
-from sim.datasets.folder_writer import write_folder
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.scenarios.toml import folder_scenario
-from sim.world.streams import RobotStream
-from team.recording.reader import open_log
-from team.ros2.bags import opened_bag
-from team.wire import channels as ch
-from team.wire.bus import opened
-from team.wire.messages import FusedMap
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.toml import folder_scenario
+from teamslam.sim.world.streams import RobotStream
+from teamslam.team.recording.reader import open_log
+from teamslam.team.ros2.bags import opened_bag
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.messages import FusedMap
 from tests.ros2 import messages as ros
 from tests.trials.kills import PROGRAM
 

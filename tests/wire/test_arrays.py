@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from team.core import check_packed_covariance, check_pose_covariance
-from team.wire.arrays import from_floats
+from teamslam.team.core import check_packed_covariance, check_pose_covariance
+from teamslam.team.wire.arrays import from_floats
 
 
 def verdict(check, *arguments):

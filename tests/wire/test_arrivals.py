@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire.zenoh import arrivals as module
-from team.wire.zenoh.arrivals import DELAY_S, PATIENCE_S, Arrivals
+from teamslam.team.wire.zenoh import arrivals as module
+from teamslam.team.wire.zenoh.arrivals import DELAY_S, PATIENCE_S, Arrivals
 
 
 @given(st.permutations(range(8)), st.lists(st.integers(0, 7), max_size=8))

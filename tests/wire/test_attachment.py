@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
+from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 
 KEY = "team/t/robot/r1/submap"
 GOLDEN = bytes.fromhex("0100000000000000feffffffffffffff0300000000000000496a1b39ffcf6e5c")

@@ -7,9 +7,9 @@ from itertools import count
 
 import pytest
 
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import (
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import (
     NO_COUNTER,
     Bus,
     BusError,
@@ -20,9 +20,9 @@ from team.wire.bus import (
     opened,
     replied,
 )
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.support import odometry, received, submap, wait_until
 

@@ -2,11 +2,11 @@
 
 import pytest
 
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError, encoded
-from team.wire.views import PARTICLES, view_of
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError, encoded
+from teamslam.team.wire.views import PARTICLES, view_of
 from tests.support import odometry, submap
 
 

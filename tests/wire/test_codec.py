@@ -13,12 +13,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from team.config import UNNAMED
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.channels import OBSERVATIONS
-from team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
-from team.wire.structure import MOST_VALUES, SMALL
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.channels import OBSERVATIONS
+from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
+from teamslam.team.wire.structure import MOST_VALUES, SMALL
 from tests import build
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire import views as v
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.router import router
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire import views as v
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.support import ROOT, submap
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire.intervals import IntervalSet
+from teamslam.team.wire.intervals import IntervalSet
 
 numbers = st.integers(-5, 40)
 pairs = st.lists(st.tuples(numbers, numbers), max_size=20)

@@ -4,13 +4,13 @@ import logging
 
 import pytest
 
-from sim.launch.watch import Watch
-from team.wire import channels as ch
-from team.wire import logs
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, shown
-from team.wire.codec import encoded
-from team.wire.text import lines, one_line, readable
+from teamslam.sim.launch.watch import Watch
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import logs
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, shown
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.text import lines, one_line, readable
 from tests import build
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"

@@ -4,8 +4,8 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire import messages as m
-from team.wire.newer import further, is_newer_map, is_newer_prior, later_end
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.newer import further, is_newer_map, is_newer_prior, later_end
 from tests import build
 from tests.support import example
 

@@ -2,7 +2,7 @@
 
 import itertools
 
-from team.wire.patience import LONGEST_S, PATIENCE_S, Patience
+from teamslam.team.wire.patience import LONGEST_S, PATIENCE_S, Patience
 
 
 def asked(gap_of, seconds=40.0):

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from team.wire import structure
-from team.wire.codec import encoded
-from team.wire.structure import DEEPEST, StructureError, check_structure, read_tag
+from teamslam.team.wire import structure
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.structure import DEEPEST, StructureError, check_structure, read_tag
 from tests.support import examples
 
 scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(-1e30, 1e30)

@@ -11,19 +11,19 @@ import pytest
 import zenoh
 from zenoh.handlers import Callback
 
-from team import the_end
-from team.the_end import TheEnd
-from team.wire import channels as c
-from team.wire import messages as m
-from team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
-from team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
-from team.wire.zenoh import bus as zenoh_bus
-from team.wire.zenoh import recovery as recovery_module
-from team.wire.zenoh.attachment import Attachment, pack, unpack
-from team.wire.zenoh.bus import ZenohBus
-from team.wire.zenoh.recovery import Heartbeat, Recovery
-from team.wire.zenoh.router import router
-from team.wire.zenoh.session import client
+from teamslam.team import the_end
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire import channels as c
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
+from teamslam.team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
+from teamslam.team.wire.zenoh import bus as zenoh_bus
+from teamslam.team.wire.zenoh import recovery as recovery_module
+from teamslam.team.wire.zenoh.attachment import Attachment, pack, unpack
+from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.recovery import Heartbeat, Recovery
+from teamslam.team.wire.zenoh.router import router
+from teamslam.team.wire.zenoh.session import client
 from tests import build
 from tests.support import (
     ROOT,
@@ -167,7 +167,7 @@ def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None
 
 def test_a_killed_process_loses_its_token(endpoint: str) -> None:
     program = (
-        "import sys; from team.wire.zenoh.bus import ZenohBus\n"
+        "import sys; from teamslam.team.wire.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus('t', {endpoint!r}); bus.declare_alive('robot/alpha')\n"
         "print('ready', flush=True); sys.stdin.read()"
     )
@@ -193,8 +193,8 @@ def python(program: str) -> subprocess.Popen[str]:
 
 def test_a_process_that_dies_of_an_exception_ends(endpoint: str) -> None:
     program = (
-        "from team.wire import channels as c\n"
-        "from team.wire.zenoh.bus import ZenohBus\n"
+        "from teamslam.team.wire import channels as c\n"
+        "from teamslam.team.wire.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus('t', {endpoint!r})\n"
         "for channel in c.CHANNELS: bus.subscribe(channel)\n"
         "bus.answer(c.SUBMAPS, '', lambda request: []); bus.watch_alive()\n"

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64
 
-from central.desk.evaluation.log import Collected
-from team.config import UNNAMED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import ids, stamps
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids, stamps
 
 Place = tuple[str, int, int, int]
 """Robot, incarnation, sequence of the submap, landmark number in it."""

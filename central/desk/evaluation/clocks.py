@@ -18,12 +18,12 @@ from datetime import UTC, datetime
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.names import in_order
-from team import translate
-from team.config import RobotConfig, Sensor
-from team.estimation.odometry import moved, steered
-from team.wire import messages as m
-from team.wire.arrays import floats
+from teamslam.central.desk.names import in_order
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.estimation.odometry import moved, steered
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
 
 APART_NS = 2_000_000_000
 """Greatest time between two compared measurements of a landmark."""

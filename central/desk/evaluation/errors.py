@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.linalg import solve_triangular
 
-from team.estimation.consistency import chi2_interval, coverage, nees
-from team.estimation.gaussian import cholesky_factor
-from team.estimation.map_joining.alignment import NEEDED, procrustes
-from team.estimation.se2 import between
+from teamslam.team.estimation.consistency import chi2_interval, coverage, nees
+from teamslam.team.estimation.gaussian import cholesky_factor
+from teamslam.team.estimation.map_joining.alignment import NEEDED, procrustes
+from teamslam.team.estimation.se2 import between
 
 TRUTH_GAP_NS = 1_000_000_000
 """Largest gap between truth samples that is interpolated."""

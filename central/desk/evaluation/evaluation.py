@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from central.desk.evaluation.association import (
+from teamslam.central.desk.evaluation.association import (
     AssociationResult,
     association_json,
     association_result,
 )
-from central.desk.evaluation.clocks import Timed, clock_warning, separate_times_warning
-from central.desk.evaluation.errors import (
+from teamslam.central.desk.evaluation.clocks import Timed, clock_warning, separate_times_warning
+from teamslam.central.desk.evaluation.errors import (
     MapErrors,
     Path,
     PoseErrors,
@@ -32,27 +32,27 @@ from central.desk.evaluation.errors import (
     rigid_alignment,
     transform_points,
 )
-from central.desk.evaluation.gps import gps_median
-from central.desk.evaluation.log import Collected, Traffic, collect_log
-from central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
-from central.desk.evaluation.peers import PeerResult, peer_json, peer_results
-from central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
-from central.desk.evaluation.running import TruthFrames
-from central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
-from central.desk.evaluation.verdicts import verdicts_given
-from central.desk.names import data_set_name, in_order, not_joined, short
-from central.monitor import TOO_LARGE
-from central.team_config import TeamConfig, team_config
-from team import translate
-from team.config import UNNAMED, RobotConfig
-from team.estimation.gaussian import Matrix
-from team.former_names import with_current_names
-from team.pairs import PAIRS
-from team.recording.check import holes
-from team.recording.reader import Log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
+from teamslam.central.desk.evaluation.gps import gps_median
+from teamslam.central.desk.evaluation.log import Collected, Traffic, collect_log
+from teamslam.central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
+from teamslam.central.desk.evaluation.peers import PeerResult, peer_json, peer_results
+from teamslam.central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
+from teamslam.central.desk.evaluation.running import TruthFrames
+from teamslam.central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
+from teamslam.central.desk.evaluation.verdicts import verdicts_given
+from teamslam.central.desk.names import data_set_name, in_order, not_joined, short
+from teamslam.central.monitor import TOO_LARGE
+from teamslam.central.team_config import TeamConfig, team_config
+from teamslam.team import translate
+from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.former_names import with_current_names
+from teamslam.team.pairs import PAIRS
+from teamslam.team.recording.check import holes
+from teamslam.team.recording.reader import Log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 
 UPLINK = {
     "submap": (ch.SUBMAP, ch.SIGHTING_FACTOR),

@@ -4,9 +4,9 @@ import re
 from dataclasses import dataclass, field
 from typing import Literal
 
-from central.desk.names import in_order, not_joined, short
-from team.wire import messages as m
-from team.wire.channels import robot_node
+from teamslam.central.desk.names import in_order, not_joined, short
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.channels import robot_node
 
 Kind = Literal[
     "joined",

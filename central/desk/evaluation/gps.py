@@ -5,11 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.log import Collected
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, stamps
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
 
 LEAST = 10
 GAP_NS = 1_500_000_000

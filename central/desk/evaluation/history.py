@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int64
 
-from central.desk.evaluation.events import MOST, Event, EventDetector
-from central.desk.evaluation.log import head_of
-from central.desk.evaluation.running import TrueLandmarks, TruthFrames
-from central.desk.names import in_order
-from central.desk.peers_as_centre import PeersAsCentre
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError
+from teamslam.central.desk.evaluation.events import MOST, Event, EventDetector
+from teamslam.central.desk.evaluation.log import head_of
+from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError
 
 _NO_SPAN = (2**63 - 1, -(2**63))
 _CHANNELS = (

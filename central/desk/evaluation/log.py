@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from central.desk.agreement import as_centre_final
-from central.desk.evaluation.clocks import Timed
-from central.desk.names import in_order
-from central.desk.peers_as_centre import PeersAsCentre
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, shown
-from team.wire.channels import Channel, channel_of
-from team.wire.codec import WireError, decoded
+from teamslam.central.desk.agreement import as_centre_final
+from teamslam.central.desk.evaluation.clocks import Timed
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, shown
+from teamslam.team.wire.channels import Channel, channel_of
+from teamslam.team.wire.codec import WireError, decoded
 
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
 _TIMED: tuple[type[m.AnyOdometry | m.AnyScan], ...] = (

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from central.desk.evaluation.log import Collected
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 _OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
 

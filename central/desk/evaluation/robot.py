@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.log import Collected
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team import translate
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
 
 REJECTED = "rejected: "
 """Prefix of a rejected measurement's disposition."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from central.desk.evaluation.errors import (
+from teamslam.central.desk.evaluation.errors import (
     BAND,
     Path,
     PoseErrors,
@@ -15,11 +15,11 @@ from central.desk.evaluation.errors import (
     interpolate_truth,
     pose_errors,
 )
-from central.fused import START_POSES
-from team import translate
-from team.estimation.consistency import chi2_quantile, nees
-from team.wire import messages as m
-from team.wire.arrays import floats, stamps
+from teamslam.central.fused import START_POSES
+from teamslam.team import translate
+from teamslam.team.estimation.consistency import chi2_quantile, nees
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
 
 SPACING_NS = 100_000_000
 """Least spacing of compared estimates."""

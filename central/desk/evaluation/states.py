@@ -3,10 +3,10 @@
 from collections.abc import Collection, Iterator, Mapping
 from typing import Literal, NamedTuple
 
-from central.desk.evaluation.log import Collected
-from central.desk.names import in_order, not_joined
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.central.desk.names import in_order, not_joined
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
 """joined: in the team's map. not joined: its map, if any, is separate. withdrawn: by an order, or

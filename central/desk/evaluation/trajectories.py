@@ -1,7 +1,7 @@
 """Absolute and relative path errors, as defined by evo.
 
 Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012. `evo_ape` and
-`evo_rpe` give the same figures for files written by `central.desk.export.tum`.
+`evo_rpe` give the same figures for files written by `teamslam.central.desk.export.tum`.
 """
 
 from dataclasses import asdict, dataclass
@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.errors import (
+from teamslam.central.desk.evaluation.errors import (
     Path,
     distance_rmse,
     interpolate_truth,

@@ -2,9 +2,9 @@
 
 from collections.abc import Collection
 
-from central.desk.evaluation.log import Collected
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 Pair = frozenset[m.LocalLandmark]
 

@@ -1,7 +1,7 @@
 """Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
 Each robot's dead-reckoned odometry with odom → base on the transform topic, and the messages of
-`team.ros2_answers`. Log times are team time.
+`teamslam.team.ros2_answers`. Log times are team time.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,16 +9,24 @@ from pathlib import Path
 
 import msgspec
 
-from team import translate
-from team.config import RobotConfig
-from team.recording.reader import Log, LogError
-from team.ros2.bags import new_bag
-from team.ros2.encoding import Names, Pose, compose, encode, odometry, transform, transforms
-from team.ros2_answers import Answer, Answers
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
-from team.wire.codec import WireError
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.ros2.bags import new_bag
+from teamslam.team.ros2.encoding import (
+    Names,
+    Pose,
+    compose,
+    encode,
+    odometry,
+    transform,
+    transforms,
+)
+from teamslam.team.ros2_answers import Answer, Answers
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import WireError
 
 TEAM_SPACE = "/teamslam"
 """Namespace of the team's map and diagnostics."""

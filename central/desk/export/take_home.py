@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from central.desk.drawing import landmark_blocks
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.evaluation import MapResult
-from central.desk.export.tum import seconds, write_tum
-from central.desk.paths import SmoothedPath, smoothed_paths
-from central.desk.verification.recorded import Recorded
-from team.config import UNNAMED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import ids
+from teamslam.central.desk.drawing import landmark_blocks
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.evaluation import MapResult
+from teamslam.central.desk.export.tum import seconds, write_tum
+from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
+from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids
 
 MAP_COLUMNS = (
     "id", "x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "measurements", "frame",

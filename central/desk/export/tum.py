@@ -8,10 +8,10 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.evaluation import Evaluation, evaluate
-from central.desk.evaluation.trajectories import associate_truth
-from team.recording.reader import Log, LogError
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.central.desk.evaluation.trajectories import associate_truth
+from teamslam.team.recording.reader import Log, LogError
 
 KINDS = ("smoothed", "online")
 

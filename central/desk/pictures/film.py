@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import (
+from teamslam.central.desk.drawing import (
     MAP_COLOUR,
     TRUE_LANDMARK_COLOUR,
     draw_ellipses,
     landmark_blocks,
     robot_colours,
 )
-from central.desk.evaluation.evaluation import Evaluation
-from central.desk.pictures.run import in_the_maps_frame, magnification, new_figure
-from team import translate
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.pictures.run import in_the_maps_frame, magnification, new_figure
+from teamslam.team import translate
+from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes

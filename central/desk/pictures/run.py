@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import (
+from teamslam.central.desk.drawing import (
     MAP_COLOUR,
     TRUE_LANDMARK_COLOUR,
     TRUTH_COLOUR,
@@ -20,12 +20,12 @@ from central.desk.drawing import (
     robot_colours,
     robot_labels,
 )
-from central.desk.evaluation.errors import Path, transform_points
-from central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
-from central.desk.paths import SmoothedPath
-from central.desk.pictures.style import save
-from team.config import UNNAMED
-from team.estimation.se2 import inverse
+from teamslam.central.desk.evaluation.errors import Path, transform_points
+from teamslam.central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from teamslam.central.desk.paths import SmoothedPath
+from teamslam.central.desk.pictures.style import save
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.se2 import inverse
 
 # Matplotlib takes half a second to import.
 if TYPE_CHECKING:

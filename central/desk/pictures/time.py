@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from central.desk.drawing import (
+from teamslam.central.desk.drawing import (
     MAP_COLOUR,
     ORANGE,
     RED,
     robot_colours,
     robot_labels,
 )
-from central.desk.evaluation.evaluation import Evaluation
-from central.desk.evaluation.history import History
-from central.desk.pictures.run import new_figure
-from central.desk.pictures.style import save
-from team.estimation.consistency import chi2_interval
+from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.evaluation.history import History
+from teamslam.central.desk.pictures.run import new_figure
+from teamslam.central.desk.pictures.style import save
+from teamslam.team.estimation.consistency import chi2_interval
 
 if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes

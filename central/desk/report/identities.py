@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from central.desk.evaluation.association import AssociationResult, Pairs
-from central.desk.report.tables import Sheet, format_figure
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.association import AssociationResult, Pairs
+from teamslam.central.desk.report.tables import Sheet, format_figure
+from teamslam.team.wire import messages as m
 
 SCORE_HEADINGS = ("pairs of detections", "precision", "recall", "F1", "wrong\ndetections")
 DECISION_HEADINGS = (

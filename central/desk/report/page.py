@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.export.take_home import write_map, write_paths
-from central.desk.export.tum import write_trajectories
-from central.desk.names import OUTSIDE, in_order
-from central.desk.pictures.run import error_picture, map_picture
-from central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
-from central.desk.pictures.time import consistency_picture
-from central.desk.report.identities import decision_sheet, score_sheet
-from central.desk.report.run import Run
-from central.desk.report.tables import (
+from teamslam.central.desk.export.take_home import write_map, write_paths
+from teamslam.central.desk.export.tum import write_trajectories
+from teamslam.central.desk.names import OUTSIDE, in_order
+from teamslam.central.desk.pictures.run import error_picture, map_picture
+from teamslam.central.desk.pictures.style import SCREEN, Picture, Style, drawn_in
+from teamslam.central.desk.pictures.time import consistency_picture
+from teamslam.central.desk.report.identities import decision_sheet, score_sheet
+from teamslam.central.desk.report.run import Run
+from teamslam.central.desk.report.tables import (
     Sheet,
     disposition_sheet,
     format_figure,

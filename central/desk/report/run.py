@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from central.desk.evaluation.evaluation import Evaluation
-from central.desk.evaluation.history import History
-from central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
-from central.desk.export.take_home import TakenHome
-from central.desk.ledger import Ledger
-from central.desk.paths import SmoothedPath
+from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.evaluation.history import History
+from teamslam.central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
+from teamslam.central.desk.export.take_home import TakenHome
+from teamslam.central.desk.ledger import Ledger
+from teamslam.central.desk.paths import SmoothedPath
 
 
 @dataclass(frozen=True)

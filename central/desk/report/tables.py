@@ -9,9 +9,9 @@ from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
-from central.desk.evaluation.errors import MapErrors
-from central.desk.evaluation.evaluation import Evaluation, RobotResult
-from central.desk.names import OUTSIDE, not_joined, short
+from teamslam.central.desk.evaluation.errors import MapErrors
+from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult
+from teamslam.central.desk.names import OUTSIDE, not_joined, short
 
 ABSURD_NEES = 1000
 """NEES per degree of freedom above which words replace it."""

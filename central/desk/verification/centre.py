@@ -1,8 +1,8 @@
 """Recompute the centre's messages: each recorded map from the inputs that it names.
 
-Submap maps come from the centre's own fold (`central.submap_fold`) over a store with the named
-submaps. Centres of comparison methods recompute their own maps (`sim.studies.rules`). Fields
-without a named input are copied from the recorded map.
+Submap maps come from the centre's own fold (`teamslam.central.submap_fold`) over a store with the
+named submaps. Centres of comparison methods recompute their own maps
+(`teamslam.sim.studies.rules`). Fields without a named input are copied from the recorded map.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,15 +10,15 @@ from typing import Any
 
 import msgspec
 
-from central.desk.verification.recorded import Identity, Recorded, identity
-from central.join_messages import Tail
-from central.node import node_class
-from central.submap_fold import RecordedFields, SubmapFold
-from team.pairs import RULES
-from team.store import Stream, SubmapStore
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.desk.verification.recorded import Identity, Recorded, identity
+from teamslam.central.join_messages import Tail
+from teamslam.central.node import node_class
+from teamslam.central.submap_fold import RecordedFields, SubmapFold
+from teamslam.team.pairs import RULES
+from teamslam.team.store import Stream, SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 
 def recomputed_centre(log: Recorded) -> dict[Identity, m.Message]:

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from team.wire import arrays
-from team.wire import messages as m
+from teamslam.team.wire import arrays
+from teamslam.team.wire import messages as m
 
 RELATIVE = 1e-6
 ABSOLUTE = 1e-9

@@ -3,7 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 
-from team.wire import messages as m
+from teamslam.team.wire import messages as m
 
 
 class RecordedMeasurements(Mapping[int, m.Measurement]):

@@ -7,17 +7,17 @@ from typing import TypeVar
 
 import msgspec
 
-from central.config import CentralConfig
-from central.desk.names import in_order
-from central.desk.verification.measurements import RecordedMeasurements
-from team.config import RobotConfig
-from team.former_names import with_current_names
-from team.recording.reader import Log, LogError
-from team.store import Stream
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.verification.measurements import RecordedMeasurements
+from teamslam.team.config import RobotConfig
+from teamslam.team.former_names import with_current_names
+from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.store import Stream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError
 
 T = TypeVar("T")
 Identity = tuple[object, ...]

@@ -4,17 +4,17 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 
-from central.desk.verification.measurements import RecordedMeasurements
-from central.desk.verification.recorded import Identity, Recorded, identity
-from team.config import RobotConfig
-from team.containment import Boundary
-from team.pairs import FEEDBACK
-from team.robot.ledger import OnDisposition
-from team.robot.node import robot_node
-from team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.desk.verification.measurements import RecordedMeasurements
+from teamslam.central.desk.verification.recorded import Identity, Recorded, identity
+from teamslam.team.config import RobotConfig
+from teamslam.team.containment import Boundary
+from teamslam.team.pairs import FEEDBACK
+from teamslam.team.robot.ledger import OnDisposition
+from teamslam.team.robot.node import robot_node
+from teamslam.team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
 """Priors named by the recorded poses, by (incarnation, stamp); None: a pose without prior."""

@@ -10,22 +10,22 @@ maps. So an error is located in one message; its successors are judged by its re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from central.desk.verification.centre import recomputed_centre, recomputed_peer
-from central.desk.verification.differences import first_difference
-from central.desk.verification.recorded import (
+from teamslam.central.desk.verification.centre import recomputed_centre, recomputed_peer
+from teamslam.central.desk.verification.differences import first_difference
+from teamslam.central.desk.verification.recorded import (
     Identity,
     Recorded,
     RecordedOutput,
     identity,
     recorded,
 )
-from central.desk.verification.robot import recomputed_robot
-from team.recording.own_log import OWN
-from team.recording.provenance import provenance
-from team.recording.reader import Log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import encoded
+from teamslam.central.desk.verification.robot import recomputed_robot
+from teamslam.team.recording.own_log import OWN
+from teamslam.team.recording.provenance import provenance
+from teamslam.team.recording.reader import Log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import encoded
 
 PLATFORM = ("core", "estimation", "arithmetic", "version.numpy", "version.scipy")
 """Metadata that must be equal for equal bits; neither the processor's features nor the core's level

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team import translate
-from team.wire import messages as m
-from team.wire.arrays import floats
+from teamslam.team import translate
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
 
 PATH_POINTS = 1_000
 """Most points of a path; a longer one is halved."""

@@ -4,14 +4,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
-from central.desk.view.node import ViewerNode
-from team.recording.reader import Log
-from team.recording.recorder import Recorder
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.codec import WireError
+from teamslam.central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
+from teamslam.central.desk.view.node import ViewerNode
+from teamslam.team.recording.reader import Log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import WireError
 
 _CHANNELS = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
 

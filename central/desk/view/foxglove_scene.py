@@ -11,9 +11,9 @@ import numpy as np
 from foxglove import messages as fox
 from jaxtyping import Float
 
-from central.desk.drawing import ellipses
-from central.desk.view.drawn import Landmarks
-from team.wire.views import MAP_FRAME
+from teamslam.central.desk.drawing import ellipses
+from teamslam.central.desk.view.drawn import Landmarks
+from teamslam.team.wire.views import MAP_FRAME
 
 Shade = tuple[str, float]
 """Colour #rrggbb and opacity."""

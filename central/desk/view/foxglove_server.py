@@ -11,9 +11,9 @@ import foxglove
 from foxglove import Channel, Context, Schema
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
-from central.desk.view.foxglove_proxy import hidden_host
-from team.recording.schemas import declaration_of
-from team.wire.bus import Sample
+from teamslam.central.desk.view.foxglove_proxy import hidden_host
+from teamslam.team.recording.schemas import declaration_of
+from teamslam.team.wire.bus import Sample
 
 
 class FoxgloveServer(ServerListener):

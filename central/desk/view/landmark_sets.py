@@ -1,8 +1,8 @@
 """Members of a map's unnamed landmarks, and the associating step of each."""
 
-from central.unnamed_landmarks import SHOWN, STEPS
-from team.wire import messages as m
-from team.wire.arrays import floats, ids
+from teamslam.central.unnamed_landmarks import SHOWN, STEPS
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids
 
 
 def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:

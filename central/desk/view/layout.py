@@ -3,10 +3,10 @@
 import json
 from collections.abc import Sequence
 
-from central.desk.drawing import colour_of
-from central.desk.names import in_order
-from team.wire import views
-from team.wire.views import MAP_FRAME
+from teamslam.central.desk.drawing import colour_of
+from teamslam.central.desk.names import in_order
+from teamslam.team.wire import views
+from teamslam.team.wire.views import MAP_FRAME
 
 
 def layout(team: str, robots: Sequence[str]) -> str:

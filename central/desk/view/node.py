@@ -12,18 +12,24 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import colour_of
-from central.desk.evaluation.errors import PoseErrors
-from central.desk.evaluation.events import Event, EventDetector
-from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
-from central.desk.names import in_order
-from central.desk.view import foxglove_scene as fox
-from central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of, place_points
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire import views
-from team.wire.arrays import floats
-from team.wire.channels import Channel
+from teamslam.central.desk.drawing import colour_of
+from teamslam.central.desk.evaluation.errors import PoseErrors
+from teamslam.central.desk.evaluation.events import Event, EventDetector
+from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
+from teamslam.central.desk.names import in_order
+from teamslam.central.desk.view import foxglove_scene as fox
+from teamslam.central.desk.view.drawn import (
+    Landmarks,
+    Track,
+    centre_particles,
+    landmarks_of,
+    place_points,
+)
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire import views
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.channels import Channel
 
 PERIOD_NS = 1_000_000_000
 """Team time between views of poses and errors."""

@@ -19,17 +19,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from central.desk.drawing import ROBOT_COLOURS
-from central.desk.evaluation.events import EventDetector
-from central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
-from central.desk.names import data_set_name
-from central.desk.view.drawn import centre_particles, landmarks_of
-from central.desk.view.landmark_sets import sets_of
-from central.desk.view.node import FORGET_NS
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, stamps
-from team.wire.bus import Sample
+from teamslam.central.desk.drawing import ROBOT_COLOURS
+from teamslam.central.desk.evaluation.events import EventDetector
+from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
+from teamslam.central.desk.names import data_set_name
+from teamslam.central.desk.view.drawn import centre_particles, landmarks_of
+from teamslam.central.desk.view.landmark_sets import sets_of
+from teamslam.central.desk.view.node import FORGET_NS
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
+from teamslam.team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
 """Least time between poses sent to the page, estimated or true."""

@@ -20,13 +20,13 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from central.desk.view.export import Viewing, for_viewer
-from central.desk.view.foxglove_proxy import proxy, refuse
-from central.desk.view.foxglove_server import FoxgloveServer
-from central.desk.view.page_frames import PageFrames
-from team.recording.reader import LogError
-from team.recording.tail import Tail
-from team.wire.bus import BusError
+from teamslam.central.desk.view.export import Viewing, for_viewer
+from teamslam.central.desk.view.foxglove_proxy import proxy, refuse
+from teamslam.central.desk.view.foxglove_server import FoxgloveServer
+from teamslam.central.desk.view.page_frames import PageFrames
+from teamslam.team.recording.reader import LogError
+from teamslam.team.recording.tail import Tail
+from teamslam.team.wire.bus import BusError
 
 STREAM = "/stream"
 LOOK_S = 0.2
@@ -48,7 +48,7 @@ class ServerError(BusError):
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Type and bytes of every page file by path."""
     found = {}
-    for file in files("central.desk.view").joinpath("page").iterdir():
+    for file in files("teamslam.central.desk.view").joinpath("page").iterdir():
         suffix = Path(file.name).suffix
         if suffix in _TYPES:
             found[f"/{file.name}"] = (_TYPES[suffix], file.read_bytes())

@@ -6,14 +6,14 @@ from collections.abc import Collection
 
 import msgspec
 
-from central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
-from central.desk.view.export import Viewing, for_viewer
-from team.containment import Boundary
-from team.shell import STATUS_S, WAIT_S, judge
-from team.the_end import TheEnd
-from team.wire import channels as ch
-from team.wire.bus import Bus, Outgoing
-from team.wire.messages import FusedMap, Status
+from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
+from teamslam.central.desk.view.export import Viewing, for_viewer
+from teamslam.team.containment import Boundary
+from teamslam.team.shell import STATUS_S, WAIT_S, judge
+from teamslam.team.the_end import TheEnd
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Bus, Outgoing
+from teamslam.team.wire.messages import FusedMap, Status
 
 NODE = "viewer"
 

@@ -21,12 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from central.config import BiasSigmas
-from sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
-from sim.studies.batch_reference.measurements import Chain
-from team.config import Sensor
-from team.estimation.models import NEAREST_M, predicted
-from team.estimation.se2 import Point, wrapped
+from teamslam.central.config import BiasSigmas
+from teamslam.sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
+from teamslam.sim.studies.batch_reference.measurements import Chain
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.models import NEAREST_M, predicted
+from teamslam.team.estimation.se2 import Point, wrapped
 
 BIASES = ("bearing", "range_offset", "range_scale")
 """Sensor biases of the centre's model, in state order."""

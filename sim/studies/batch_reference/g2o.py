@@ -12,14 +12,19 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.evaluation import evaluate
-from sim.studies.batch_reference.graph import FLOOR_SIGMAS, landmark_starts
-from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
-from sim.studies.batch_reference.reference import placed
-from team.estimation.gaussian import Matrix
-from team.estimation.models import predicted
-from team.estimation.se2 import Point
-from team.wire.bus import Sample
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, landmark_starts
+from teamslam.sim.studies.batch_reference.measurements import (
+    BatchReferenceError,
+    Chain,
+    anchored,
+    chains_of,
+)
+from teamslam.sim.studies.batch_reference.reference import placed
+from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.se2 import Point
+from teamslam.team.wire.bus import Sample
 
 Poses = Float[np.ndarray, "K 3"]
 

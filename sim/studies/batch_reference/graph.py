@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.evaluation import MapResult
-from sim.studies.batch_reference.measurements import Chain
-from team.estimation.gaussian import Matrix
-from team.estimation.models import located, predicted
-from team.estimation.se2 import Point, Pose, tangent
-from team.extras import install_command
-from team.registry import NotInstalledError
+from teamslam.central.desk.evaluation.evaluation import MapResult
+from teamslam.sim.studies.batch_reference.measurements import Chain
+from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.models import located, predicted
+from teamslam.team.estimation.se2 import Point, Pose, tangent
+from teamslam.team.extras import install_command
+from teamslam.team.registry import NotInstalledError
 
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32

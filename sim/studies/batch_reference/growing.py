@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.batch_reference.graph import (
+from teamslam.sim.studies.batch_reference.graph import (
     FLOOR_SIGMAS,
     load_gtsam,
     newton_step,
     start_factor,
     under_loss,
 )
-from sim.studies.batch_reference.measurements import Scan
-from sim.studies.estimators.robot_step import RobotStep
-from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.models import located, predicted
-from team.estimation.se2 import Pose, compose, tangent
+from teamslam.sim.studies.batch_reference.measurements import Scan
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from teamslam.team.estimation.models import located, predicted
+from teamslam.team.estimation.se2 import Pose, compose, tangent
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
 """A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning

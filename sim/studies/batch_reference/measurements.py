@@ -9,21 +9,21 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt32
 from msgspec import structs
 
-from central.desk.evaluation.errors import Path, on_circle
-from central.team_config import TeamConfig
-from team import translate
-from team.config import RobotConfig, Sensor
-from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
-from team.estimation.models import Increment, noise
-from team.estimation.mount import moved_by
-from team.estimation.scans import Own, unclaimed
-from team.estimation.se2 import Pose, between, compose, inverse
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
-from team.wire.channels import channel_of
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.central.team_config import TeamConfig
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
+from teamslam.team.estimation.models import Increment, noise
+from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.se2 import Pose, between, compose, inverse
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.channels import channel_of
 
 _TAKEN = frozenset(
     channel.name for channel in (ch.START, ch.ODOMETRY, ch.OBSERVATIONS, ch.SIGHTINGS)
@@ -42,7 +42,7 @@ class BatchReferenceError(RuntimeError):
 class Scan(NamedTuple):
     """Accepted, calibrated ranges [m] and bearings [rad] from one pose.
 
-    own: their covariances (`team.estimation.scans`).
+    own: their covariances (`teamslam.team.estimation.scans`).
     """
 
     ids: UInt32[np.ndarray, " n"]

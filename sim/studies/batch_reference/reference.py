@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from central.desk.evaluation.errors import (
+from teamslam.central.desk.evaluation.errors import (
     MapErrors,
     Path,
     distance_rmse,
@@ -26,9 +26,14 @@ from central.desk.evaluation.errors import (
     map_errors,
     pose_errors,
 )
-from central.desk.evaluation.evaluation import Evaluation, evaluate
-from sim.studies.batch_reference.errors import add_errors, bias_key, has_biases, profile_graph
-from sim.studies.batch_reference.graph import (
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.sim.studies.batch_reference.errors import (
+    add_errors,
+    bias_key,
+    has_biases,
+    profile_graph,
+)
+from teamslam.sim.studies.batch_reference.graph import (
     factor_graph,
     landmark_starts,
     load_gtsam,
@@ -36,12 +41,17 @@ from sim.studies.batch_reference.graph import (
     pose_key,
     values_of,
 )
-from sim.studies.batch_reference.measurements import BatchReferenceError, Chain, anchored, chains_of
-from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.mount import moved_by
-from team.estimation.se2 import inverse, tangent
-from team.registry import NotInstalledError
-from team.wire.bus import Sample
+from teamslam.sim.studies.batch_reference.measurements import (
+    BatchReferenceError,
+    Chain,
+    anchored,
+    chains_of,
+)
+from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
+from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.se2 import inverse, tangent
+from teamslam.team.registry import NotInstalledError
+from teamslam.team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
 """√(gᵀH⁻¹g) allowed at the optimum: length of the next Newton step in standard deviations.

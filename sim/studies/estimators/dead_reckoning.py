@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import Sensor
-from team.estimation import dense
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.models import Increment
-from team.estimation.se2 import Pose, tangent
+from teamslam.team.config import Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import Pose, tangent
 
 
 @dataclass(frozen=True)

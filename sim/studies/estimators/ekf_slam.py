@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.estimators.ekf_step import step
-from team.config import Sensor
-from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
-from team.estimation.hybrid_slam.innovation import Innovation, joint_innovation, slots_of
-from team.estimation.models import Increment, variances
-from team.estimation.se2 import Pose
-from team.estimation.submap import LocalMap
+from teamslam.sim.studies.estimators.ekf_step import step
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation, joint_innovation, slots_of
+from teamslam.team.estimation.models import Increment, variances
+from teamslam.team.estimation.se2 import Pose
+from teamslam.team.estimation.submap import LocalMap
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.config import GATE, UNNAMED, Sensor
-from team.core import mean_direction
-from team.estimation import dense
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from team.estimation.models import Increment
+from teamslam.team import core
+from teamslam.team.config import GATE, UNNAMED, Sensor
+from teamslam.team.core import mean_direction
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.models import Increment
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team import core
-from team.config import Sensor
-from team.core import moments
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.models import Increment
-from team.estimation.se2 import Pose
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.core import moments
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
-from team import core
-from team.config import Sensor
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.models import Increment
-from team.estimation.se2 import Pose
+from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import Pose
 
 FIRST_RANGE_VAR = 15.0**2
 FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2

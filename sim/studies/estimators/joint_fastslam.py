@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
-from sim.studies.estimators.robot_step import RobotStep
-from team import core
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from team.estimation.se2 import Pose
+from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team import core
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from teamslam.team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)

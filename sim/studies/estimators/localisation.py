@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from sim.studies.estimators.plain_fastslam import pose_moments
-from sim.studies.estimators.sight import see
-from team import core
-from team.config import Sensor
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam import innovation as innovations
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.models import Increment, variances
-from team.estimation.se2 import Pose
+from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
+from teamslam.sim.studies.estimators.sight import see
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam import innovation as innovations
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.models import Increment, variances
+from teamslam.team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)

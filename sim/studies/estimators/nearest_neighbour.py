@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from sim.studies.estimators import ekf_slam
-from sim.studies.estimators.ekf_slam import EkfSlam
-from team import core
-from team.config import GATE, UNNAMED, Sensor
-from team.estimation import dense
-from team.estimation.association.gating import compute_mahalanobis, match_best_first
-from team.estimation.association.scans import UNASSIGNED
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.models import Increment
-from team.estimation.se2 import Pose
+from teamslam.sim.studies.estimators import ekf_slam
+from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
+from teamslam.team import core
+from teamslam.team.config import GATE, UNNAMED, Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import compute_mahalanobis, match_best_first
+from teamslam.team.estimation.association.scans import UNASSIGNED
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import Pose
 
 
 @dataclass(frozen=True)

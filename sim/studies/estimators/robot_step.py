@@ -5,16 +5,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import Sensor
-from team.estimation.models import Increment
-from team.estimation.scans import Own, unclaimed
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import Own, unclaimed
 
 
 class RobotStep(NamedTuple):
     """A robot's motion since its last turn, then its measurements at the end of it.
 
-    ranges [m] and bearings [rad] are calibrated; own: their covariances (`team.estimation.scans`),
-    or no rows.
+    ranges [m] and bearings [rad] are calibrated; own: their covariances
+    (`teamslam.team.estimation.scans`), or no rows.
     """
 
     robot: str

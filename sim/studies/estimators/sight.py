@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.estimation.models import NEAREST_M
+from teamslam.team import core
+from teamslam.team.estimation.models import NEAREST_M
 
 Array = Float[np.ndarray, "..."]
 

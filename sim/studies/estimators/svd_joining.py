@@ -13,17 +13,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.estimation import dense
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
-from team.estimation.map_joining import joining
-from team.estimation.map_joining.alignment import procrustes
-from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
-from team.estimation.map_joining.joining import EMPTY_FOLD, Fold
-from team.estimation.models import located
-from team.estimation.se2 import Pose, wrapped
-from team.estimation.submap import LocalMap
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
+from teamslam.team.estimation.map_joining import joining
+from teamslam.team.estimation.map_joining.alignment import procrustes
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
+from teamslam.team.estimation.models import located
+from teamslam.team.estimation.se2 import Pose, wrapped
+from teamslam.team.estimation.submap import LocalMap
 
 Weighting = Literal["identity", "spherical", "full"]
 SETTINGS = JoinSettings()

@@ -1,14 +1,20 @@
 """Accuracy and consistency of the team in every kind of world."""
 
-from sim.studies.experiments import (
+from teamslam.sim.studies.experiments import (
     accuracy_few,
     accuracy_outliers,
     accuracy_starts,
     accuracy_utias,
     accuracy_worlds,
 )
-from sim.studies.experiments.experiment import Experiment, Options, Outcome, Results, combined
-from sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import (
+    Experiment,
+    Options,
+    Outcome,
+    Results,
+    combined,
+)
+from teamslam.sim.studies.experiments.task import Task
 
 PARTS: tuple[Experiment, ...] = (
     accuracy_worlds,

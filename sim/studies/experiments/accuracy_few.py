@@ -10,11 +10,11 @@ more than a large or nonlinear covariance.
 
 import msgspec
 
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
-from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import (
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,
     cells_of,
@@ -22,8 +22,8 @@ from sim.studies.experiments.team_runs import (
     over_seeds,
     team_task,
 )
-from sim.world.config import SimulatedWorld
-from team.estimation.consistency import chi2_interval
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")
 COUNTS = (3, 4, 5)

@@ -6,11 +6,24 @@ inliers. An outlier has a uniform range and bearing, or the identity of another 
 
 import msgspec
 
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table, seed_count
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from sim.world.config import OutlierKind, SimulatedWorld
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments.experiment import (
+    Goal,
+    Options,
+    Outcome,
+    Results,
+    Table,
+    seed_count,
+)
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import (
+    Figures,
+    Shown,
+    cells_of,
+    over_seeds,
+    team_task,
+)
+from teamslam.sim.world.config import OutlierKind, SimulatedWorld
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3

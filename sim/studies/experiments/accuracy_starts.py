@@ -6,11 +6,17 @@ After a right merge only the map's position is undetermined, so maps are compare
 
 import msgspec
 
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, Shown, cells_of, over_seeds, team_task
-from team.estimation.consistency import chi2_limit
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import (
+    Figures,
+    Shown,
+    cells_of,
+    over_seeds,
+    team_task,
+)
+from teamslam.team.estimation.consistency import chi2_limit
 
 WORLDS = ("thesis", "thesis-b")
 SHOWN: Shown = (

@@ -7,9 +7,9 @@ the same noise is the cost of the submaps.
 
 from collections.abc import Mapping
 
-from sim.scenarios.scenario import load
-from sim.studies.experiments.accuracy_starts import unknown_starts
-from sim.studies.experiments.experiment import (
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.studies.experiments.accuracy_starts import unknown_starts
+from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Goal,
     Options,
@@ -18,8 +18,8 @@ from sim.studies.experiments.experiment import (
     Table,
     without_datasets,
 )
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, Shown, cells_of, team_task
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, Shown, cells_of, team_task
 
 NORMAL_SCALE = (0.8, 1.25)
 """Bounds of the monitor's covariance scale without truth, in units of the profile's

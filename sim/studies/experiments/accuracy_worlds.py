@@ -6,8 +6,8 @@ NEES is per degree of freedom: 1 for a correct covariance.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments.experiment import (
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.experiments.experiment import (
     Goal,
     Options,
     Outcome,
@@ -15,8 +15,8 @@ from sim.studies.experiments.experiment import (
     Table,
     seed_count,
 )
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import (
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import (
     OURS,
     Figures,
     Shown,
@@ -25,7 +25,7 @@ from sim.studies.experiments.team_runs import (
     over_seeds,
     team_task,
 )
-from team.pairs import PAIRS
+from teamslam.team.pairs import PAIRS
 
 
 class World(NamedTuple):

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from central.desk.evaluation.evaluation import evaluate, to_json
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.experiments.drawing import figure, ruled
-from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
-from sim.studies.experiments.task import Task
-from team.config import Estimator, FusionRule
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.drawing import figure, ruled
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.figure import Figure
@@ -90,7 +90,7 @@ def _tasks(axis: str, value: float, system: System, options: Options) -> list[Ta
     missed = value if axis == "missed" else 0.0
     return [
         Task(
-            "sim.studies.experiments.association:association_run",
+            "teamslam.sim.studies.experiments.association:association_run",
             {
                 "estimator": system.estimator,
                 "fusion": system.fusion,

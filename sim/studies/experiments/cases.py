@@ -16,8 +16,8 @@ from typing import Any
 from joblib import Memory, Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from sim.studies.experiments.task import Task
-from team.extras import install_command
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.team.extras import install_command
 
 FOLDER = "cases"
 _STORED = "output.pkl"

@@ -12,19 +12,19 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from central.desk.evaluation.errors import Path, PoseErrors, pose_errors
-from central.desk.evaluation.evaluation import evaluate
-from sim.scenarios.scenario import Scenario, loads
-from sim.scenarios.source import streams_of
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
-from sim.world.streams import Detections, RobotStream, WorldStreams
-from team import translate
-from team.pairs import PAIRS
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
-from team.wire.bus import Sample, opened
+from teamslam.central.desk.evaluation.errors import Path, PoseErrors, pose_errors
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.scenarios.scenario import Scenario, loads
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
+from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
+from teamslam.team import translate
+from teamslam.team.pairs import PAIRS
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.bus import Sample, opened
 
 STEP_S = 1.0
 """Length [s] of a step of the thesis' world."""
@@ -47,7 +47,7 @@ def curves_task(
     of the step before. shots: steps whose maps and paths are stored.
     """
     return Task(
-        "sim.studies.experiments.curves:curves_run",
+        "teamslam.sim.studies.experiments.curves:curves_run",
         {"world": msgspec.to_builtins(scenario)}
         | ({} if team_scenario is None else {"team_scenario": msgspec.to_builtins(team_scenario)})
         | ({"late": True} if late else {})

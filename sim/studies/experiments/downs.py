@@ -13,12 +13,16 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from central.desk.drawing import BLUE, ORANGE, SKY, VERMILION
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments import downs_printed
-from sim.studies.experiments.accuracy_utias import team_on
-from sim.studies.experiments.downs_joined import his_protocol, spherical_task, whole_run_task
-from sim.studies.experiments.downs_simulated import (
+from teamslam.central.desk.drawing import BLUE, ORANGE, SKY, VERMILION
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments import downs_printed
+from teamslam.sim.studies.experiments.accuracy_utias import team_on
+from teamslam.sim.studies.experiments.downs_joined import (
+    his_protocol,
+    spherical_task,
+    whole_run_task,
+)
+from teamslam.sim.studies.experiments.downs_simulated import (
     SIMULATED_5_1,
     SIMULATED_5_2,
     SIMULATED_5_3,
@@ -28,8 +32,8 @@ from sim.studies.experiments.downs_simulated import (
     paired_test,
     sample_picture,
 )
-from sim.studies.experiments.drawing import figure, ruled
-from sim.studies.experiments.experiment import (
+from teamslam.sim.studies.experiments.drawing import figure, ruled
+from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Options,
     Outcome,
@@ -39,9 +43,9 @@ from sim.studies.experiments.experiment import (
     combined,
     without_datasets,
 )
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, team_task
-from sim.world.config import UtiasWorld
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, team_task
+from teamslam.sim.world.config import UtiasWorld
 
 Row = tuple[float | None, ...]
 """Errors [m] of robots 1 … 5, or of the team alone."""

@@ -14,34 +14,34 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
-from central.desk.evaluation.evaluation import Evaluation, evaluate
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, loads, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.estimators import svd_joining
-from sim.studies.estimators.svd_joining import (
+from teamslam.central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.estimators import svd_joining
+from teamslam.sim.studies.estimators.svd_joining import (
     SETTINGS,
     PointPairs,
     SubmapJoining,
     mutual_sighting,
     weighted,
 )
-from sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
-from sim.studies.experiments.experiment import Dataset
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, expected_s
-from sim.studies.rules.svd_rule import tied
-from sim.world.config import UtiasWorld
-from team import translate
-from team.config import Sensor
-from team.estimation.contribution import Contribution, Stream
-from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.map_joining import joining
-from team.estimation.models import corrected
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample, opened
+from teamslam.sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
+from teamslam.sim.studies.experiments.experiment import Dataset
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, expected_s
+from teamslam.sim.studies.rules.svd_rule import tied
+from teamslam.sim.world.config import UtiasWorld
+from teamslam.team import translate
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.contribution import Contribution, Stream
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.estimation.map_joining import joining
+from teamslam.team.estimation.models import corrected
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, opened
 
 STEP_S = 1.0
 NEVER_S = 1e6
@@ -97,7 +97,7 @@ def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
 def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> Task:
     place = scenario.name if dataset is None else dataset.name
     return Task(
-        f"sim.studies.experiments.downs_joined:{work}",
+        f"teamslam.sim.studies.experiments.downs_joined:{work}",
         {"scenario": msgspec.to_builtins(scenario)}
         | ({} if dataset is None else {"sha256": dataset.sha256}),
         f"{place}, {scenario.estimator}{f', {note}' if note else ''}, "

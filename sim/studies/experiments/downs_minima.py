@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import Bounds, differential_evolution
 
-from central.desk.drawing import BLUE, VERMILION
-from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments.downs_joined import spherical_task
-from sim.studies.experiments.drawing import figure, ruled
-from sim.studies.experiments.experiment import (
+from teamslam.central.desk.drawing import BLUE, VERMILION
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.experiments.downs_joined import spherical_task
+from teamslam.sim.studies.experiments.drawing import figure, ruled
+from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Picture,
@@ -29,11 +29,11 @@ from sim.studies.experiments.experiment import (
     Table,
     without_datasets,
 )
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.world.config import SimulatedWorld, UtiasWorld
-from team.estimation.map_joining.alignment import procrustes
-from team.estimation.se2 import wrapped
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
+from teamslam.team.estimation.map_joining.alignment import procrustes
+from teamslam.team.estimation.se2 import wrapped
 
 STEPS = 600
 """Steps of his simulator, after which most landmarks were detected."""

@@ -13,14 +13,18 @@ import msgspec
 import numpy as np
 from scipy.stats import ttest_rel
 
-from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, RED, TRUTH_COLOUR, VERMILION
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.downs_joined import final_maps_only, spherical_task, whole_run_task
-from sim.studies.experiments.drawing import draw_map, figure, ruled, spread
-from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, team_task
-from sim.world.config import SimulatedWorld
+from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, RED, TRUTH_COLOUR, VERMILION
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments.downs_joined import (
+    final_maps_only,
+    spherical_task,
+    whole_run_task,
+)
+from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled, spread
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, team_task
+from teamslam.sim.world.config import SimulatedWorld
 
 WORLDS = ("downs-10", "downs-100")
 TEAM = 2

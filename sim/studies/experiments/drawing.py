@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import MAP_COLOUR, draw_ellipses
+from teamslam.central.desk.drawing import MAP_COLOUR, draw_ellipses
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes

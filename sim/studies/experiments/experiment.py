@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.task import Task
 
 UTIAS_SOURCE = (
     "the UTIAS Multi-Robot Cooperative Localization and Mapping data set (MRCLAM; Leung, Halpern, "

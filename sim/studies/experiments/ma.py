@@ -12,28 +12,28 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION
-from central.desk.evaluation.errors import Path, pose_errors
-from central.desk.evaluation.evaluation import evaluate
-from sim.scenarios.scenario import Scenario, load, loads, with_options
-from sim.studies.experiments.curves import (
+from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION
+from teamslam.central.desk.evaluation.errors import Path, pose_errors
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
+from teamslam.sim.studies.experiments.curves import (
     estimated_poses,
     messages,
     pose_keys,
     short,
     true_landmarks,
 )
-from sim.studies.experiments.experiment import Dataset
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures, TimedRun, named
-from sim.studies.experiments.xu import Method, with_particles
-from sim.world.config import UtiasWorld
-from team import translate
-from team.config import MotionModel, RobotConfig, Sensor
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
-from team.wire.bus import Sample, opened
+from teamslam.sim.studies.experiments.experiment import Dataset
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, named
+from teamslam.sim.studies.experiments.xu import Method, with_particles
+from teamslam.sim.world.config import UtiasWorld
+from teamslam.team import translate
+from teamslam.team.config import MotionModel, RobotConfig, Sensor
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.bus import Sample, opened
 
 FRAME_S = 0.2
 FRAMES = 1400
@@ -58,7 +58,7 @@ def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
     """Run of one method on the first 1400 frames of a set."""
     scenario = _scenario(method, seed)
     return Task(
-        "sim.studies.experiments.ma:ma_run",
+        "teamslam.sim.studies.experiments.ma:ma_run",
         {"scenario": msgspec.to_builtins(scenario), "sha256": dataset.sha256},
         f"{dataset.name}, {method.robots} robots, {named(method.estimator, method.fusion)}, "
         f"seed {seed}",

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from sim.studies.experiments.drawing import Curves
-from sim.studies.experiments.experiment import (
+from teamslam.sim.studies.experiments.drawing import Curves
+from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Options,
     Outcome,
@@ -16,7 +16,7 @@ from sim.studies.experiments.experiment import (
     Table,
     without_datasets,
 )
-from sim.studies.experiments.ma import (
+from teamslam.sim.studies.experiments.ma import (
     DEAD_RECKONING,
     FRAMES,
     MULTI_3,
@@ -25,9 +25,9 @@ from sim.studies.experiments.ma import (
     SINGLE,
     ma_task,
 )
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
 
 
 class ErrorFigure(NamedTuple):

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from central.desk.drawing import RED, SKY, TRUTH_COLOUR, colour_of
-from sim.studies.experiments.drawing import draw_map, figure, ruled
-from sim.studies.experiments.experiment import (
+from teamslam.central.desk.drawing import RED, SKY, TRUTH_COLOUR, colour_of
+from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled
+from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Options,
     Outcome,
@@ -17,10 +17,10 @@ from sim.studies.experiments.experiment import (
     Table,
     without_datasets,
 )
-from sim.studies.experiments.ma import DEAD_RECKONING, MULTI_3, MULTI_5, SINGLE, ma_task
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.studies.experiments.xu import Method
+from teamslam.sim.studies.experiments.ma import DEAD_RECKONING, MULTI_3, MULTI_5, SINGLE, ma_task
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.xu import Method
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments.task import Task
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.experiments.task import Task
 
 IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
 """Parameters in the run's label, or different for every robot."""

@@ -20,7 +20,7 @@ from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import splu
 
-from team.estimation.map_joining.submap_graph import Graph
+from teamslam.team.estimation.map_joining.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
 Rows = Float[np.ndarray, "_ _"]

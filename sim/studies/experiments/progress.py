@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from sim.studies.experiments.cases import Done
-from sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.cases import Done
+from teamslam.sim.studies.experiments.task import Task
 
 LINE_S = 10.0
 

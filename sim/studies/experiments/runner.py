@@ -9,12 +9,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from sim.datasets.tables import open_data_set
-from sim.studies.experiments.cases import Cases, Done
-from sim.studies.experiments.catalogue import Entry
-from sim.studies.experiments.experiment import Dataset, Experiment, Options, Outcome, Results
-from sim.studies.experiments.parameters import kinds_of
-from sim.studies.experiments.task import Task
+from teamslam.sim.datasets.tables import open_data_set
+from teamslam.sim.studies.experiments.cases import Cases, Done
+from teamslam.sim.studies.experiments.catalogue import Entry
+from teamslam.sim.studies.experiments.experiment import (
+    Dataset,
+    Experiment,
+    Options,
+    Outcome,
+    Results,
+)
+from teamslam.sim.studies.experiments.parameters import kinds_of
+from teamslam.sim.studies.experiments.task import Task
 
 FAILURES = "failures.txt"
 """File with the tracebacks of the last command's failed runs."""
@@ -55,7 +61,7 @@ task.
 def planned(entry: Entry, options: Options) -> Plan:
     """List the experiment's tasks; raises ScenarioError, DatasetError."""
     name, _, attribute = entry.module.partition(":")
-    module = import_module(f"sim.studies.experiments.{name}")
+    module = import_module(f"teamslam.sim.studies.experiments.{name}")
     experiment = cast(Experiment, getattr(module, attribute) if attribute else module)
     return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim.studies.experiments.cases import FOLDER
-from sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.cases import FOLDER
+from teamslam.sim.studies.experiments.task import Task
 
 DESCRIPTION = "shard.json"
 """File in a shard's folder: the study, the shard's number, and the digests of its program."""

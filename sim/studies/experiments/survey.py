@@ -6,10 +6,10 @@ implemented methods, on its world and on the one with an accurate sensor.
 
 from typing import NamedTuple
 
-from sim.scenarios.scenario import load, with_options
-from sim.studies.experiments.experiment import Options, Outcome, Results, Table, seed_count
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import (
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table, seed_count
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import (
     OURS,
     Figures,
     Shown,
@@ -18,9 +18,9 @@ from sim.studies.experiments.team_runs import (
     over_seeds,
     team_task,
 )
-from sim.studies.experiments.xu import with_particles
-from team.config import Estimator, FusionRule
-from team.pairs import PAIRS
+from teamslam.sim.studies.experiments.xu import with_particles
+from teamslam.team.config import Estimator, FusionRule
+from teamslam.team.pairs import PAIRS
 
 WORLDS = ("thesis", "thesis-b")
 MOST_SEEDS = 12

@@ -10,10 +10,10 @@ from importlib import metadata
 from platform import python_version
 from typing import Any
 
-from team import core
-from team.sources import sources_of
+from teamslam.team import core
+from teamslam.team.sources import sources_of
 
-ROOTS = ("team", "central", "sim")
+ROOTS = ("teamslam",)
 LIBRARIES = ("numpy", "scipy", "gtsam")
 """Libraries that results depend on."""
 

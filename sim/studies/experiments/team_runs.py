@@ -7,24 +7,24 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from central.config import CentralConfig
-from central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
-from central.node import CentralNode, node_class
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, loads, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.batch_reference.measurements import BatchReferenceError
-from sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
-from sim.studies.experiments.experiment import Dataset
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.true_minimum import true_minimum
-from sim.world.config import SimulatedWorld
-from sim.world.streams import WorldStreams
-from team.config import Estimator, Exchange, FusionRule, RobotConfig
-from team.robot.node import RobotNode, robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing, Sample
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
+from teamslam.central.node import CentralNode, node_class
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.batch_reference.measurements import BatchReferenceError
+from teamslam.sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
+from teamslam.sim.studies.experiments.experiment import Dataset
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.true_minimum import true_minimum
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
+from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
 
 Figures = dict[str, Any]
 Shown = Sequence[tuple[str, str, str]]
@@ -55,7 +55,7 @@ def team_task(
     place = scenario.name if dataset is None else dataset.name
     place += f", {note}" if note else ""
     return Task(
-        "sim.studies.experiments.team_runs:team_run",
+        "teamslam.sim.studies.experiments.team_runs:team_run",
         {"scenario": msgspec.to_builtins(scenario), "batch": batch, "noise": noise}
         | ({"minimum": True} if minimum else {})
         | ({} if dataset is None else {"sha256": dataset.sha256}),

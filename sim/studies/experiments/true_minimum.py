@@ -14,17 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.evaluation.errors import Path, interpolate_truth
-from central.desk.evaluation.evaluation import Evaluation
-from central.desk.verification.recorded import Recorded
-from central.tick_fold import TickFold
-from sim.studies.experiments.plain_cost import PlainCost
-from team import translate
-from team.estimation.consistency import chi2_quantile
-from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.joining import Fold, converged
-from team.wire import messages as m
-from team.wire.bus import Sample
+from teamslam.central.desk.evaluation.errors import Path, interpolate_truth
+from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.central.tick_fold import TickFold
+from teamslam.sim.studies.experiments.plain_cost import PlainCost
+from teamslam.team import translate
+from teamslam.team.estimation.consistency import chi2_quantile
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.joining import Fold, converged
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 
 LOWER = 1.0
 """Decrease of the cost that indicates another minimum."""

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import msgspec
 import numpy as np
 
-from central.desk.drawing import BLACK, BLUE, GREEN, PURPLE, VERMILION
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.studies.experiments.curves import curves_task
-from sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
-from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.world.config import SimulatedWorld
-from team.config import MotionNoise
+from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, PURPLE, VERMILION
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.studies.experiments.curves import curves_task
+from teamslam.sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team.config import MotionNoise
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes

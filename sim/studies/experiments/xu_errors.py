@@ -2,7 +2,7 @@
 
 from math import radians
 
-from sim.studies.experiments.xu import (
+from teamslam.sim.studies.experiments.xu import (
     EKF,
     FASTSLAM,
     HYBRID,

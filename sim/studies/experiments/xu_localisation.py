@@ -2,7 +2,7 @@
 
 Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here they are on the thesis'
 world: the three steps of the filter after a stretch without measurements, and a start anywhere. The
-filter is `sim.studies.estimators.localisation`; keyframes are those of a robot's node.
+filter is `teamslam.sim.studies.estimators.localisation`; keyframes are those of a robot's node.
 """
 
 from collections.abc import Mapping
@@ -15,30 +15,37 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from central.desk.drawing import BLACK, BLUE, RED, ROBOT_COLOURS, TRUTH_COLOUR, VERMILION
-from central.desk.evaluation.evaluation import evaluate
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load, loads, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.estimators import localisation
-from sim.studies.estimators.localisation import Localisation
-from sim.studies.experiments.curves import true_landmarks
-from sim.studies.experiments.drawing import figure, ruled, spread
-from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
-from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
-from sim.world.config import SimulatedWorld
-from team import translate
-from team.estimation.consistency import nees
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.models import Increment
-from team.estimation.randomness import generator
-from team.estimation.se2 import wrapped
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.central.desk.drawing import BLACK, BLUE, RED, ROBOT_COLOURS, TRUTH_COLOUR, VERMILION
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.estimators import localisation
+from teamslam.sim.studies.estimators.localisation import Localisation
+from teamslam.sim.studies.experiments.curves import true_landmarks
+from teamslam.sim.studies.experiments.drawing import figure, ruled, spread
+from teamslam.sim.studies.experiments.experiment import (
+    Options,
+    Outcome,
+    Picture,
+    Results,
+    Table,
+    combined,
+)
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
+from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team import translate
+from teamslam.team.estimation.consistency import nees
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes
@@ -165,7 +172,7 @@ def _alone(seed: int, particles: int) -> Scenario:
 
 def _task(work: str, scenario: Scenario, options: Options, seed: int) -> Task:
     return Task(
-        f"sim.studies.experiments.xu_localisation:{work}",
+        f"teamslam.sim.studies.experiments.xu_localisation:{work}",
         {"world": msgspec.to_builtins(scenario), "clouds": seed == options.seeds[0]},
         f"thesis, section 3.5, {work.partition('_')[0]}, seed {seed}",
         _COST_S,

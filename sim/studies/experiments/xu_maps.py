@@ -7,13 +7,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from central.desk.drawing import RED, TRUTH_COLOUR, colour_of
-from sim.studies.experiments import xu_errors
-from sim.studies.experiments.drawing import draw_map, figure, ruled, sampled, spread
-from sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table, combined
-from sim.studies.experiments.task import Task
-from sim.studies.experiments.team_runs import Figures
-from sim.studies.experiments.xu import (
+from teamslam.central.desk.drawing import RED, TRUTH_COLOUR, colour_of
+from teamslam.sim.studies.experiments import xu_errors
+from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled, sampled, spread
+from teamslam.sim.studies.experiments.experiment import (
+    Options,
+    Outcome,
+    Picture,
+    Results,
+    Table,
+    combined,
+)
+from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.xu import (
     EKF,
     FASTSLAM,
     HYBRID,
@@ -28,7 +35,7 @@ from sim.studies.experiments.xu import (
     Panel,
     Reading,
 )
-from sim.studies.experiments.xu import task as curves_of
+from teamslam.sim.studies.experiments.xu import task as curves_of
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
     from matplotlib.axes import Axes

@@ -7,16 +7,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import RobotConfig
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.odometry import OdometryInterval
-from team.estimation.scans import Scan
-from team.estimation.submap import Became
-from team.pairs import ESTIMATORS
-from team.registry import loaded
-from team.rejection import Rejection
-from team.robot.own_map import AT_ORIGIN, Cloud, InitialPose
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.scans import Scan
+from teamslam.team.estimation.submap import Became
+from teamslam.team.pairs import ESTIMATORS
+from teamslam.team.registry import loaded
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.own_map import AT_ORIGIN, Cloud, InitialPose
 
 
 class KnownMap(NamedTuple):

@@ -6,11 +6,11 @@ waits for the answer (lockstep) and absorbs it.
 
 from collections import deque
 
-from team.config import RobotConfig
-from team.estimation.gaussian import LandmarkGaussian
-from team.pairs import FEEDBACK, PAIRS
-from team.robot.statements import MessageWriter
-from team.wire.bus import Outgoing
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.pairs import FEEDBACK, PAIRS
+from teamslam.team.robot.statements import MessageWriter
+from teamslam.team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000
 """Landmarks beyond which a map has only 2 × 2 covariances: a message has at most 64 MiB."""

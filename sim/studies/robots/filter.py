@@ -5,20 +5,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim.studies.robots.estimator import KnownMap
-from team.config import RobotConfig, Sensor
-from team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.models import Increment
-from team.robot.own_map import InitialPose
+from teamslam.sim.studies.robots.estimator import KnownMap
+from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.models import Increment
+from teamslam.team.robot.own_map import InitialPose
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
 """Dispositions of a measurement that such an estimator uses."""
 Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and own covariances
-(`team.estimation.scans`) at its end.
+(`teamslam.team.estimation.scans`) at its end.
 """
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sim.studies.estimators import (
+from teamslam.sim.studies.estimators import (
     dead_reckoning,
     ekf_slam,
     hybrid_thesis,
@@ -15,21 +15,28 @@ from sim.studies.estimators import (
     nearest_neighbour,
     plain_fastslam,
 )
-from sim.studies.estimators.hybrid_thesis_coded import CodedState
-from sim.studies.estimators.localisation import Localisation
-from sim.studies.estimators.plain_fastslam import PlainFastSlam
-from sim.studies.robots.estimator import KnownMap
-from sim.studies.robots.filter import IN_POSE, Filter, FilterStep, InitialState, Judged, Step
-from sim.studies.robots.likelihood import with_association
-from team import translate
-from team.config import Estimator, RobotConfig, Sensor
-from team.estimation import dense
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
-from team.estimation.models import Increment
-from team.estimation.se2 import tangent
-from team.robot.own_map import InitialPose
+from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
+from teamslam.sim.studies.estimators.localisation import Localisation
+from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
+from teamslam.sim.studies.robots.estimator import KnownMap
+from teamslam.sim.studies.robots.filter import (
+    IN_POSE,
+    Filter,
+    FilterStep,
+    InitialState,
+    Judged,
+    Step,
+)
+from teamslam.sim.studies.robots.likelihood import with_association
+from teamslam.team import translate
+from teamslam.team.config import Estimator, RobotConfig, Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import tangent
+from teamslam.team.robot.own_map import InitialPose
 
 
 def _random(filter_step: Callable[..., Any]) -> FilterStep:

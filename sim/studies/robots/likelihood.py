@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from sim.studies.estimators import fastslam_ml
-from sim.studies.estimators.fastslam_ml import FastSlamMl
-from sim.studies.robots.filter import Filter, Step
-from team.config import UNNAMED, RobotConfig
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.sim.studies.estimators import fastslam_ml
+from teamslam.sim.studies.estimators.fastslam_ml import FastSlamMl
+from teamslam.sim.studies.robots.filter import Filter, Step
+from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 
 
 def with_association(plain: Filter) -> Filter:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.studies.robots.estimator import (
+from teamslam.sim.studies.robots.estimator import (
     NOTHING_KNOWN,
     AbsorbsMaps,
     Associates,
@@ -16,20 +16,20 @@ from sim.studies.robots.estimator import (
     RobotEstimator,
     estimator_of,
 )
-from sim.studies.robots.exchange import MapExchange
-from team import translate
-from team.config import RobotConfig
-from team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from team.estimation.hybrid_slam.innovation import Innovation
-from team.estimation.hybrid_slam.pose_grid import TeammateScan
-from team.estimation.map_joining.whole_map import absorbed
-from team.estimation.scans import Scan
-from team.estimation.submap import LocalMap
-from team.pairs import NEEDS_MAP
-from team.rejection import UNMEASURED, Rejection
-from team.robot.mapper import Mapper
-from team.robot.own_map import InitialPose
-from team.wire import messages as m
+from teamslam.sim.studies.robots.exchange import MapExchange
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
+from teamslam.team.estimation.map_joining.whole_map import absorbed
+from teamslam.team.estimation.scans import Scan
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.pairs import NEEDS_MAP
+from teamslam.team.rejection import UNMEASURED, Rejection
+from teamslam.team.robot.mapper import Mapper
+from teamslam.team.robot.own_map import InitialPose
+from teamslam.team.wire import messages as m
 
 
 class ExchangingMapper(Mapper):

@@ -9,14 +9,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from sim.studies.robots.mappers import ExchangingMapper, StreamMapper
-from team import translate
-from team.config import Exchange, RobotConfig
-from team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
-from team.robot import node as product
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.sim.studies.robots.mappers import ExchangingMapper, StreamMapper
+from teamslam.team import translate
+from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
+from teamslam.team.robot import node as product
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 
 
 class ExchangingRobot(RobotNode):

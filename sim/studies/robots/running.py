@@ -8,28 +8,28 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from sim.studies.robots.estimator import Estimates, KnownMap
-from sim.studies.robots.filter import Step
-from sim.studies.robots.filters import FILTERS
-from team.config import UNNAMED, RobotConfig
-from team.estimation.gaussian import (
+from teamslam.sim.studies.robots.estimator import Estimates, KnownMap
+from teamslam.sim.studies.robots.filter import Step
+from teamslam.sim.studies.robots.filters import FILTERS
+from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import (
     LandmarkGaussian,
     NotACovarianceError,
     PoseGaussian,
 )
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.reduction import KeyframeScan
-from team.estimation.models import Increment
-from team.estimation.mount import moved_by
-from team.estimation.odometry import OdometryInterval
-from team.estimation.randomness import generator
-from team.estimation.scans import Scan, unclaimed
-from team.estimation.se2 import Pose, inverse
-from team.estimation.submap import Became
-from team.pairs import FEEDBACK
-from team.rejection import Rejection
-from team.robot.own_map import Cloud, InitialPose, thin_out
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.scans import Scan, unclaimed
+from teamslam.team.estimation.se2 import Pose, inverse
+from teamslam.team.estimation.submap import Became
+from teamslam.team.pairs import FEEDBACK
+from teamslam.team.rejection import Rejection
+from teamslam.team.robot.own_map import Cloud, InitialPose, thin_out
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 """Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without

@@ -6,20 +6,20 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.config import CentralConfig
-from sim.studies.batch_reference import growing as batch
-from sim.studies.batch_reference.graph import load_gtsam
-from sim.studies.batch_reference.growing import GrowingBatch, UnsolvableError
-from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
-from sim.studies.rules.team_keyframes import RobotKeyframe
-from team import translate
-from team.config import RobotConfig
-from team.estimation.gaussian import Matrix, PoseGaussian
-from team.estimation.mount import moved_by
-from team.estimation.se2 import Pose, inverse
-from team.wire import channels as ch
-from team.wire.bus import Outgoing
+from teamslam.central.config import CentralConfig
+from teamslam.sim.studies.batch_reference import growing as batch
+from teamslam.sim.studies.batch_reference.graph import load_gtsam
+from teamslam.sim.studies.batch_reference.growing import GrowingBatch, UnsolvableError
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
+from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
+from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.se2 import Pose, inverse
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
 """Most iterations of a broadcast's map from the last solution, and the Newton step in σ that ends

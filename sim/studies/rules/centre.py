@@ -1,19 +1,19 @@
 """Common part of the comparison centres without submaps.
 
 Attendance, the end of the streams and the conclusion are the product's
-(`central.node.CentralNode`), inputs and maps their own.
+(`teamslam.central.node.CentralNode`), inputs and maps their own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from central.node import CentralNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.node import CentralNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 
 if TYPE_CHECKING:
-    from central.desk.verification.recorded import Recorded
+    from teamslam.central.desk.verification.recorded import Recorded
 
 
 class ComparisonCentre(CentralNode):

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from central.config import CentralConfig
-from central.fused import fused_message
-from sim.studies.rules.centre import ComparisonCentre, recorded_maps
-from sim.studies.rules.map_fusion import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import fused_message
+from teamslam.sim.studies.rules.centre import ComparisonCentre, recorded_maps
+from teamslam.sim.studies.rules.map_fusion import (
     covariance_intersection,
     fused_totally,
     kalman,
     kalman_per_axis,
 )
-from team import translate
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.digest import digest_of
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.digest import digest_of
 
 if TYPE_CHECKING:
-    from central.desk.verification.recorded import Recorded
+    from teamslam.central.desk.verification.recorded import Recorded
 
 RULES: Mapping[str, Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian]] = {
     "kalman": kalman,

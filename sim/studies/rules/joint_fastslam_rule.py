@@ -5,19 +5,19 @@ from contextlib import suppress
 
 import numpy as np
 
-from central.config import CentralConfig
-from sim.studies.estimators import joint_fastslam
-from sim.studies.estimators.joint_fastslam import JointFastSlam
-from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
-from sim.studies.rules.team_keyframes import RobotKeyframe
-from team.config import RobotConfig
-from team.estimation import dense
-from team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
-from team.estimation.models import Increment
-from team.estimation.randomness import generator
-from team.estimation.se2 import Pose, tangent
-from team.wire.bus import Outgoing
+from teamslam.central.config import CentralConfig
+from teamslam.sim.studies.estimators import joint_fastslam
+from teamslam.sim.studies.estimators.joint_fastslam import JointFastSlam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
+from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.se2 import Pose, tangent
+from teamslam.team.wire.bus import Outgoing
 
 RESAMPLE_BELOW = 1.0
 """Resamples at every step, as algorithm 1 does."""

@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.estimation import dense
-from team.estimation.gaussian import (
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import (
     NO_LANDMARKS,
     LandmarkGaussian,
     NotACovarianceError,

@@ -5,20 +5,20 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from central.config import CentralConfig
-from central.fused import fused_message
-from sim.studies.rules.centre import ComparisonCentre, recorded_maps
-from sim.studies.rules.map_fusion import fused_totally, kalman
-from team import translate
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from team.store import Stream
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.digest import digest_of
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import fused_message
+from teamslam.sim.studies.rules.centre import ComparisonCentre, recorded_maps
+from teamslam.sim.studies.rules.map_fusion import fused_totally, kalman
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from teamslam.team.store import Stream
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.digest import digest_of
 
 if TYPE_CHECKING:
-    from central.desk.verification.recorded import Recorded
+    from teamslam.central.desk.verification.recorded import Recorded
 
 
 class NewestMapsCentre(ComparisonCentre):

@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from central.config import CentralConfig
-from central.fused import START_POSES, fused_message
-from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.centre import ComparisonCentre
-from sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
-from team import translate
-from team.config import RobotConfig
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from team.estimation.mount import moved_by
-from team.estimation.plausible import start_beyond
-from team.estimation.se2 import Pose, inverse
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.digest import NO_MAP, digest_of
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import START_POSES, fused_message
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.rules.centre import ComparisonCentre
+from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
+from teamslam.team import translate
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
+from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.plausible import start_beyond
+from teamslam.team.estimation.se2 import Pose, inverse
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.digest import NO_MAP, digest_of
 
 if TYPE_CHECKING:
-    from central.desk.verification.recorded import Recorded
+    from teamslam.central.desk.verification.recorded import Recorded
 
 
 @dataclass(frozen=True)

@@ -13,33 +13,33 @@ from types import MappingProxyType
 
 import numpy as np
 
-from central.config import CentralConfig
-from central.fused import fused_message, version_entry
-from central.join_messages import Tail
-from central.node import CentralNode
-from central.submap_fold import RecordedFields, SubmapFold
-from sim.studies.estimators import svd_joining
-from sim.studies.estimators.svd_joining import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.fused import fused_message, version_entry
+from teamslam.central.join_messages import Tail
+from teamslam.central.node import CentralNode
+from teamslam.central.submap_fold import RecordedFields, SubmapFold
+from teamslam.sim.studies.estimators import svd_joining
+from teamslam.sim.studies.estimators.svd_joining import (
     NO_PAIRS,
     PointPairs,
     SubmapJoining,
     TooFewPointsError,
     Weighting,
 )
-from team import core, translate
-from team.estimation import dense
-from team.estimation.contribution import named
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from team.estimation.plausible import start_beyond, submap_beyond
-from team.estimation.se2 import Pose
-from team.estimation.submap import LocalMap
-from team.store import Stream, SubmapStore
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
-from team.wire.digest import digest_of
+from teamslam.team import core, translate
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import named
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.plausible import start_beyond, submap_beyond
+from teamslam.team.estimation.se2 import Pose
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.store import Stream, SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 
 NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from typing import NamedTuple
 
-from team import translate
-from team.config import Bounds, RobotConfig
-from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.scans import sensible
-from team.rejection import UNMEASURED
-from team.stream.inbox import Inbox
-from team.stream.judge import StreamJudge
-from team.wire import messages as m
+from teamslam.team import translate
+from teamslam.team.config import Bounds, RobotConfig
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from teamslam.team.estimation.scans import sensible
+from teamslam.team.rejection import UNMEASURED
+from teamslam.team.stream.inbox import Inbox
+from teamslam.team.stream.judge import StreamJudge
+from teamslam.team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):

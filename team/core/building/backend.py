@@ -4,8 +4,9 @@
     python team/core/building/backend.py --checked   with sanitizers (TEAMSLAM_CORE=checked)
     python team/core/building/backend.py --find      name the C++ compiler; status 1: there is none
 
-Wheels are scikit-build-core's. An editable install builds into the source tree and adds that tree
-to the path, nothing else: no import hook stands before a second checkout on PYTHONPATH.
+Wheels are scikit-build-core's. An editable install builds into the source tree and adds one
+folder to the path, which holds a link to the package `teamslam` and nothing else: no import hook
+stands before a second checkout on PYTHONPATH, and no other folder of the tree can be imported.
 
 Without a C++20 compiler on the machine the build takes the one of the `ziglang` wheel.
 """
@@ -166,10 +167,14 @@ def build_editable(
     from scikit_build_core import build
 
     build_in_place()
+    link = ROOT / "build" / "editable" / "teamslam"
+    if not link.is_symlink():
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(ROOT / "teamslam")
     with tempfile.TemporaryDirectory() as folder:
         info = build.prepare_metadata_for_build_editable(folder, config_settings)
         name = info.removesuffix(".dist-info")
-        files = {f"{name.partition('-')[0]}.pth": f"{ROOT}\n".encode()}
+        files = {f"{name.partition('-')[0]}.pth": f"{link.parent}\n".encode()}
         for path in sorted(Path(folder, info).rglob("*")):
             if path.is_file() and path.name != "RECORD":
                 files[path.relative_to(folder).as_posix()] = path.read_bytes()

@@ -153,7 +153,7 @@ void bind_dense(nb::module_& m) {
       },
       "P"_a,
       "Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in "
-      "team.estimation.gaussian.FAULTS of why there is none.");
+      "teamslam.team.estimation.gaussian.FAULTS of why there is none.");
   m.def(
       "curved_covariance",
       [](double heading, const Matrix3& P) {
@@ -161,7 +161,7 @@ void bind_dense(nb::module_& m) {
       },
       "heading"_a, "covariance"_a,
       "Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; "
-      "team.estimation.gaussian.curved describes it.");
+      "teamslam.team.estimation.gaussian.curved describes it.");
   m.def(
       "chi2_quantiles",
       [](double below, double above, const Numbers& dof) {

@@ -35,7 +35,7 @@ motion::Moved moved_of(const Triple& twist, const std::optional<Matrix3>& covari
 }
 
 void bind_model(nb::module_& m) {
-  nb::class_<Model>(m, "MotionModel", "The parameters of a motion model, as of `team.config.MotionModel`.")
+  nb::class_<Model>(m, "MotionModel", "The parameters of a motion model, as of `teamslam.team.config.MotionModel`.")
       .def(
           "__init__",
           [](Model* self, bool turns_first, const Three& forward, const Three& turn, const Three& final_turn, const Three& lateral,

@@ -5,7 +5,7 @@
 
 namespace teamslam::gaussian {
 
-// Why a matrix is no covariance; the index in team.estimation.gaussian.FAULTS.
+// Why a matrix is no covariance; the index in teamslam.team.estimation.gaussian.FAULTS.
 enum class Fault : int { NONE = 0, NOT_FINITE = 1, NOT_POSITIVE = 2, NOT_SYMMETRIC = 3 };
 
 // What is seen of a matrix without factoring it; sigmas: the roots of its diagonal, where it is positive.

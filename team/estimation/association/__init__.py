@@ -8,5 +8,5 @@ Between submaps, on the joint Gaussian of a map's landmarks: `gating` evaluates 
 `density` and `visibility` give the evidence against them, `joint_compatibility` accepts sets of
 pairs, `island_view` runs the steps of a tick, `voting` and `closure` search for a patch of
 landmarks elsewhere, and `verification` tests a closure. The results are `landmark_sets`, stored in
-`member_log`. `team.estimation.map_joining.fold_association` applies them to the graph.
+`member_log`. `teamslam.team.estimation.map_joining.fold_association` applies them to the graph.
 """

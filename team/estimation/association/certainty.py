@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.config import AssociationSettings
-from team.estimation.association.gating import compute_mahalanobis
-from team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
-from team.estimation.association.smoothing import SmoothedWindow
+from teamslam.team import core
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.gating import compute_mahalanobis
+from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
+from teamslam.team.estimation.association.smoothing import SmoothedWindow
 
 LEAST = 0.1
 """Least probability that a detected landmark is in view."""

@@ -17,37 +17,42 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.association import AssociationProfile
-from team.estimation import dense
-from team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
-from team.estimation.association.island_view import (
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation.association.island_view import (
     IslandView,
     join_indices,
     select_comparisons,
 )
-from team.estimation.association.joint_compatibility import (
+from teamslam.team.estimation.association.joint_compatibility import (
     SURE_AFTER,
     MergedPairs,
     assign_jointly,
     grow_pairs,
 )
-from team.estimation.association.verification import (
+from teamslam.team.estimation.association.verification import (
     Closure,
     ClosureTests,
     find_failed_test,
     matched_share,
     nearest_distance,
 )
-from team.estimation.association.visibility import (
+from teamslam.team.estimation.association.visibility import (
     Views,
     mark_visible,
     pad_views,
     renumber_views,
 )
-from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
-from team.estimation.contribution import Stream
-from team.estimation.se2 import compose
+from teamslam.team.estimation.association.voting import (
+    PointSet,
+    Vote,
+    apply_motion,
+    propose_alignments,
+)
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.se2 import compose
 
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""

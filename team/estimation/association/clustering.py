@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.config import AssociationSettings
-from team.estimation.association.certainty import association_probabilities
-from team.estimation.association.gating import compute_mahalanobis, match_scan
-from team.estimation.association.scans import (
+from teamslam.team import core
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.certainty import association_probabilities
+from teamslam.team.estimation.association.gating import compute_mahalanobis, match_scan
+from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
     initialise_landmark,
     predict_landmarks,
     relative_to,
 )
-from team.estimation.association.smoothing import SmoothedWindow, smooth_window
-from team.estimation.association.tracking import Slip, slip_covariance, track_window
+from teamslam.team.estimation.association.smoothing import SmoothedWindow, smooth_window
+from teamslam.team.estimation.association.tracking import Slip, slip_covariance, track_window
 
 RARE = 0.05
 """Significance level of the test for clutter."""

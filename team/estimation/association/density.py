@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.association import AssociationProfile
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
 
 CLOSE = 0.1
 """Quantile of the landmarks' spacings taken as the spacing within groups."""

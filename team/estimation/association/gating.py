@@ -14,17 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.association import AssociationProfile
-from team.config import AssociationSettings
-from team.estimation.association.density import LandmarkDensity
-from team.estimation.association.scans import UNASSIGNED
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.scans import UNASSIGNED
 
 Indices = Int64[np.ndarray, " _"]
 
 LEAST_DETERMINANT = 1e-32
 """Lower bound of |S| [m⁴]: that of the smallest standard deviation accepted, 1e-8 m
-(`team.config.Bounds.sigma_m`).
+(`teamslam.team.config.Bounds.sigma_m`).
 """
 SPLIT = 1.0
 """Additional log-likelihood ratio for a pair of one window, which seldom splits a landmark."""

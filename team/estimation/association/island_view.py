@@ -16,28 +16,28 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.association import AssociationProfile
-from team.config import UNNAMED
-from team.estimation.association.density import LandmarkDensity
-from team.estimation.association.gating import (
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.gating import (
     Indices,
     Joint,
     Pair,
     gate_pairs,
     list_pairs,
 )
-from team.estimation.association.joint_compatibility import (
+from teamslam.team.estimation.association.joint_compatibility import (
     MOST_ASSIGNED,
     MergedPairs,
     assign_jointly,
     condition_on_pair,
     grow_pairs,
 )
-from team.estimation.association.landmark_sets import Landmarks
-from team.estimation.association.member_log import LocalLandmark, MergeRecord
-from team.estimation.association.visibility import miss_probabilities
-from team.estimation.contribution import Observation, Stream
+from teamslam.team.estimation.association.landmark_sets import Landmarks
+from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
+from teamslam.team.estimation.association.visibility import miss_probabilities
+from teamslam.team.estimation.contribution import Observation, Stream
 
 COMPARED = 6
 """Number of submaps that one submap is compared with: those with the most candidates."""

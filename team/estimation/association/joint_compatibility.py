@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from team import core
-from team.association import AssociationProfile
-from team.estimation import dense
-from team.estimation.association.gating import (
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import (
     Indices,
     Joint,
     Likelihoods,

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from team.config import UNNAMED
-from team.estimation.association.member_log import (
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.member_log import (
     LocalLandmark,
     MemberLog,
     MemberRecord,
@@ -23,7 +23,7 @@ from team.estimation.association.member_log import (
     MergeRecord,
     record_of,
 )
-from team.estimation.contribution import Contribution, Key, Stream, named
+from teamslam.team.estimation.contribution import Contribution, Key, Stream, named
 
 OPEN = 2**62
 """Last sequence number of a side that includes all later submaps."""

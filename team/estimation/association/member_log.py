@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, UInt32
 
-from team.config import UNNAMED
-from team.estimation.contribution import Stream
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.contribution import Stream
 
 KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")
 """The steps that merge landmarks."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.estimation import dense
+from teamslam.team import core
+from teamslam.team.estimation import dense
 
 UNASSIGNED = -1
 """No identity, or no landmark."""

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team.estimation import dense
-from team.estimation.association.scans import (
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
     pose_jacobians,
     relative_to,
     rotations,
 )
-from team.estimation.se2 import wrapped
+from teamslam.team.estimation.se2 import wrapped
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""

@@ -11,11 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.config import AssociationSettings
-from team.estimation import dense
-from team.estimation.association.gating import compute_mahalanobis, match_best_first, match_scan
-from team.estimation.association.scans import (
+from teamslam.team import core
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import (
+    compute_mahalanobis,
+    match_best_first,
+    match_scan,
+)
+from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
     initialise_landmark,
@@ -23,8 +27,8 @@ from team.estimation.association.scans import (
     predict_landmarks,
     rotation,
 )
-from team.estimation.consistency import chi2_limit
-from team.estimation.se2 import adjoint, compose, inverse
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.se2 import adjoint, compose, inverse
 
 FEW = 0.5
 """Share of matched detections in a scan below which a slip is suspected."""

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.association import AssociationProfile
-from team.estimation.association.gating import Indices, Pair, evaluate_pairs
-from team.estimation.association.island_view import IslandView
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation.association.gating import Indices, Pair, evaluate_pairs
+from teamslam.team.estimation.association.island_view import IslandView
 
 WIDE = 3.0
 """Radius around a closure's places that an audit considers, in spacings."""

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
+from teamslam.team import core
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""

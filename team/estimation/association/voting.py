@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.estimation import dense
+from teamslam.team import core
+from teamslam.team.estimation import dense
 
 MOST_BINS = 60
 """Number of refined motions, those with the most votes."""

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.hybrid_slam.pose_grid import NodeSighting
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.submap import Became, LocalMap, Slipped
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team import core
-from team.config import Sensor
-from team.core import effective_sample_size, normalise, systematic_parents
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.models import Increment
-from team.estimation.scans import Own, unclaimed
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.core import effective_sample_size, normalise, systematic_parents
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import Own, unclaimed
 
 __all__ = [
     "Noise",
@@ -160,9 +160,9 @@ def propagated_and_updated(
     Resampling comes first, when the effective sample size of the last step is below
     `resample_below`·M, so that the particles of a window's last step keep their weights. ranges [m]
     and bearings [rad] are corrected by the calibration, own are the measurements' own covariances
-    (`team.estimation.scans`); an id may occur twice. Draws one uniform number if it resamples, and
-    M × 3 normal ones.
-    Raises NotACovarianceError if the motion's covariance is not positive semi-definite.
+    (`teamslam.team.estimation.scans`); an id may occur twice. Draws one uniform number if it
+    resamples, and M × 3 normal ones. Raises NotACovarianceError if the motion's covariance is not
+    positive semi-definite.
     """
     parents = None
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):

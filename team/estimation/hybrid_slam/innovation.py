@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
-from team import core
-from team.config import Sensor
-from team.estimation import dense
-from team.estimation.gaussian import cholesky_factor, whitened
-from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
-from team.estimation.models import Increment, noise
-from team.estimation.scans import Own, unclaimed
-from team.estimation.se2 import compose, tangent, wrapped
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import cholesky_factor, whitened
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
+from teamslam.team.estimation.models import Increment, noise
+from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.se2 import compose, tangent, wrapped
 
 Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
 """Ids, ranges [m], bearings [rad] and claimed noises of measurements."""

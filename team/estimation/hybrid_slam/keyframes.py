@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 from msgspec.structs import force_setattr, replace
 
-from team import core
-from team.config import MotionModel, Sensor
-from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
-from team.estimation.models import Increment, model_of, scanned
-from team.estimation.odometry import STANDING, OdometryInterval
-from team.estimation.scans import Own, calibrated, unclaimed
-from team.rejection import Rejection
+from teamslam.team import core
+from teamslam.team.config import MotionModel, Sensor
+from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
+from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
+from teamslam.team.estimation.models import Increment, model_of, scanned
+from teamslam.team.estimation.odometry import STANDING, OdometryInterval
+from teamslam.team.estimation.scans import Own, calibrated, unclaimed
+from teamslam.team.rejection import Rejection
 
 NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
 """The measurements of a keyframe without any."""
@@ -27,8 +27,8 @@ large as the motion itself."""
 class Keyframe(msgspec.Struct, frozen=True, gc=False):
     """The motion since the last keyframe and the measurements at its end (accepted and calibrated).
 
-    own: the noises that the measurements claim (`team.estimation.scans`); without rows: none do.
-    Poses and motions are those of the sensor, wherever on the base it is mounted.
+    own: the noises that the measurements claim (`teamslam.team.estimation.scans`); without rows:
+    none do. Poses and motions are those of the sensor, wherever on the base it is mounted.
     looks: the scans without identities since the last keyframe, as they came. rest: the motion
     since the last of them; None: there is none.
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.

@@ -10,19 +10,22 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
-from team.config import RobotConfig
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
-from team.estimation.hybrid_slam.outliers import OutlierGate
-from team.estimation.hybrid_slam.redrawing import redrawn
-from team.estimation.hybrid_slam.unnamed_detections import AssociatedKeyframes, associate_keyframes
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.models import Increment
-from team.estimation.mount import of_base
-from team.estimation.plausible import submap_beyond
-from team.estimation.randomness import generator
-from team.estimation.submap import LocalMap
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
+from teamslam.team.estimation.hybrid_slam.outliers import OutlierGate
+from teamslam.team.estimation.hybrid_slam.redrawing import redrawn
+from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
+    AssociatedKeyframes,
+    associate_keyframes,
+)
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.mount import of_base
+from teamslam.team.estimation.plausible import submap_beyond
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.submap import LocalMap
 
 DEPLETED = 10.0
 """Effective number of particles; where fewer remain after a keyframe, their scatter is no

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from team import core
-from team.config import Sensor
-from team.estimation.hybrid_slam.fastslam import noise_of, refused_by_name
-from team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team import core
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.hybrid_slam.fastslam import noise_of, refused_by_name
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 
 
 class OutlierGate:

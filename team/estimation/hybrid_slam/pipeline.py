@@ -9,23 +9,23 @@
 
 A window begins at zero where the last one ended, so a submap depends on its own measurements, the
 configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is the back end's:
-`team.estimation.map_joining`.
+`teamslam.team.estimation.map_joining`.
 """
 
 from dataclasses import replace
 
-from team.config import RobotConfig
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.closed_window import ClosedWindow
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation
-from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.open_window import OpenWindow
-from team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.odometry import OdometryInterval
-from team.estimation.scans import Scan
-from team.estimation.submap import LocalMap
-from team.rejection import Rejection
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
+from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
+from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.scans import Scan
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.rejection import Rejection
 
 LONGEST_NS = 2**62
 """No two stamps are as far apart."""

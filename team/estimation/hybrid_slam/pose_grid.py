@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.config import FrontEnd, Sensor
-from team.estimation.inter_robot import (
+from teamslam.team import core
+from teamslam.team.config import FrontEnd, Sensor
+from teamslam.team.estimation.inter_robot import (
     CarriedPoint,
     carried_back,
     carried_on,
@@ -22,8 +22,8 @@ from team.estimation.inter_robot import (
     point_seen,
     reduced,
 )
-from team.estimation.models import Increment, scanned
-from team.rejection import Rejection
+from teamslam.team.estimation.models import Increment, scanned
+from teamslam.team.rejection import Rejection
 
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""

@@ -18,16 +18,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.estimation import dense
-from team.estimation.association.scans import Scans, points_of
-from team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
-from team.estimation.hybrid_slam.fastslam import effective_sample_size, noise_of, normalise
-from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.reduction import variances
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.scans import POINT
-from team.estimation.se2 import adjoint, between, inverse
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.scans import Scans, points_of
+from teamslam.team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
+from teamslam.team.estimation.hybrid_slam.fastslam import effective_sample_size, noise_of, normalise
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.hybrid_slam.reduction import variances
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.scans import POINT
+from teamslam.team.estimation.se2 import adjoint, between, inverse
 
 Paths = Float[np.ndarray, "K M 3"]
 FEW = 10.0

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team import core
-from team.config import UNNAMED, Sensor
-from team.estimation.models import Increment
-from team.estimation.scans import SENSOR, Own
-from team.estimation.se2 import Pose
+from teamslam.team import core
+from teamslam.team.config import UNNAMED, Sensor
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import SENSOR, Own
+from teamslam.team.estimation.se2 import Pose
 
 
 class KeyframeScan(msgspec.Struct, frozen=True, gc=False):

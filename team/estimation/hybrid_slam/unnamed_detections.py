@@ -13,15 +13,20 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from msgspec.structs import replace
 
-from team.config import UNNAMED, AssociationSettings, Sensor
-from team.estimation.association.clustering import associate_window
-from team.estimation.association.scans import UNASSIGNED, Scans, points_of
-from team.estimation.association.tracking import Slip, slip_covariance
-from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.reduction import KeyframeScan, Measured, reduced, variances
-from team.estimation.models import Increment
-from team.estimation.scans import Own, together
-from team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
+from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
+from teamslam.team.estimation.association.clustering import associate_window
+from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, points_of
+from teamslam.team.estimation.association.tracking import Slip, slip_covariance
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.hybrid_slam.reduction import (
+    KeyframeScan,
+    Measured,
+    reduced,
+    variances,
+)
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import Own, together
+from teamslam.team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 
 
 @dataclass(frozen=True)

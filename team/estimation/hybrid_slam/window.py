@@ -13,16 +13,16 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team import core
-from team.config import BIASES, Bias, FrontEnd, Sensor
-from team.estimation import dense
-from team.estimation.gaussian import FAULTS, NotACovarianceError
-from team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
-from team.estimation.models import Increment
-from team.estimation.scans import Own, unclaimed
-from team.estimation.se2 import tangent
-from team.estimation.submap import NO_NODES, LocalMap
+from teamslam.team import core
+from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import FAULTS, NotACovarianceError
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.se2 import tangent
+from teamslam.team.estimation.submap import NO_NODES, LocalMap
 
 STILL = np.zeros(3)
 
@@ -69,7 +69,7 @@ class Window(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def own(self) -> Own:
-        """The noises that the measurements claim (`team.estimation.scans`)."""
+        """The noises that the measurements claim (`teamslam.team.estimation.scans`)."""
         return self.core.measurements()[3]
 
     @property
@@ -111,7 +111,7 @@ def advanced(
 
     The measurements are accepted and corrected already (`models.scanned`).
     forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
-    own: the noises that the measurements claim (`team.estimation.scans`).
+    own: the noises that the measurements claim (`teamslam.team.estimation.scans`).
     """
     noises = unclaimed(len(ids)) if own is None else own
     seen, count = (ids, ranges, bearings, noises), window.front_end.particles

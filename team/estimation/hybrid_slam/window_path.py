@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.core import POSE_JITTER, on_group, sample_factor
-from team.estimation import dense
-from team.estimation.hybrid_slam.window import Window
-from team.estimation.se2 import Pose, wrapped
+from teamslam.team import core
+from teamslam.team.core import POSE_JITTER, on_group, sample_factor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.se2 import Pose, wrapped
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.estimation import dense
-from team.estimation.consistency import chi2_limit
-from team.estimation.gaussian import deviation, information
-from team.estimation.se2 import wrapped
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.gaussian import deviation, information
+from teamslam.team.estimation.se2 import wrapped
 
 ITERATIONS = 10
 NEEDED = 2

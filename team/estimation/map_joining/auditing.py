@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from team.estimation.association.density import LandmarkDensity
-from team.estimation.association.landmark_sets import OPEN, Opened
-from team.estimation.association.verification import overlap_share
-from team.estimation.map_joining.gauss_newton import Island, JoinSettings
-from team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
-from team.estimation.map_joining.refusal import add_members
+from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.landmark_sets import OPEN, Opened
+from teamslam.team.estimation.association.verification import overlap_share
+from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from teamslam.team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
+from teamslam.team.estimation.map_joining.refusal import add_members
 
 
 def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:

@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.estimation import dense
-from team.estimation.contribution import Stream
-from team.estimation.map_joining.upper_triangle import packed_of, unpacked_of
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining.upper_triangle import packed_of, unpacked_of
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

@@ -18,8 +18,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from team.estimation.contribution import Stream
-from team.estimation.map_joining.condensed_factor import (
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining.condensed_factor import (
     NOBODY,
     Condensed,
     Departed,
@@ -27,18 +27,18 @@ from team.estimation.map_joining.condensed_factor import (
     newest,
     places,
 )
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.marginals import BELIEVED, Terms, terms
-from team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
-from team.estimation.map_joining.path_elimination import (
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
+from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
+from teamslam.team.estimation.map_joining.path_elimination import (
     MarkedFactors,
     nodes_of,
     quadratic,
     without_paths,
 )
-from team.estimation.map_joining.resting import FIRST, beside, idle, split
-from team.estimation.map_joining.submap_graph import Graph, without_nodes
+from teamslam.team.estimation.map_joining.resting import FIRST, beside, idle, split
+from teamslam.team.estimation.map_joining.submap_graph import Graph, without_nodes
 
 Indices = Int64[np.ndarray, " _"]
 T = TypeVar("T")

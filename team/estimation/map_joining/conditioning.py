@@ -17,23 +17,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from team import core
-from team.config import Bias
-from team.core import WholeMap
-from team.estimation.consistency import chi2_limit
-from team.estimation.contribution import Contribution
-from team.estimation.gaussian import NotACovarianceError, PoseGaussian
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team import core
+from teamslam.team.config import Bias
+from teamslam.team.core import WholeMap
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     NotDeterminedError,
     joint_marginal,
     settled,
 )
-from team.estimation.map_joining.merging import ages
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
-from team.estimation.map_joining.whole_map import end_pose, without
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.map_joining.merging import ages
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from teamslam.team.estimation.map_joining.whole_map import end_pose, without
+from teamslam.team.estimation.submap import LocalMap
 
 GATE = 18.420680744107813
 """99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`.

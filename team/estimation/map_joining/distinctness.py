@@ -1,7 +1,7 @@
 """Landmarks that a final map leaves out: placed by an uncertain heading, or missed by most submaps
 that look there; and streams that were lost.
 
-`team.estimation.association.verification.find_possible_duplicates` finds duplicates.
+`teamslam.team.estimation.association.verification.find_possible_duplicates` finds duplicates.
 """
 
 import math
@@ -9,11 +9,11 @@ from collections.abc import Collection
 
 import numpy as np
 
-from team.estimation.contribution import Stream
-from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.memory import MOST
-from team.estimation.map_joining.nonlinearity import heading_sigma
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.memory import MOST
+from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
 
 
 def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:

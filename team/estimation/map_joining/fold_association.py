@@ -1,7 +1,7 @@
 """Data association applied to the fold: merges landmarks, closures and islands in its graph.
 
-The decisions are those of `team.estimation.association`. Each step is a function of the fold alone,
-which is a function of the set of submaps in canonical order; so are the decisions.
+The decisions are those of `teamslam.team.estimation.association`. Each step is a function of the
+fold alone, which is a function of the set of submaps in canonical order; so are the decisions.
 """
 
 from collections.abc import Sequence
@@ -10,10 +10,14 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.association.closure import patch_step, search_island, search_other_island
-from team.estimation.association.island_view import IslandView, ViewedSubmap
-from team.estimation.association.joint_compatibility import MergedPairs
-from team.estimation.association.landmark_sets import (
+from teamslam.team.estimation.association.closure import (
+    patch_step,
+    search_island,
+    search_other_island,
+)
+from teamslam.team.estimation.association.island_view import IslandView, ViewedSubmap
+from teamslam.team.estimation.association.joint_compatibility import MergedPairs
+from teamslam.team.estimation.association.landmark_sets import (
     OPEN,
     Decision,
     Landmarks,
@@ -21,10 +25,10 @@ from team.estimation.association.landmark_sets import (
     merge_sets,
     name_sides,
 )
-from team.estimation.association.member_log import LocalLandmark, MergeRecord
-from team.estimation.association.verification import Closure
-from team.estimation.contribution import Contribution, Stream
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
+from teamslam.team.estimation.association.verification import Closure
+from teamslam.team.estimation.contribution import Contribution, Stream
+from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     is_solvable,
@@ -32,11 +36,11 @@ from team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     settled,
 )
-from team.estimation.map_joining.joining import Fold, merged_islands
-from team.estimation.map_joining.merging import Merge, placed
-from team.estimation.map_joining.minima import minimum
-from team.estimation.map_joining.submap_graph import tied
-from team.estimation.se2 import inverse
+from teamslam.team.estimation.map_joining.joining import Fold, merged_islands
+from teamslam.team.estimation.map_joining.merging import Merge, placed
+from teamslam.team.estimation.map_joining.minima import minimum
+from teamslam.team.estimation.map_joining.submap_graph import tied
+from teamslam.team.estimation.se2 import inverse
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:

@@ -22,19 +22,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.association import DEFAULT_PROFILE, AssociationProfile
-from team.config import Bias
-from team.estimation import dense
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.map_joining.least_squares import (
+from teamslam.team import core
+from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
+from teamslam.team.config import Bias
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.map_joining.least_squares import (
     HALVINGS,
     MOST_DAMPING,
     STUCK,
     Values,
     robust_scale,
 )
-from team.estimation.map_joining.submap_graph import CommonBias, Graph
+from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph
 
 STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.estimation import dense
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining import alignment
-from team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from team.estimation.map_joining.submap_graph import Graph, pose_node
-from team.estimation.models import located
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining import alignment
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.submap_graph import Graph, pose_node
+from teamslam.team.estimation.models import located
 
 JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""

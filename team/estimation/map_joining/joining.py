@@ -15,14 +15,14 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from team.estimation.association.landmark_sets import (
+from teamslam.team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     Landmarks,
     Opened,
     Verdict,
     add_landmarks,
 )
-from team.estimation.contribution import (
+from teamslam.team.estimation.contribution import (
     Contribution,
     InitialPoseFactor,
     Key,
@@ -30,8 +30,8 @@ from team.estimation.contribution import (
     moment,
     named,
 )
-from team.estimation.inter_robot import InterRobotFactor, SightingKey
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team.estimation.inter_robot import InterRobotFactor, SightingKey
+from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     JoinSettings,
@@ -39,9 +39,9 @@ from team.estimation.map_joining.gauss_newton import (
     is_solvable,
     iterated,
 )
-from team.estimation.map_joining.markers import add_markers, warn_of_unmarked
-from team.estimation.map_joining.merging import Merge, ages, merge, sighted
-from team.estimation.map_joining.minima import (
+from teamslam.team.estimation.map_joining.markers import add_markers, warn_of_unmarked
+from teamslam.team.estimation.map_joining.merging import Merge, ages, merge, sighted
+from teamslam.team.estimation.map_joining.minima import (
     Minimum,
     Search,
     searched,
@@ -49,8 +49,8 @@ from team.estimation.map_joining.minima import (
     warnings,
     widened,
 )
-from team.estimation.map_joining.resting import woken
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from teamslam.team.estimation.map_joining.resting import woken
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
 __all__ = [
     "EMPTY_FOLD",

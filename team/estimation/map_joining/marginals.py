@@ -11,14 +11,20 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from team.config import UNNAMED, Bias
-from team.estimation.contribution import Stream
-from team.estimation.gaussian import deviation
-from team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
-from team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
-from team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.landmark_view import blocks_of, joint, joints, known, points_of
+from teamslam.team.config import UNNAMED, Bias
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.gaussian import deviation
+from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import (
+    blocks_of,
+    joint,
+    joints,
+    known,
+    points_of,
+)
 
 BELIEVED = 0.5
 """Least weight of a landmark in a submap for the submap to be believed about it."""

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from team import core
-from team.config import UNNAMED
-from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.submap_graph import CommonError, Joined, Prior
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.submap_graph import CommonError, Joined, Prior
 
 
 def add_markers(island: Island) -> Island:

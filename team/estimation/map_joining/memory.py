@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from team.estimation.contribution import Observation
+from teamslam.team.estimation.contribution import Observation
 
 Indices = Int64[np.ndarray, " _"]
 

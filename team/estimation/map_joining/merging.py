@@ -14,15 +14,25 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int64
 
-from team import core
-from team.estimation.gaussian import deviation
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining import alignment
-from team.estimation.map_joining.alignment import Alignment, SharedPoints
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island, is_solvable, joint_marginal
-from team.estimation.map_joining.island_ties import SharedPoint, aligned_by, headings_that_fit, ties
-from team.estimation.map_joining.minima import Minimum, Search, minimum, searched
-from team.estimation.map_joining.submap_graph import encounter_of, merged
+from teamslam.team import core
+from teamslam.team.estimation.gaussian import deviation
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining import alignment
+from teamslam.team.estimation.map_joining.alignment import Alignment, SharedPoints
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    UNSOLVABLE,
+    Island,
+    is_solvable,
+    joint_marginal,
+)
+from teamslam.team.estimation.map_joining.island_ties import (
+    SharedPoint,
+    aligned_by,
+    headings_that_fit,
+    ties,
+)
+from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
+from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
 
 WORTH_TELLING = 1.0
 """Least gain in χ² for which a search is reported: below, it found the place of the first guess."""

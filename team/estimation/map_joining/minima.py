@@ -15,24 +15,24 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from team import core
-from team.estimation.consistency import chi2_limit
-from team.estimation.contribution import Stream, named
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team import core
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     NotDeterminedError,
     final_cost,
     settled,
 )
-from team.estimation.map_joining.nonlinearity import (
+from teamslam.team.estimation.map_joining.nonlinearity import (
     ends,
     heading_sigma,
     nonlinearity_warnings,
     profile,
 )
-from team.estimation.map_joining.relaxation import relaxed
-from team.estimation.se2 import wrapped
+from teamslam.team.estimation.map_joining.relaxation import relaxed
+from teamslam.team.estimation.se2 import wrapped
 
 Values = Float[np.ndarray, " _"]
 

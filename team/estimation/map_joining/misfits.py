@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from team.config import UNNAMED
-from team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.map_joining.gauss_newton import Island
 
 LEAST_SUBMAPS = 4
 """Least number of submaps of a landmark to be judged."""

@@ -11,18 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from team import core
-from team.estimation import dense
-from team.estimation.contribution import Stream, named
-from team.estimation.gaussian import deviation, information
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.gaussian import deviation, information
+from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     Island,
     aged,
     joint_marginal,
     solved_with_fixed,
 )
-from team.estimation.se2 import compose, inverse, logarithm
+from teamslam.team.estimation.se2 import compose, inverse, logarithm
 
 STEPS = (1.0, 2.0, 3.0)
 """Displacements of a heading, in its standard deviations."""

@@ -16,11 +16,17 @@ from typing import TypeVar
 
 import numpy as np
 
-from team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream, named
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.fold_association import associate_tick
-from team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
-from team.estimation.map_joining.joining import Fold, Tick, folded, started
+from teamslam.team.estimation.contribution import (
+    Contribution,
+    InitialPoseFactor,
+    Key,
+    Stream,
+    named,
+)
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.fold_association import associate_tick
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
+from teamslam.team.estimation.map_joining.joining import Fold, Tick, folded, started
 
 T = TypeVar("T")
 

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.estimation.map_joining.submap_graph import Graph
+from teamslam.team import core
+from teamslam.team.estimation.map_joining.submap_graph import Graph
 
 Values = Float[np.ndarray, " _"]
 Indices = Int64[np.ndarray, " _"]

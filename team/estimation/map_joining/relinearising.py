@@ -11,22 +11,22 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from team.estimation.contribution import Contribution, Key, Stream
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.condensed_factor import EliminatedPath
-from team.estimation.map_joining.condensing import LIMITS
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team.estimation.contribution import Contribution, Key, Stream
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
+from teamslam.team.estimation.map_joining.condensing import LIMITS
+from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
     Island,
     is_solvable,
     iterated,
 )
-from team.estimation.map_joining.joining import Fold
-from team.estimation.map_joining.landmark_view import known, points_of
-from team.estimation.map_joining.merging import ages, sighted
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
-from team.estimation.se2 import compose, transformed
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import known, points_of
+from teamslam.team.estimation.map_joining.merging import ages, sighted
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
+from teamslam.team.estimation.se2 import compose, transformed
 
 Values = Float[np.ndarray, " _"]
 

@@ -20,11 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.config import UNNAMED
-from team.estimation.association.voting import PointSet, Vote, apply_motion, propose_alignments
-from team.estimation.contribution import Stream
-from team.estimation.map_joining.gauss_newton import Island
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.voting import (
+    PointSet,
+    Vote,
+    apply_motion,
+    propose_alignments,
+)
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining.gauss_newton import Island
 
 LEAST_PAIRS = 6
 """Least number of landmarks that repeat others."""

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.estimation import dense
-from team.estimation.map_joining.condensed_factor import Resting, places
-from team.estimation.map_joining.gauss_newton import Island
-from team.estimation.map_joining.landmark_view import resting_of
-from team.estimation.map_joining.submap_graph import Graph, with_landmarks
-from team.estimation.map_joining.upper_triangle import between, upper_of
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.map_joining.condensed_factor import Resting, places
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.landmark_view import resting_of
+from teamslam.team.estimation.map_joining.submap_graph import Graph, with_landmarks
+from teamslam.team.estimation.map_joining.upper_triangle import between, upper_of
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from team import core
-from team.config import UNNAMED, Bias
-from team.estimation.contribution import (
+from teamslam.team import core
+from teamslam.team.config import UNNAMED, Bias
+from teamslam.team.estimation.contribution import (
     RANGE_POWER,
     Contribution,
     InitialPoseFactor,
@@ -25,11 +25,11 @@ from team.estimation.contribution import (
     Stream,
     named,
 )
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
-from team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
-from team.estimation.se2 import compose, transformed
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
+from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
+from teamslam.team.estimation.se2 import compose, transformed
+from teamslam.team.estimation.submap import LocalMap
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

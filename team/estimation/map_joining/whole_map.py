@@ -11,10 +11,10 @@ import math
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
 
-from team.core import WholeMap
-from team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
-from team.estimation.se2 import wrapped
-from team.estimation.submap import LocalMap
+from teamslam.team.core import WholeMap
+from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
+from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.estimation.submap import LocalMap
 
 INDEFINITE, SINGULAR = 1, 2
 """Faults of the core: the covariance of the innovation of all known landmarks is not positive

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from team.core import check_ascending, check_blocks, check_finite, check_packed_covariance
-from team.wire.arrays import ids
+from teamslam.team.core import check_ascending, check_blocks, check_finite, check_packed_covariance
+from teamslam.team.wire.arrays import ids
 
 Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 Text = Annotated[str, Meta(max_length=20_000)]

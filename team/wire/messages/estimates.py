@@ -5,9 +5,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.core import check_finite, check_pose_covariance
-from team.wire.arrays import Floats, Ids, floats
-from team.wire.messages.base import Count, Digest, Message, Name, Text, check_landmarks
+from teamslam.team.core import check_finite, check_pose_covariance
+from teamslam.team.wire.arrays import Floats, Ids, floats
+from teamslam.team.wire.messages.base import Count, Digest, Message, Name, Text, check_landmarks
 
 
 class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):

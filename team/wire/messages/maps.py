@@ -6,9 +6,14 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.core import check_ascending, check_finite, check_packed_covariance, check_pose_covariance
-from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
-from team.wire.messages.base import (
+from teamslam.team.core import (
+    check_ascending,
+    check_finite,
+    check_packed_covariance,
+    check_pose_covariance,
+)
+from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
+from teamslam.team.wire.messages.base import (
     Bias,
     Count,
     Digest,
@@ -19,7 +24,7 @@ from team.wire.messages.base import (
     Text,
     check_landmarks,
 )
-from team.wire.messages.orders import Judgement
+from teamslam.team.wire.messages.orders import Judgement
 
 
 class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from team.core import (
+from teamslam.team.core import (
     check_angles,
     check_blocks,
     check_finite,
@@ -14,8 +14,8 @@ from team.core import (
     check_pose_covariance,
     check_ranges,
 )
-from team.wire.arrays import Floats, Ids, check_semidefinite, floats, ids
-from team.wire.messages.base import Count, Message, Name, Real, Text
+from teamslam.team.wire.arrays import Floats, Ids, check_semidefinite, floats, ids
+from teamslam.team.wire.messages.base import Count, Message, Name, Real, Text
 
 
 class Measurement(Message, frozen=True, kw_only=True):

@@ -4,7 +4,16 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from team.wire.messages.base import Count, Digest, Document, Message, Name, Real, StampNs, Text
+from teamslam.team.wire.messages.base import (
+    Count,
+    Digest,
+    Document,
+    Message,
+    Name,
+    Real,
+    StampNs,
+    Text,
+)
 
 
 class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.wire.messages.base import Count, Message, Name, Text
+from teamslam.team.wire.messages.base import Count, Message, Name, Text
 
 
 class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):

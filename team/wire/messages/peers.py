@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from team.wire.messages.base import Count, Digest, Message, Name, StampNs, Text
+from teamslam.team.wire.messages.base import Count, Digest, Message, Name, StampNs, Text
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):

@@ -3,10 +3,19 @@
 import math
 from itertools import pairwise
 
-from team.config import UNNAMED
-from team.core import check_ascending, check_finite, check_packed_covariance
-from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
-from team.wire.messages.base import Bias, Count, Digest, Message, Name, Real, StampNs, check_counts
+from teamslam.team.config import UNNAMED
+from teamslam.team.core import check_ascending, check_finite, check_packed_covariance
+from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
+from teamslam.team.wire.messages.base import (
+    Bias,
+    Count,
+    Digest,
+    Message,
+    Name,
+    Real,
+    StampNs,
+    check_counts,
+)
 
 
 class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):

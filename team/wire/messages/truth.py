@@ -1,8 +1,8 @@
 """Truth for the evaluation, the known map of localisation, the plan of a simulated radio."""
 
-from team.core import check_ascending, check_finite, check_named
-from team.wire.arrays import Floats, Ids, Stamps, ids, stamps
-from team.wire.messages.base import Message, Name, StampNs, check_counts
+from teamslam.team.core import check_ascending, check_finite, check_named
+from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
+from teamslam.team.wire.messages.base import Message, Name, StampNs, check_counts
 
 
 class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):

@@ -8,8 +8,8 @@ publishers' caches and heartbeats, `…/@adv/pub/*/*/*`.
 from collections.abc import Sequence
 from typing import Any
 
-from team.keys.roster import REPLAY, Roster
-from team.wire.channels import (
+from teamslam.team.keys.roster import REPLAY, Roster
+from teamslam.team.wire.channels import (
     CHANNELS,
     TRUTH,
     TRUTH_LABELS,
@@ -17,7 +17,7 @@ from team.wire.channels import (
     TRUTH_POSITIONS,
     Channel,
 )
-from team.wire.zenoh.session import DOOR
+from teamslam.team.wire.zenoh.session import DOOR
 
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")

@@ -7,7 +7,7 @@ As long as it lives, a receiver can detect every gap: `docs/decisions/07-deliver
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-from team.wire.intervals import IntervalSet
+from teamslam.team.wire.intervals import IntervalSet
 
 PATIENCE_S = 0.5
 """Age [s] at which a gap is requested."""

@@ -1,7 +1,8 @@
 """The bus over Zenoh: publish, subscribe, query and answer for one process of the team.
 
-Each payload has an attachment (`team.wire.zenoh.attachment`). `team.wire.zenoh.delivery` implements
-a channel's delivery; `team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
+Each payload has an attachment (`teamslam.team.wire.zenoh.attachment`).
+`teamslam.team.wire.zenoh.delivery` implements a channel's delivery;
+`teamslam.team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
 
 Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue:
 there is no further thread, the order of arrival is preserved across subscriptions, and a slow node
@@ -20,20 +21,20 @@ from typing import TYPE_CHECKING, Self
 import zenoh
 from zenoh.handlers import Callback
 
-from team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
-from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
-from team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
-from team.wire.logs import LOG
-from team.wire.messages import Liveliness, Message, Tally
-from team.wire.text import cut
-from team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
-from team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
-from team.wire.zenoh.queries import Queries, Question, Reply
-from team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
-from team.wire.zenoh.session import RouterLink, client
+from teamslam.team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
+from teamslam.team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
+from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
+from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.messages import Liveliness, Message, Tally
+from teamslam.team.wire.text import cut
+from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
+from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
+from teamslam.team.wire.zenoh.queries import Queries, Question, Reply
+from teamslam.team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
+from teamslam.team.wire.zenoh.session import RouterLink, client
 
 if TYPE_CHECKING:  # not needed without keys
-    from team.keys.credentials import Credentials
+    from teamslam.team.keys.credentials import Credentials
 
 _ALIVE_TIMEOUT_S = 5.0
 _FLUSH = "router/flush"

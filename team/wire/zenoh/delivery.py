@@ -1,7 +1,7 @@
 """Implement the deliveries of the table of channels by Zenoh's means.
 
 All publishers block while their link to the router is busy; the router drops samples to a slow
-receiver (`team.wire.zenoh.router`).
+receiver (`teamslam.team.wire.zenoh.router`).
 
 stream: a plain publisher; samples of a cut, and dropped ones, are lost.
 latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
@@ -15,8 +15,8 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from team.wire.bus import WHOLE_CACHE, cache_size
-from team.wire.channels import Channel, row_of
+from teamslam.team.wire.bus import WHOLE_CACHE, cache_size
+from teamslam.team.wire.channels import Channel, row_of
 
 _HEARTBEAT_S = 0.25
 _BLOCK = zenoh.CongestionControl.BLOCK

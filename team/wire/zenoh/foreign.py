@@ -10,7 +10,7 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import FifoChannel
 
-from team.wire.bus import BusError
+from teamslam.team.wire.bus import BusError
 
 TOKENS_S = 5.0
 """Timeout [s] for the list of tokens that are present."""

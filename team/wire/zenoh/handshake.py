@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from team.keys.credentials import Credentials
+    from teamslam.team.keys.credentials import Credentials
 
 TIMEOUT_S = 1.0
 """Timeout [s] of each step of a handshake."""

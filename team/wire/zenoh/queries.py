@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import zenoh
 from zenoh.handlers import Callback
 
-from team.wire.bus import Answer, BusError, Sample, replied
-from team.wire.channels import Channel
-from team.wire.codec import WireError, encoded
-from team.wire.messages import Message
+from teamslam.team.wire.bus import Answer, BusError, Sample, replied
+from teamslam.team.wire.channels import Channel
+from teamslam.team.wire.codec import WireError, encoded
+from teamslam.team.wire.messages import Message
 
 _ANSWER_S = 10.0
 _LOG = logging.getLogger("teamslam")

@@ -1,8 +1,8 @@
 """Request missing publications from their publisher's cache.
 
 Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
-publisher are therefore counted (`team.wire.zenoh.arrivals`) and compared with its heartbeats, and
-gaps older than half a second are requested.
+publisher are therefore counted (`teamslam.team.wire.zenoh.arrivals`) and compared with its
+heartbeats, and gaps older than half a second are requested.
 
 Keys, publishers and numbers come from the wire, so the publishers tracked per node and in all are
 bounded; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import zenoh
 from zenoh.handlers import Callback
 
-from team.wire.bus import Sample
-from team.wire.channels import row_of
-from team.wire.logs import LOG
-from team.wire.zenoh.arrivals import Arrivals
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import row_of
+from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.zenoh.arrivals import Arrivals
 
 ADVANCED = "/@adv/pub/"
 """Part of the keys of advanced publishers' heartbeats."""

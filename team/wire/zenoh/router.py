@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 import zenoh
 from zenoh.handlers import Callback
 
-from team.keys.roster import Roster
-from team.wire.bus import BusError, Sample
-from team.wire.channels import ALIVE, KEPT, REPLIES, TALLY
-from team.wire.codec import WireError, decoded
-from team.wire.logs import LOG
-from team.wire.messages import KeptRequest
-from team.wire.zenoh.access import access_control
-from team.wire.zenoh.attachment import AttachmentError, unpack
-from team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
-from team.wire.zenoh.stored import StoredMessages
+from teamslam.team.keys.roster import Roster
+from teamslam.team.wire.bus import BusError, Sample
+from teamslam.team.wire.channels import ALIVE, KEPT, REPLIES, TALLY
+from teamslam.team.wire.codec import WireError, decoded
+from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.messages import KeptRequest
+from teamslam.team.wire.zenoh.access import access_control
+from teamslam.team.wire.zenoh.attachment import AttachmentError, unpack
+from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
+from teamslam.team.wire.zenoh.stored import StoredMessages
 
 if TYPE_CHECKING:  # not needed without keys
-    from team.keys.credentials import Credentials
+    from teamslam.team.keys.credentials import Credentials
 
 REFUSALS = "error,zenoh_link_tls=warn"
 """Zenoh's log filter with keys: refused connections, with reasons."""

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import zenoh
 from zenoh.handlers import Callback
 
-from team.wire.bus import BusError
-from team.wire.codec import LARGEST_PAYLOAD
-from team.wire.logs import LOG
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.codec import LARGEST_PAYLOAD
+from teamslam.team.wire.logs import LOG
 
 if TYPE_CHECKING:  # not needed without keys
-    from team.keys.credentials import Credentials
+    from teamslam.team.keys.credentials import Credentials
 
 _LEASE_MS = 5_000  # silence after which a link counts as cut; detects a stopped process
 _BLOCK_US = 10_000_000  # time that a full queue may block a publisher before its link is closed
@@ -84,7 +84,7 @@ def client(
         try:
             return opened(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
         except zenoh.ZError as error:
-            from team.wire.zenoh.handshake import examine  # ssl: only here
+            from teamslam.team.wire.zenoh.handshake import examine  # ssl: only here
 
             found = examine(connect, keys)
             if found.refused is not None:
@@ -122,9 +122,9 @@ class RouterLink:
 
     Silence never ends a process: a router that is gone, stopped or behind a bad radio link is
     waited for without limit. Only evidence raises `BusError`: the result of a handshake
-    (`team.wire.zenoh.handshake`), or the router's statement that its roster lacks our certificate.
-    Zenoh connects a revoked certificate, too, and drops its messages silently; so each new link is
-    followed by that query.
+    (`teamslam.team.wire.zenoh.handshake`), or the router's statement that its roster lacks our
+    certificate. Zenoh connects a revoked certificate, too, and drops its messages silently; so each
+    new link is followed by that query.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:
@@ -195,7 +195,7 @@ class RouterLink:
         self._interval_s = min(2.0 * self._interval_s, LONGEST_S)
 
         def run() -> None:
-            from team.wire.zenoh.handshake import examine  # ssl: only here
+            from teamslam.team.wire.zenoh.handshake import examine  # ssl: only here
 
             found = examine(self._connect, self._keys, ANSWER_S)
             self._router_ends = found.router_ends or self._router_ends

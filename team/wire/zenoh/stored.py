@@ -15,10 +15,10 @@ a live team) are valid until the centre's final map, or until no process of the 
 import threading
 from dataclasses import dataclass, field
 
-from team.wire.bus import Sample, opened
-from team.wire.channels import ENDS, FINAL_MAP, ORDERS
-from team.wire.codec import WireError, decoded, encoded
-from team.wire.messages import FusedMap, Kept, KeptRequest
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.channels import ENDS, FINAL_MAP, ORDERS
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.messages import FusedMap, Kept, KeptRequest
 
 MOST_ORDERS = 10_000
 """Most stored orders to a team, signatures included; others must be repeated."""

@@ -5,17 +5,17 @@ import hashlib
 import msgspec
 import pytest
 
-from central.desk.agreement import Agreement
-from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.peers_as_centre import PeersAsCentre
-from central.team_config import TeamConfig
-from sim.launch.watch import Watch
-from team.config import RobotConfig
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.central.desk.agreement import Agreement
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.central.team_config import TeamConfig
+from teamslam.sim.launch.watch import Watch
+from teamslam.team.config import RobotConfig
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.support import examples
 

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from central.desk.evaluation.association import association_json, association_result
-from central.desk.evaluation.gps import distances
-from central.desk.evaluation.log import collect_log
-from team.config import UNNAMED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import encoded
+from teamslam.central.desk.evaluation.association import association_json, association_result
+from teamslam.central.desk.evaluation.gps import distances
+from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 
 NONE = m.NO_LABEL

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.evaluation.clocks import (
+from teamslam.central.desk.evaluation.clocks import (
     BEYOND_DOUBT,
     Timed,
     lateness,
     separate_times_warning,
 )
-from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.evaluation.log import collect_log
-from central.desk.report.tables import team_rows
-from sim.cli.launch import _time_warnings
-from sim.cli.main import app
-from sim.publisher.node import WorldNode
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
-from team.config import RobotConfig, Sensor
-from team.wire.bus import Sample
-from team.wire.digest import configured
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.central.desk.report.tables import team_rows
+from teamslam.sim.cli.launch import _time_warnings
+from teamslam.sim.cli.main import app
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.digest import configured
 from tests.sim.logs import final_map, samples
 from tests.trials.stress_world import StressWorld, write
 

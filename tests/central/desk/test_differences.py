@@ -2,9 +2,9 @@
 
 import msgspec
 
-from central.desk.verification.differences import first_difference
-from team.wire import messages as m
-from team.wire.arrays import from_floats
+from teamslam.central.desk.verification.differences import first_difference
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
 from tests import build
 from tests.support import packed, spd
 

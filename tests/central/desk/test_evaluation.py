@@ -9,27 +9,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.desk.compare import compare_picture, compare_rows
-from central.desk.evaluation.errors import (
+from teamslam.central.desk.compare import compare_picture, compare_rows
+from teamslam.central.desk.evaluation.errors import (
     Path,
     interpolate_truth,
     map_errors,
     pose_errors,
     transform_points,
 )
-from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.report.tables import robot_sheet, team_rows, title_of
-from central.monitor import TOO_LARGE
-from sim.scenarios.scenario import Scenario
-from sim.world.config import FolderWorld
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.translate import joint_bytes
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Outgoing, Sample
-from team.wire.codec import decoded, encoded
-from team.wire.digest import configured
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.report.tables import robot_sheet, team_rows, title_of
+from teamslam.central.monitor import TOO_LARGE
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.world.config import FolderWorld
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.translate import joint_bytes
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.sim.logs import (
     final_map,

@@ -2,11 +2,11 @@
 
 import msgspec
 
-from central.desk.evaluation.events import MOST, EventDetector, without_decimals
-from central.desk.evaluation.history import history
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Outgoing
+from teamslam.central.desk.evaluation.events import MOST, EventDetector, without_decimals
+from teamslam.central.desk.evaluation.history import history
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing
 from tests import build
 from tests.sim.logs import samples
 from tests.support import fused_map

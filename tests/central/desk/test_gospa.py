@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from central.desk.evaluation.matching import gospa, half_spacing
+from teamslam.central.desk.evaluation.matching import gospa, half_spacing
 
 TRUE = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
 

@@ -4,13 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.history import History, history
-from sim.in_memory.team import run_team
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Outgoing, Sample, opened
+from teamslam.central.desk.evaluation.history import History, history
+from teamslam.sim.in_memory.team import run_team
+from teamslam.team import translate
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Outgoing, Sample, opened
 from tests import build
 from tests.sim.logs import final_map, joined_log, samples, scenario, streams
 from tests.support import fused_map, submap

@@ -1,13 +1,13 @@
 import msgspec
 import numpy as np
 
-from central.desk.evaluation.association import AssociationResult, Pairs
-from central.desk.evaluation.errors import map_errors
-from central.desk.evaluation.events import EventDetector
-from central.desk.report.identities import decision_sheet, score_sheet
-from central.desk.report.tables import in_words
-from central.desk.view.landmark_sets import sets_of
-from team.wire import messages as m
+from teamslam.central.desk.evaluation.association import AssociationResult, Pairs
+from teamslam.central.desk.evaluation.errors import map_errors
+from teamslam.central.desk.evaluation.events import EventDetector
+from teamslam.central.desk.report.identities import decision_sheet, score_sheet
+from teamslam.central.desk.report.tables import in_words
+from teamslam.central.desk.view.landmark_sets import sets_of
+from teamslam.team.wire import messages as m
 from tests.support import examples
 
 FUSED = next(each for each in examples() if isinstance(each, m.FusedMap))

@@ -6,12 +6,12 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.ledger import Ledger, ledger
-from central.desk.verification.recorded import recorded
-from sim.cli.rerun import app
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
+from teamslam.central.desk.ledger import Ledger, ledger
+from teamslam.central.desk.verification.recorded import recorded
+from teamslam.sim.cli.rerun import app
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 from tests.sim.recorded.test_rerun import restless
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
 

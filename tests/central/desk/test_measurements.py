@@ -5,12 +5,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.desk.verification.measurements import RecordedMeasurements
-from central.desk.verification.recorded import Recorded
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.desk.verification.measurements import RecordedMeasurements
+from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 
 numbers = st.integers(0, 12)

@@ -7,18 +7,18 @@ import msgspec
 import pytest
 from typer.testing import CliRunner, Result
 
-from central.config import CentralConfig
-from central.desk import orders
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.evaluation.verdicts import contradicting
-from central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
-from central.desk.report.tables import team_rows
-from central.node import CentralNode
-from sim.cli.main import app
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk import orders
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.verdicts import contradicting
+from teamslam.central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
+from teamslam.central.desk.report.tables import team_rows
+from teamslam.central.node import CentralNode
+from teamslam.sim.cli.main import app
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
+from teamslam.team.wire.codec import encoded
 from tests.support import examples, fused_map, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
@@ -170,7 +170,9 @@ def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgeme
 
     thread = threading.Thread(target=centre, daemon=True)
     thread.start()
-    monkeypatch.setattr("sim.cli.orders.connect_bus", lambda *_: nullcontext(MemoryBus(network)))
+    monkeypatch.setattr(
+        "teamslam.sim.cli.orders.connect_bus", lambda *_: nullcontext(MemoryBus(network))
+    )
     try:
         return CliRunner().invoke(app, ["verdict", *words, "--team", "t"])
     finally:

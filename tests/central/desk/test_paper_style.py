@@ -7,8 +7,8 @@ import pytest
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from central.desk.pictures.run import new_figure
-from central.desk.pictures.style import (
+from teamslam.central.desk.pictures.run import new_figure
+from teamslam.central.desk.pictures.style import (
     PAPER_DPI,
     PAPER_PT,
     Form,

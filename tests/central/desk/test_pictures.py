@@ -12,26 +12,26 @@ from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
 
-from central.desk.compare import compare_rows
-from central.desk.drawing import (
+from teamslam.central.desk.compare import compare_rows
+from teamslam.central.desk.drawing import (
     ELLIPSE_SCALE,
     curve_through,
     ellipses,
 )
-from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
-from central.desk.evaluation.history import history
-from central.desk.pictures import film
-from central.desk.pictures.run import (
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from teamslam.central.desk.evaluation.history import history
+from teamslam.central.desk.pictures import film
+from teamslam.central.desk.pictures.run import (
     error_picture,
     map_picture,
 )
-from central.desk.pictures.style import Form, Look, Picture, Style
-from central.desk.report.page import write_pictures
-from central.desk.report.run import Run
-from central.desk.report.tables import summary_tables, team_rows
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.codec import decoded
+from teamslam.central.desk.pictures.style import Form, Look, Picture, Style
+from teamslam.central.desk.report.page import write_pictures
+from teamslam.central.desk.report.run import Run
+from teamslam.central.desk.report.tables import summary_tables, team_rows
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded
 from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -102,7 +102,9 @@ def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
 ) -> None:
     """The path of a robot that had never joined began at the origin of the others' map."""
     drawn: list[Figure] = []
-    monkeypatch.setattr("central.desk.pictures.run.save", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(
+        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
+    )
     path = run.robots["r2"].smoothed_path
     nowhere = replace(path, stamps_ns=path.stamps_ns[:0], poses=path.poses[:0])
     alone = replace(run.robots["r2"], smoothed_path=nowhere)
@@ -135,7 +137,9 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr("central.desk.pictures.run.save", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(
+        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
+    )
     assert run.map is not None
     small = replace(run, map=replace(run.map, covariance=1e-8 * np.eye(len(run.map.covariance))))
     assert map_picture(small, tmp_path / "map.png")

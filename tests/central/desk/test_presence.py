@@ -2,8 +2,8 @@
 
 import pytest
 
-from central.desk.presence import Presence
-from team.wire import messages as m
+from teamslam.central.desk.presence import Presence
+from teamslam.team.wire import messages as m
 from tests import build
 
 S = 10**9

@@ -9,17 +9,17 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.evaluation.evaluation import evaluate, to_json
-from central.desk.evaluation.history import history
-from central.desk.ledger import Entry, Ledger
-from central.desk.report import page as report_page
-from central.desk.report.page import write_report
-from central.desk.report.run import Run, run_figures
-from sim.cli.main import app
-from sim.in_memory.team import run_team
-from team.recording.recorder import Recorder
-from team.wire import channels as ch
-from team.wire.bus import Sample
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.history import history
+from teamslam.central.desk.ledger import Entry, Ledger
+from teamslam.central.desk.report import page as report_page
+from teamslam.central.desk.report.page import write_report
+from teamslam.central.desk.report.run import Run, run_figures
+from teamslam.sim.cli.main import app
+from teamslam.sim.in_memory.team import run_team
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Sample
 from tests.sim.logs import joined_log, scenario, streams, world_log
 
 PICTURES = ["map", "errors", "consistency"]

@@ -9,21 +9,21 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
-from central.desk.evaluation.history import history
-from central.desk.report.page import write_report
-from central.desk.report.run import Run
-from central.desk.report.tables import summary_tables, team_rows
-from sim.cli.rerun import app
-from sim.in_memory.team import final_map, run_team
-from sim.world.simulator import simulated
-from sim.world.streams import WorldStreams
-from team.containment import Boundary
-from team.shell import FaultyRunError, judge
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
-from team.wire.codec import decoded, encoded
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from teamslam.central.desk.evaluation.history import history
+from teamslam.central.desk.report.page import write_report
+from teamslam.central.desk.report.run import Run
+from teamslam.central.desk.report.tables import summary_tables, team_rows
+from teamslam.sim.cli.rerun import app
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.containment import Boundary
+from teamslam.team.shell import FaultyRunError, judge
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import decoded, encoded
 from tests.central.test_withdrawal import run, scenario
 from tests.sim.reruns import written
 

@@ -8,25 +8,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import Path as Poses
-from central.desk.evaluation.errors import pose_errors
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.export.take_home import (
+from teamslam.central.desk.evaluation.errors import Path as Poses
+from teamslam.central.desk.evaluation.errors import pose_errors
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,
     measurement_counts,
     take_home,
     write_map,
     write_paths,
 )
-from central.desk.paths import smoothed_paths
-from central.desk.verification.recorded import Recorded
-from sim.in_memory.team import run_team
-from team.config import UNNAMED
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.desk.paths import smoothed_paths
+from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.sim.in_memory.team import run_team
+from teamslam.team.config import UNNAMED
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests.sim.logs import scenario, streams
 from tests.support import fused_map, submap
 

@@ -13,11 +13,11 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import Path
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.evaluation.trajectories import trajectory_errors
-from central.desk.export.tum import write_trajectories, write_tum
-from sim.in_memory.team import run_team
+from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.trajectories import trajectory_errors
+from teamslam.central.desk.export.tum import write_trajectories, write_tum
+from teamslam.sim.in_memory.team import run_team
 from tests.sim.logs import scenario, streams
 from tests.support import ROOT
 

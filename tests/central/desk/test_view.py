@@ -11,25 +11,31 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from central.desk.evaluation.errors import map_errors
-from central.desk.evaluation.running import RunningErrors, TrueLandmarks
-from central.desk.view.drawn import PATH_POINTS, Track, centre_particles, landmarks_of, place_points
-from central.desk.view.export import export_views, with_views
-from central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team import translate
-from team.recording.check import check_log
-from team.recording.reader import open_log
-from team.recording.recorder import Recorder
-from team.robot.node import RobotNode
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire import views
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import Sample
-from team.wire.codec import decoded
+from teamslam.central.desk.evaluation.errors import map_errors
+from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks
+from teamslam.central.desk.view.drawn import (
+    PATH_POINTS,
+    Track,
+    centre_particles,
+    landmarks_of,
+    place_points,
+)
+from teamslam.central.desk.view.export import export_views, with_views
+from teamslam.central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team import translate
+from teamslam.team.recording.check import check_log
+from teamslam.team.recording.reader import open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire import views
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import decoded
 from tests import build
 from tests.support import fused_map, spd
 

@@ -17,19 +17,19 @@ from mcap.reader import make_reader
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from central.desk.view.export import with_views
-from central.desk.view.foxglove_proxy import VIEWERS, refusal
-from central.desk.view.layout import layout
-from central.desk.view.page_frames import PageFrames
-from central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
-from team.recording.reader import LogError
-from team.recording.recorder import Recorder
-from team.recording.tail import Tail
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.desk.view.export import with_views
+from teamslam.central.desk.view.foxglove_proxy import VIEWERS, refusal
+from teamslam.central.desk.view.layout import layout
+from teamslam.central.desk.view.page_frames import PageFrames
+from teamslam.central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
+from teamslam.team.recording.reader import LogError
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.tail import Tail
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.crowd import crowd
 from tests.support import ROOT, wait_until

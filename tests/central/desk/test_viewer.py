@@ -5,13 +5,13 @@ import threading
 import msgspec
 import pytest
 
-from central.desk.view.viewer import run_viewer
-from team import the_end
-from team.shell import FaultyRunError
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
-from team.wire.codec import encoded
+from teamslam.central.desk.view.viewer import run_viewer
+from teamslam.team import the_end
+from teamslam.team.shell import FaultyRunError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import examples
 

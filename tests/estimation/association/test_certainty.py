@@ -6,10 +6,10 @@ from itertools import product
 import numpy as np
 import pytest
 
-from team.config import AssociationSettings
-from team.estimation.association.certainty import estimate_view, marginals
-from team.estimation.association.clustering import associate_window
-from team.estimation.association.scans import UNASSIGNED
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.certainty import estimate_view, marginals
+from teamslam.team.estimation.association.clustering import associate_window
+from teamslam.team.estimation.association.scans import UNASSIGNED
 from tests.estimation.association.test_clustering import pairs, window
 
 

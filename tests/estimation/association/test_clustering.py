@@ -6,16 +6,16 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from team.config import AssociationSettings
-from team.estimation.association.clustering import WindowAssociation, associate_window
-from team.estimation.association.scans import (
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.clustering import WindowAssociation, associate_window
+from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
     points_of,
     relative_to,
     rotations,
 )
-from team.estimation.association.smoothing import smooth_window
+from teamslam.team.estimation.association.smoothing import smooth_window
 
 SETTINGS = AssociationSettings()
 MOTION_NOISE = np.diag([0.02, 0.01, 0.01]) ** 2

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from team.association import AssociationProfile
-from team.config import UNNAMED
-from team.estimation.association.density import LandmarkDensity
-from team.estimation.association.gating import Joint, evaluate_pairs
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.gating import Joint, evaluate_pairs
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 PROFILE = AssociationProfile(slack=0.0, density=1.0)
 

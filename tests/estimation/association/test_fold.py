@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from central.join_messages import Shown, reasons
-from team.association import AssociationProfile
-from team.estimation.association.landmark_sets import (
+from teamslam.central.join_messages import Shown, reasons
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation.association.landmark_sets import (
     OPEN,
     Landmarks,
     Opened,
     Verdict,
 )
-from team.estimation.association.member_log import LocalLandmark
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.auditing import fold_tick, share_now
-from team.estimation.map_joining.joining import (
+from teamslam.team.estimation.association.member_log import LocalLandmark
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.auditing import fold_tick, share_now
+from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
     Fold,

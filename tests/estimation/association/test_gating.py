@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from team.association import AssociationProfile
-from team.config import AssociationSettings
-from team.estimation.association.gating import (
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.gating import (
     Joint,
     compute_mahalanobis,
     evaluate_pairs,
     match_best_first,
     match_scan,
 )
-from team.estimation.association.scans import UNASSIGNED
+from teamslam.team.estimation.association.scans import UNASSIGNED
 
 
 def test_distances_and_determinants_are_those_of_the_matrix_inverse():

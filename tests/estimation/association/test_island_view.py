@@ -4,21 +4,26 @@ import numpy as np
 import pytest
 from jaxtyping import Bool, Float
 
-from team.association import AssociationProfile
-from team.config import UNNAMED
-from team.estimation.association.gating import Joint, list_pairs
-from team.estimation.association.island_view import (
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.gating import Joint, list_pairs
+from teamslam.team.estimation.association.island_view import (
     REEXAMINED,
     IslandView,
     find_undecided,
     select_by_turns,
     select_comparisons,
 )
-from team.estimation.association.joint_compatibility import assign_jointly
-from team.estimation.map_joining.auditing import fold_tick
-from team.estimation.map_joining.fold_association import view_island
-from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, JoinSettings, Tick
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.estimation.association.joint_compatibility import assign_jointly
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.fold_association import view_island
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    Contribution,
+    JoinSettings,
+    Tick,
+)
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 OWN = 0.01
 PROFILE = AssociationProfile(slack=0.0, density=1.0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from team.association import AssociationProfile
-from team.estimation.association.gating import SPLIT, Joint, evaluate_pairs
-from team.estimation.association.joint_compatibility import (
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation.association.gating import SPLIT, Joint, evaluate_pairs
+from teamslam.team.estimation.association.joint_compatibility import (
     assign_jointly,
     condition_on_pair,
     grow_pairs,

@@ -2,14 +2,14 @@ from itertools import permutations
 
 import numpy as np
 
-from team.config import UNNAMED
-from team.estimation.association.landmark_sets import (
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     add_landmarks,
     merge_sets,
     number_of,
 )
-from team.estimation.association.member_log import LocalLandmark, MergeRecord
+from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from tests.estimation.association.unnamed_worlds import circle, drive
 
 WORLD = np.array([[8.0, 1.0], [9.0, -2.0], [7.0, 3.0]])

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from team.estimation.association.visibility import mark_visible, pad_views, renumber_views
-from team.estimation.submap import Unnamed
+from teamslam.team.estimation.association.visibility import mark_visible, pad_views, renumber_views
+from teamslam.team.estimation.submap import Unnamed
 
 
 def test_a_point_in_the_polygon_that_one_keyframe_saw_is_covered_and_one_outside_is_not() -> None:

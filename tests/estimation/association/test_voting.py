@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from team.estimation.association import voting
-from team.estimation.association.voting import PointSet, apply_motion, propose_alignments
+from teamslam.team.estimation.association import voting
+from teamslam.team.estimation.association.voting import PointSet, apply_motion, propose_alignments
 
 
 def _points(mean: np.ndarray) -> PointSet:

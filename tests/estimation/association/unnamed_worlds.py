@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from team.config import UNNAMED
-from team.estimation.association.landmark_sets import Landmarks
-from team.estimation.association.member_log import LocalLandmark
-from team.estimation.contribution import Contribution
-from team.estimation.se2 import between, inverse, transformed
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.landmark_sets import Landmarks
+from teamslam.team.estimation.association.member_log import LocalLandmark
+from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.se2 import between, inverse, transformed
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 POSE_SD = (0.03, 0.03, 0.004)
 LANDMARK_SD = 0.03

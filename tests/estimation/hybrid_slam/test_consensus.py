@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from sim.world.streams import WorldStreams
-from team import core
-from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.hybrid_slam.fastslam import noise_of
-from team.estimation.models import Increment, increment_of, predicted
-from team.estimation.scans import point_scan, polar_scan, unclaimed
-from team.estimation.se2 import compose
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team import core
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
+from teamslam.team.estimation.models import Increment, increment_of, predicted
+from teamslam.team.estimation.scans import point_scan, polar_scan, unclaimed
+from teamslam.team.estimation.se2 import compose
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from team import core
-from team.core import landmarks_along_paths
-from team.estimation.hybrid_slam.fastslam import Noise
-from team.estimation.models import predicted
-from team.estimation.scans import unclaimed
+from teamslam.team import core
+from teamslam.team.core import landmarks_along_paths
+from teamslam.team.estimation.hybrid_slam.fastslam import Noise
+from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.scans import unclaimed
 
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
 LANDMARK = np.array([4.0, 2.5])

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sim.calibration.data import interval_of, scan_of
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.streams import OBSERVATIONS, ODOMETRY
-from team.estimation.hybrid_slam import open_window
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.se2 import between
+from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY
+from teamslam.team.estimation.hybrid_slam import open_window
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.se2 import between
 
 SEQUENCE = 21
 """Of r1 of `thesis`, seed 1015: odometry off by three sigma beside landmarks that are close."""

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from team import core
-from team.config import MotionModel, MotionNoise, Sensor
-from team.core import moments, semidefinite_factor
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.models import Increment, increment_of
-from team.estimation.scans import unclaimed
+from teamslam.team import core
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.core import moments, semidefinite_factor
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.scans import unclaimed
 
 quick = settings(deadline=None, max_examples=60)
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.001, bearing_sigma=0.002)

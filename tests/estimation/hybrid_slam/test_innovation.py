@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from team.config import Sensor
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
-from team.estimation.models import Increment, predicted
-from team.estimation.se2 import compose, exponential, transformed
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from teamslam.team.estimation.models import Increment, predicted
+from teamslam.team.estimation.se2 import compose, exponential, transformed
 from tests.estimation.hybrid_slam.test_window import ACCURATE, drive, driven, wrap
 
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.03)

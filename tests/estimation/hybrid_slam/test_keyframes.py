@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team import core
-from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation import se2
-from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.models import Increment, increment_of, located, model_of
-from team.estimation.odometry import OdometryInterval
+from teamslam.team import core
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation import se2
+from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
+from teamslam.team.estimation.models import Increment, increment_of, located, model_of
+from teamslam.team.estimation.odometry import OdometryInterval
 
 SECOND = 1_000_000_000
 WHITE = MotionModel(

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from team import core
-from team.estimation.models import predicted
-from team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
+from teamslam.team import core
+from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 
 SENSOR = (0.04, 0.001, 0.003)

@@ -4,15 +4,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from team import core
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.hybrid_slam.fastslam import noise_of
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.models import Increment, increment_of, predicted
-from team.estimation.mount import of_base, of_sensor
-from team.estimation.odometry import OdometryInterval
-from team.estimation.scans import polar_scan
-from team.estimation.se2 import compose
+from teamslam.team import core
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.models import Increment, increment_of, predicted
+from teamslam.team.estimation.mount import of_base, of_sensor
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.scans import polar_scan
+from teamslam.team.estimation.se2 import compose
 
 MOUNT = (3.78, 0.5, -0.6)
 SECOND = 1_000_000_000

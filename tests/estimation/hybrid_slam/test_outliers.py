@@ -8,15 +8,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.evaluation import evaluate
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load
-from sim.scenarios.source import streams_of
-from sim.world.streams import RobotStream
-from team.config import RobotConfig
-from team.robot.node import RobotNode
-from team.wire import messages as m
-from team.wire.arrays import ids
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import RobotStream
+from teamslam.team.config import RobotConfig
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids
 from tests.teams import config, driven, published, stream
 
 

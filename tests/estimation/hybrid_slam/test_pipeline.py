@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team import translate
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.odometry import OdometryInterval
-from team.robot.own_map import InitialPose, OwnMap
-from team.wire import messages as m
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team import translate
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.robot.own_map import InitialPose, OwnMap
+from teamslam.team.wire import messages as m
 from tests import build
 from tests.teams import config, published, stream
 

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation.hybrid_slam.keyframes import Segmenter
-from team.estimation.hybrid_slam.pipeline import HybridSlam
-from team.estimation.hybrid_slam.pose_grid import PoseGrid
-from team.estimation.models import Increment
-from team.estimation.odometry import OdometryInterval
-from team.rejection import Rejection
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.rejection import Rejection
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from team.config import FrontEnd, Sensor
-from team.core import POSE_JITTER
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.models import Increment
+from teamslam.team.config import FrontEnd, Sensor
+from teamslam.team.core import POSE_JITTER
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.models import Increment
 from tests.estimation.submap_world import wrap
 
 STEP = Increment(np.array([0.5, 0.0, 0.2]), np.diag([0.03, 0.01, 0.02]) ** 2)

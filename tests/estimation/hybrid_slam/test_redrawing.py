@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
-from team.estimation.hybrid_slam import open_window
-from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.open_window import OpenWindow
-from team.estimation.hybrid_slam.reduction import KeyframeScan
-from team.estimation.hybrid_slam.window import gaussian
-from team.estimation.models import Increment
-from team.estimation.scans import unclaimed
-from team.estimation.se2 import between, compose, inverse, transformed
-from team.estimation.submap import LocalMap
+from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
+from teamslam.team.estimation.hybrid_slam import open_window
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
+from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
+from teamslam.team.estimation.hybrid_slam.window import gaussian
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import unclaimed
+from teamslam.team.estimation.se2 import between, compose, inverse, transformed
+from teamslam.team.estimation.submap import LocalMap
 
 SECOND = 10**9
 STEPS, REACH = 40, 5.0

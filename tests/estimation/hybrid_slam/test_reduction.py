@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
-from team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
-from team.estimation.odometry import OdometryInterval
-from team.estimation.scans import unclaimed
+from teamslam.team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from teamslam.team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.scans import unclaimed
 
 TICK = 10**8
 LANDMARKS = np.array([[3.0, 0.5], [3.0, -1.5], [5.0, 1.0]])

@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from team import core, translate
-from team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
-from team.estimation import se2
-from team.estimation.consistency import nees
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.hybrid_slam.fastslam import noise_of
-from team.estimation.map_joining import joining, marginals
-from team.estimation.map_joining.joining import JoinSettings, converged, folded, started
-from team.estimation.models import increment_of, model_of
-from team.estimation.randomness import generator
-from team.robot.node import RobotNode
-from team.wire import channels as ch
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.team import core, translate
+from teamslam.team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation import se2
+from teamslam.team.estimation.consistency import nees
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
+from teamslam.team.estimation.map_joining import joining, marginals
+from teamslam.team.estimation.map_joining.joining import JoinSettings, converged, folded, started
+from teamslam.team.estimation.models import increment_of, model_of
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import channels as ch
 from tests.estimation.submap_world import local_truth, team, wrap
 from tests.teams import config, driven, of, published
 

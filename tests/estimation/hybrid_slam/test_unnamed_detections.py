@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from team.config import UNNAMED, AssociationSettings, Sensor
-from team.estimation.hybrid_slam.keyframes import Keyframe
-from team.estimation.hybrid_slam.reduction import KeyframeScan
-from team.estimation.hybrid_slam.unnamed_detections import associate_keyframes
-from team.estimation.models import Increment
-from team.estimation.scans import unclaimed
+from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
+from teamslam.team.estimation.hybrid_slam.unnamed_detections import associate_keyframes
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.scans import unclaimed
 
 SECOND = 10**9
 FORWARD = Increment(np.array([1.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from team.core import POSE_JITTER, moments, on_group, sample_factor
-from team.estimation.consistency import nees, state_error
-from team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from team.estimation.hybrid_slam import window as windows
-from team.estimation.models import Increment, increment_of
-from team.estimation.randomness import generator
-from team.estimation.se2 import compose, exponential
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.core import POSE_JITTER, moments, on_group, sample_factor
+from teamslam.team.estimation.consistency import nees, state_error
+from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.se2 import compose, exponential
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(

@@ -7,11 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.estimation.contribution import InitialPoseFactor, moment
-from team.estimation.map_joining.alignment import SharedPoints, aligned, procrustes, refusal
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import converged
-from team.estimation.map_joining.marginals import landmark_map, trajectory
+from teamslam.team.estimation.contribution import InitialPoseFactor, moment
+from teamslam.team.estimation.map_joining.alignment import (
+    SharedPoints,
+    aligned,
+    procrustes,
+    refusal,
+)
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.marginals import landmark_map, trajectory
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, team, wrap
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.inter_robot import InterRobotFactor
-from team.estimation.map_joining.gauss_newton import (
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     aged,
@@ -15,9 +15,9 @@ from team.estimation.map_joining.gauss_newton import (
     iterated,
     settled,
 )
-from team.estimation.map_joining.merging import ages, sighted
-from team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.map_joining.merging import ages, sighted
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from teamslam.team.estimation.submap import LocalMap
 
 ANNEALED = JoinSettings(robust_c=1.0)
 AT_ONCE = replace(ANNEALED, robust_start=1.0)

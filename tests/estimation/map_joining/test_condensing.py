@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import (
+from teamslam.team.estimation.map_joining import (
     condensing,
     gauss_newton,
     marginals,
     path_elimination,
 )
-from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.gauss_newton import aged, final_cost, take_step
-from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
-from team.estimation.map_joining.minima import degrees_of_freedom
-from team.estimation.map_joining.path_elimination import quadratic
-from team.estimation.map_joining.relinearising import is_due, restore_submaps
+from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
+from teamslam.team.estimation.map_joining.gauss_newton import aged, final_cost, take_step
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
+from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
+from teamslam.team.estimation.map_joining.path_elimination import quadratic
+from teamslam.team.estimation.map_joining.relinearising import is_due, restore_submaps
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import team
 

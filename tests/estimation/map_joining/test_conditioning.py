@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.consistency import nees
-from team.estimation.gaussian import NotACovarianceError, PoseGaussian, curved
-from team.estimation.map_joining import conditioning, whole_map
-from team.estimation.map_joining.conditioning import (
+from teamslam.team.estimation.consistency import nees
+from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian, curved
+from teamslam.team.estimation.map_joining import conditioning, whole_map
+from teamslam.team.estimation.map_joining.conditioning import (
     TRUSTING,
     RobotPrior,
     SubmapCorrection,
     followed,
     pose_now,
 )
-from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
-from team.estimation.map_joining.marginals import prior_for, trajectory
-from team.estimation.map_joining.whole_map import without
-from team.estimation.se2 import compose, exponential, tangent
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
+from teamslam.team.estimation.map_joining.marginals import prior_for, trajectory
+from teamslam.team.estimation.map_joining.whole_map import without
+from teamslam.team.estimation.se2 import compose, exponential, tangent
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import solved, team, wrap
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining.gauss_newton import JoinSettings, take_step
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, take_step
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 

@@ -5,15 +5,21 @@ is what nearly all submaps miss that look there.
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.join_messages import reasons, shown_landmarks
-from team.config import UNNAMED
-from team.estimation.association.landmark_sets import Verdict
-from team.estimation.association.member_log import LocalLandmark
-from team.estimation.map_joining.auditing import fold_tick
-from team.estimation.map_joining.joining import EMPTY_FOLD, Contribution, Fold, JoinSettings, Tick
-from team.estimation.map_joining.memory import MOST
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.central.config import CentralConfig
+from teamslam.central.join_messages import reasons, shown_landmarks
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.landmark_sets import Verdict
+from teamslam.team.estimation.association.member_log import LocalLandmark
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    Contribution,
+    Fold,
+    JoinSettings,
+    Tick,
+)
+from teamslam.team.estimation.map_joining.memory import MOST
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 SD = 0.01
 FALSE = (3.0, 0.5)

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from team import core
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
-from team.estimation.map_joining.joining import (
+from teamslam.team import core
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
+from teamslam.team.estimation.map_joining.joining import (
     GapError,
     LateStartError,
     NotCanonicalError,
@@ -20,7 +20,7 @@ from team.estimation.map_joining.joining import (
     folded,
     started,
 )
-from team.estimation.map_joining.marginals import (
+from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_blocks,
     landmark_map,
@@ -28,7 +28,7 @@ from team.estimation.map_joining.marginals import (
     prior_for,
     trajectory,
 )
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth, team, wrap
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from team.estimation.map_joining.joining import JoinSettings, converged
-from team.estimation.map_joining.marginals import landmark_blocks, landmark_map, prior_for
+from teamslam.team.estimation.map_joining.joining import JoinSettings, converged
+from teamslam.team.estimation.map_joining.marginals import landmark_blocks, landmark_map, prior_for
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 

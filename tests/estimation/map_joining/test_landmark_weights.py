@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.estimation.map_joining.joining import JoinSettings, converged
-from team.estimation.map_joining.marginals import joint_cost, landmark_map
+from teamslam.team.estimation.map_joining.joining import JoinSettings, converged
+from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, solved, team
 

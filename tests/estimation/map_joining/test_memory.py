@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from team.association import AssociationProfile
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.auditing import fold_tick
-from team.estimation.map_joining.condensed_factor import places
-from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
-from team.estimation.map_joining.memory import MOST, Memory, Observed
-from team.estimation.map_joining.relinearising import restore_submaps
-from team.estimation.map_joining.submap_graph import tied
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.condensed_factor import places
+from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
+from teamslam.team.estimation.map_joining.memory import MOST, Memory, Observed
+from teamslam.team.estimation.map_joining.relinearising import restore_submaps
+from teamslam.team.estimation.map_joining.submap_graph import tied
 from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.map_joining import gauss_newton, minima
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.map_joining.minima import (
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.map_joining import gauss_newton, minima
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.minima import (
     Search,
     minimum,
     searched,
@@ -19,8 +19,8 @@ from team.estimation.map_joining.minima import (
     warnings,
     widened,
 )
-from team.estimation.map_joining.relaxation import relaxed
-from team.estimation.submap import LocalMap
+from teamslam.team.estimation.map_joining.relaxation import relaxed
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import team, wrap
 

@@ -3,14 +3,18 @@
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import Path, pose_errors
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.map_joining import nonlinearity
-from team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, solved_with_fixed
-from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.map_joining.minima import minimum, searched, warnings
-from team.estimation.map_joining.nonlinearity import understated_uncertainty
-from team.estimation.submap import LocalMap
+from teamslam.central.desk.evaluation.errors import Path, pose_errors
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.map_joining import nonlinearity
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    JoinSettings,
+    joint_marginal,
+    solved_with_fixed,
+)
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.minima import minimum, searched, warnings
+from teamslam.team.estimation.map_joining.nonlinearity import understated_uncertainty
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import drawn, local_truth
 
 OPTIONS = JoinSettings()

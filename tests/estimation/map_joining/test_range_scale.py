@@ -5,19 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team import core
-from team.association import AssociationProfile
-from team.config import UNNAMED
-from team.estimation.contribution import Contribution, InitialPoseFactor
-from team.estimation.gaussian import packed, unpacked
-from team.estimation.map_joining import marginals
-from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.gauss_newton import settled
-from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, converged, folded, started
-from team.estimation.map_joining.markers import add_markers
-from team.estimation.map_joining.submap_graph import tied
-from team.estimation.se2 import compose, inverse, transformed
-from team.estimation.submap import LocalMap, Unnamed
+from teamslam.team import core
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.gaussian import packed, unpacked
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
+from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    JoinSettings,
+    converged,
+    folded,
+    started,
+)
+from teamslam.team.estimation.map_joining.markers import add_markers
+from teamslam.team.estimation.map_joining.submap_graph import tied
+from teamslam.team.estimation.se2 import compose, inverse, transformed
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth
 

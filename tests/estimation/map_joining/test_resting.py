@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from team.estimation.map_joining import landmark_view, marginals
-from team.estimation.map_joining.condensing import Limits, condense_submaps
-from team.estimation.map_joining.gauss_newton import final_cost
-from team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
-from team.estimation.map_joining.minima import degrees_of_freedom
-from team.estimation.map_joining.relinearising import restore_submaps
+from teamslam.team.estimation.map_joining import landmark_view, marginals
+from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
+from teamslam.team.estimation.map_joining.gauss_newton import final_cost
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
+from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
+from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
 
 ROBUST = JoinSettings(robust_c=2.0)

@@ -7,9 +7,9 @@ of their own.
 
 import numpy as np
 
-from team.config import FrontEnd
-from team.estimation.randomness import generator
-from team.library import (
+from teamslam.team.config import FrontEnd
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.library import (
     InitialPose,
     Keyframe,
     MotionModel,

@@ -7,16 +7,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from team.config import Sensor
-from team.core import linearise_sighting
-from team.estimation.consistency import nees
-from team.estimation.inter_robot import CarriedPoint, carried_back, carried_on, point_seen, reduced
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import converged
-from team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
-from team.estimation.models import Increment
-from team.estimation.se2 import compose, exponential, inverse, transformed
-from team.estimation.submap import LocalMap
+from teamslam.team.config import Sensor
+from teamslam.team.core import linearise_sighting
+from teamslam.team.estimation.consistency import nees
+from teamslam.team.estimation.inter_robot import (
+    CarriedPoint,
+    carried_back,
+    carried_on,
+    point_seen,
+    reduced,
+)
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import compose, exponential, inverse, transformed
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import seen_from, wrap
 

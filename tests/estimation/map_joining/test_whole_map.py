@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from team.core import WholeMap
-from team.estimation.gaussian import NotACovarianceError
-from team.estimation.map_joining.gauss_newton import JoinSettings
-from team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
-from team.estimation.map_joining.marginals import prior_for
-from team.estimation.map_joining.whole_map import (
+from teamslam.team.core import WholeMap
+from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.marginals import prior_for
+from teamslam.team.estimation.map_joining.whole_map import (
     absorbed,
     end_pose,
     initial_map,

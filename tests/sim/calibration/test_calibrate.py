@@ -10,35 +10,35 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.evaluation.errors import Path, on_circle
-from sim.calibration.calibrate import Calibration, calibrate_models
-from sim.calibration.data import Reference, poses_at
-from sim.calibration.figures import (
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.sim.calibration.calibrate import Calibration, calibrate_models
+from teamslam.sim.calibration.data import Reference, poses_at
+from teamslam.sim.calibration.figures import (
     CalibrationError,
     Figure,
     groups_of,
     jackknife,
     with_figures,
 )
-from sim.calibration.join import joined_team
-from sim.calibration.motion import UNITS as MOTION_UNITS
-from sim.calibration.motion import creep, fit_motion
-from sim.calibration.scenario import scenario_toml, within
-from sim.calibration.sensor import UNITS as SENSOR_UNITS
-from sim.calibration.sensor import fit_sensor
-from sim.cli.main import app
-from sim.datasets.utias_writer import write_utias
-from sim.recorded.streams import recorded_streams
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.world.config import SimulatedWorld, UtiasWorld
-from sim.world.streams import (
+from teamslam.sim.calibration.join import joined_team
+from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
+from teamslam.sim.calibration.motion import creep, fit_motion
+from teamslam.sim.calibration.scenario import scenario_toml, within
+from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
+from teamslam.sim.calibration.sensor import fit_sensor
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.recorded.streams import recorded_streams
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
+from teamslam.sim.world.streams import (
     Detections,
     Intervals,
     WorldStreams,
     grouped,
 )
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.wire.bus import opened
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.wire.bus import opened
 from tests.sim.logs import scenario, streams, world_log
 
 SECOND = 1_000_000_000

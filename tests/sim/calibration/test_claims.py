@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import TRUTH_GAP_NS
-from sim.calibration.claims import landmark_factor, mount_note, odometry_factor
-from sim.calibration.data import Reference, references, true_paths
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS
+from teamslam.sim.calibration.claims import landmark_factor, mount_note, odometry_factor
+from teamslam.sim.calibration.data import Reference, references, true_paths
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 MOUNT = (1.2, -0.4, 0.3)
 ROBOTS = [

@@ -7,15 +7,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.calibration import calibrate
-from sim.calibration.calibrate import Calibration, against_truth, calibrate_models
-from sim.calibration.clocks import Clock, clocks_of, on_one_clock
-from sim.calibration.figures import Figure
-from sim.calibration.scenario import scenario_toml, within
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from team.wire.arrays import floats, ids
+from teamslam.sim.calibration import calibrate
+from teamslam.sim.calibration.calibrate import Calibration, against_truth, calibrate_models
+from teamslam.sim.calibration.clocks import Clock, clocks_of, on_one_clock
+from teamslam.sim.calibration.figures import Figure
+from teamslam.sim.calibration.scenario import scenario_toml, within
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire.arrays import floats, ids
 from tests.trials.stress_world import StressWorld, write
 
 OFFSET_S = 0.5

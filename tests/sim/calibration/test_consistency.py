@@ -7,13 +7,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.tick_fold import join_settings
-from sim.calibration.calibrate import Calibration
-from sim.calibration.consistency import covariance_factor, disagreements, landmark_sigma
-from sim.calibration.scenario import scenario_toml
-from sim.scenarios.scenario import load
-from team.estimation.map_joining.joining import (
+from teamslam.central.config import CentralConfig
+from teamslam.central.tick_fold import join_settings
+from teamslam.sim.calibration.calibrate import Calibration
+from teamslam.sim.calibration.consistency import covariance_factor, disagreements, landmark_sigma
+from teamslam.sim.calibration.scenario import scenario_toml
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
     JoinSettings,

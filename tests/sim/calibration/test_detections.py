@@ -6,18 +6,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from sim.calibration.calibrate import Calibration
-from sim.calibration.consistency import factor_by_cost
-from sim.calibration.detections import claim_notes, detection_figures, windows_of
-from sim.calibration.figures import Figure
-from sim.calibration.join import fold_of
-from sim.calibration.scenario import scenario_toml
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.world.streams import NO_LABEL
-from team.association import AssociationProfile
-from team.config import AssociationSettings
+from teamslam.central.config import CentralConfig
+from teamslam.sim.calibration.calibrate import Calibration
+from teamslam.sim.calibration.consistency import factor_by_cost
+from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
+from teamslam.sim.calibration.figures import Figure
+from teamslam.sim.calibration.join import fold_of
+from teamslam.sim.calibration.scenario import scenario_toml
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import NO_LABEL
+from teamslam.team.association import AssociationProfile
+from teamslam.team.config import AssociationSettings
 from tests.estimation.association.unnamed_worlds import circle, drive
 
 REACH_M = 12.0

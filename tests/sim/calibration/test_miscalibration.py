@@ -6,14 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.evaluation import MapResult, evaluate
-from central.monitor import miscalibrations
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, with_options
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.map_joining.marginals import BiasEstimate
+from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.central.monitor import miscalibrations
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, with_options
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 
 SPEED = 0.25
 """[m/s]; the models below were calibrated at up to 0.09."""

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from central.desk.evaluation.errors import Path, on_circle
-from sim.calibration.calibrate import _other_model
-from sim.calibration.data import Reference
-from sim.calibration.own import marker_spread, own_constants
-from sim.calibration.sensor import fit_sensor
-from sim.world.streams import Intervals, grouped
+from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.sim.calibration.calibrate import _other_model
+from teamslam.sim.calibration.data import Reference
+from teamslam.sim.calibration.own import marker_spread, own_constants
+from teamslam.sim.calibration.sensor import fit_sensor
+from teamslam.sim.world.streams import Intervals, grouped
 from tests.sim.calibration.test_calibrate import reference
 
 PLACES = {i: (1.0 + 0.4 * i) * np.array([np.cos(a), np.sin(a)])

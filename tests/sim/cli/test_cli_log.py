@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.cli.options import WRONG_USE
-from sim.datasets.tables import DatasetError
-from sim.datasets.utias_writer import write_utias
-from team.recording.check import NO_FINAL
-from team.recording.reader import LogError, open_log
-from team.recording.recorder import Recorder
-from team.wire.arrays import from_floats
-from team.wire.bus import Sample, opened
-from team.wire.codec import encoded
-from team.wire.messages import Increment
+from teamslam.sim.cli.main import app
+from teamslam.sim.cli.options import WRONG_USE
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.team.recording.check import NO_FINAL
+from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.messages import Increment
 from tests.sim.logs import scenario, streams, world_log
 from tests.support import ROOT
 
@@ -200,7 +200,7 @@ def test_what_a_user_gets_wrong_ends_with_2_and_leaves_nothing(
 def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
     (tmp_path / "hello.mcap").write_bytes(b"hello")
     done = subprocess.run(
-        [sys.executable, "-m", "sim", "log", "check", str(tmp_path / "hello.mcap")],
+        [sys.executable, "-m", "teamslam", "log", "check", str(tmp_path / "hello.mcap")],
         cwd=ROOT, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from team.recording.recorder import Recorder
+from teamslam.sim.cli.main import app
+from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import joined_log, scenario
 
 

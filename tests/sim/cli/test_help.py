@@ -3,8 +3,8 @@
 import typer
 from typer.testing import CliRunner
 
-from sim.cli.help import SECTIONS
-from sim.cli.main import app
+from teamslam.sim.cli.help import SECTIONS
+from teamslam.sim.cli.main import app
 from tests.test_architecture import unknown
 
 RUN = CliRunner()

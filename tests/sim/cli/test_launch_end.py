@@ -10,17 +10,17 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.evaluation.history import history
-from central.desk.report import page
-from central.desk.report.run import Run
-from sim.cli import launch
-from sim.cli.main import app
-from sim.in_memory.team import run_team
-from sim.launch.launch import Outcome
-from sim.scenarios.scenario import dumps
-from team.recording.recorder import Recorder
-from team.wire import channels as ch
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.history import history
+from teamslam.central.desk.report import page
+from teamslam.central.desk.report.run import Run
+from teamslam.sim.cli import launch
+from teamslam.sim.cli.main import app
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.launch.launch import Outcome
+from teamslam.sim.scenarios.scenario import dumps
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as ch
 from tests.sim.logs import scenario, streams
 
 

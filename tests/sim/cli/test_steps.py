@@ -2,8 +2,8 @@
 
 import pytest
 
-from sim.cli import steps
-from sim.cli.steps import Steps
+from teamslam.sim.cli import steps
+from teamslam.sim.cli.steps import Steps
 
 
 def test_short_work_says_nothing_and_long_work_what_it_does_and_how_far_it_is(

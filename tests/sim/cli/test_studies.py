@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.cli.studies import COMMANDS
+from teamslam.sim.cli.studies import COMMANDS
 
 ROOT = Path(__file__).parents[3]
 
@@ -25,7 +25,7 @@ def without_studies(folder: Path) -> Path:
 def teamslam(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         # -S: without the editable install, which would find the studies where they are.
-        [sys.executable, "-S", "-c", "from sim.cli.main import main; main()", *words],
+        [sys.executable, "-S", "-c", "from teamslam.sim.cli.main import main; main()", *words],
         cwd=folder,
         env={"PYTHONPATH": os.pathsep.join([str(folder), *site.getsitepackages()])},
         capture_output=True,
@@ -51,7 +51,7 @@ def test_without_the_studies_their_commands_say_so_and_the_others_run(tmp_path: 
 def test_with_the_studies_their_commands_are_there(name: str) -> None:
     from typer.testing import CliRunner
 
-    from sim.cli.main import app
+    from teamslam.sim.cli.main import app
 
     shown = CliRunner().invoke(app, [name, "--help"])
     assert shown.exit_code == 0

@@ -13,13 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.evaluation import Evaluation, evaluate
-from sim.datasets.utias_writer import write_utias
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, dumps, load, loads, with_options
-from sim.scenarios.source import streams_of, with_present_robots
-from sim.world.config import SimulatedWorld, UtiasWorld
-from sim.world.streams import WorldStreams
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, dumps, load, loads, with_options
+from teamslam.sim.scenarios.source import streams_of, with_present_robots
+from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
+from teamslam.sim.world.streams import WorldStreams
 
 STEPS = 25
 

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.datasets.folder_writer import write_folder
-from sim.datasets.tables import DatasetError
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.scenarios.toml import folder_scenario
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.toml import folder_scenario
 
 
 def written(place: Path, tagged: float) -> tuple:

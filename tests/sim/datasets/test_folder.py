@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.datasets.folder import folder
-from sim.datasets.folder_writer import seconds, write_folder
-from sim.datasets.kinds import kind_of
-from sim.datasets.tables import DatasetError
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import scenario_beside, streams_of, with_present_robots
-from sim.world.config import FolderWorld
-from sim.world.streams import RobotStream, StartPose, WorldStreams, moved
-from team.config import RobotConfig
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.folder import folder
+from teamslam.sim.datasets.folder_writer import seconds, write_folder
+from teamslam.sim.datasets.kinds import kind_of
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.world.config import FolderWorld
+from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
+from teamslam.team.config import RobotConfig
 from tests import teams
 
 HOUR = "1248272272.841"

@@ -5,13 +5,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from central.desk.evaluation.evaluation import evaluate
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
-from sim.studies.experiments.team_runs import Figures, team_figures
-from sim.world.config import UtiasWorld
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
+from teamslam.sim.studies.experiments.team_runs import Figures, team_figures
+from teamslam.sim.world.config import UtiasWorld
 
 SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 

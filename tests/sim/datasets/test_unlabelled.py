@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.calibration.data import scan_of
-from sim.calibration.source import measurements_of
-from sim.cli.launch import _time_warnings
-from sim.cli.main import app
-from sim.datasets.kinds import kind_of
-from sim.datasets.tables import DatasetError
-from sim.datasets.unlabelled import unlabelled
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
-from sim.world.config import UnlabelledWorld
-from sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
-from team.config import UNNAMED
+from teamslam.sim.calibration.data import scan_of
+from teamslam.sim.calibration.source import measurements_of
+from teamslam.sim.cli.launch import _time_warnings
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.kinds import kind_of
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.unlabelled import unlabelled
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.sim.world.config import UnlabelledWorld
+from teamslam.sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
+from teamslam.team.config import UNNAMED
 
 
 def write(folder, **tables):

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sim.calibration.source import measurements_of, own_scenario
-from sim.cli.main import app
-from sim.datasets import errata
-from sim.datasets.tables import DatasetError
-from sim.datasets.utias import utias
-from sim.datasets.utias_rows import start_pose
-from sim.datasets.utias_writer import landmark_shift, write_utias
-from sim.publisher.node import WorldNode
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
-from sim.world.config import UtiasWorld
-from sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
-from team.config import RobotConfig
-from team.wire import messages as m
+from teamslam.sim.calibration.source import measurements_of, own_scenario
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets import errata
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.utias import utias
+from teamslam.sim.datasets.utias_rows import start_pose
+from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias
+from teamslam.sim.publisher.node import WorldNode
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.sim.world.config import UtiasWorld
+from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
+from teamslam.team.config import RobotConfig
+from teamslam.team.wire import messages as m
 from tests import build
 
 REAL = Path(__file__).parents[4] / "shared" / "utias"

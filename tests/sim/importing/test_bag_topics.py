@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.tables import DatasetError
 from tests.ros2 import messages as ros
 from tests.sim.importing.test_import import ODOMETRY, OPTICAL, TAGS, S, read, run
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.datasets.kinds import kind_of
-from sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.kinds import kind_of
+from teamslam.sim.datasets.tables import DatasetError
 from tests.sim.importing.test_import import read, run
 
 TRACK = "t,x,y,yaw\n0,0,0,0\n1,1,0,0\n2,2,0,0\n"

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from sim.cli.importing import readable
-from sim.cli.main import app
-from sim.datasets.csv_table import CsvTable
-from sim.datasets.folder_writer import write_folder
-from sim.datasets.tables import DatasetError
-from sim.datasets.utias_writer import write_utias
-from sim.importing.columns import propose_map
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
-from sim.world.streams import WorldStreams
+from teamslam.sim.cli.importing import readable
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.csv_table import CsvTable
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.importing.columns import propose_map
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.sim.world.streams import WorldStreams
 from tests import teams
 from tests.ros2 import messages as ros
 from tests.sim.datasets.test_folder import same

@@ -11,13 +11,13 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
-from sim.cli import launch
-from sim.cli.main import app
-from sim.importing.columns import load_map
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import scenario_beside, streams_of
-from team.ros2.topics import load_topics
+from teamslam.sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+from teamslam.sim.cli import launch
+from teamslam.sim.cli.main import app
+from teamslam.sim.importing.columns import load_map
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.team.ros2.topics import load_topics
 
 ROOT = Path(__file__).parents[3]
 

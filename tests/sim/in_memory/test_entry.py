@@ -41,10 +41,10 @@ import numpy as np  # as NumPy comes, before any of our packages
 
 numpys = len(os.listdir("/proc/self/task"))
 
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from team.wire import channels as ch
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire import channels as ch
 
 team = load(sys.argv[1])
 samples = list(run_team(team, streams_of(team)))

@@ -4,14 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.in_memory.team import ROUND_S, final_map, run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team import translate
-from team.pairs import PAIRS
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import opened
+from teamslam.sim.in_memory.team import ROUND_S, final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team import translate
+from teamslam.team.pairs import PAIRS
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
 
 
 def thesis(estimator, fusion, seed=1, steps=30):

@@ -3,17 +3,17 @@
 import msgspec
 import pytest
 
-from central.peers.robot import PeerRobot
-from sim.in_memory.air import Air, Meeting, meetings
-from sim.in_memory.peers import PeerTeam, peer_world
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.peers.members import Member, about
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.bus import Sample
-from team.wire.codec import decoded, encoded
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.sim.in_memory.air import Air, Meeting, meetings
+from teamslam.sim.in_memory.peers import PeerTeam, peer_world
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.peers.members import Member, about
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import decoded, encoded
 
 SECOND = 1_000_000_000
 

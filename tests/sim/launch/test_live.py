@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sim.launch import live, progress
-from sim.launch.watch import Watch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from teamslam.sim.launch import live, progress
+from teamslam.sim.launch.watch import Watch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
 from tests import build
 from tests.support import fused_map
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sim.launch.truth import LiveErrors
-from sim.launch.watch import Watch
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from teamslam.sim.launch.truth import LiveErrors
+from teamslam.sim.launch.watch import Watch
+from teamslam.team import translate
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from tests import build
 from tests.sim.logs import samples
 from tests.support import fused_map

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from sim.launch.processes import Process
+from teamslam.sim.launch.processes import Process
 
 BALLAST_BYTES = 200_000_000
 WAITS = "print('ready', flush=True); input()"

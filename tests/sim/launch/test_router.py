@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sim.launch import launch as launching
-from sim.launch.launch import entered
-from sim.launch.processes import Starter
-from sim.launch.supervisor import Supervised, end_all
-from team.wire.bus import BusError
-from team.wire.zenoh.bus import ZenohBus
+from teamslam.sim.launch import launch as launching
+from teamslam.sim.launch.launch import entered
+from teamslam.sim.launch.processes import Starter
+from teamslam.sim.launch.supervisor import Supervised, end_all
+from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.zenoh.bus import ZenohBus
 
 
 def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(

@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from sim.launch.supervision import FEW, Silence, supervise
-from sim.launch.supervisor import Child, Supervised
-from sim.launch.watch import Watch
-from team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
+from teamslam.sim.launch.supervision import FEW, Silence, supervise
+from teamslam.sim.launch.supervisor import Child, Supervised
+from teamslam.sim.launch.watch import Watch
+from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
 
 
 class Quiet(Child):

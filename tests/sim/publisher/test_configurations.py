@@ -3,14 +3,14 @@
 import msgspec
 import pytest
 
-from sim.in_memory.team import run_team
-from sim.publisher.configurations import Configurations, differences
-from sim.publisher.main import expected_configurations
-from sim.publisher.node import WorldNode, expected_nodes
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from team.wire import channels as ch
-from team.wire import messages as m
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.publisher.configurations import Configurations, differences
+from teamslam.sim.publisher.main import expected_configurations
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 from tests import build
 from tests.teams import stream, world_of
 

@@ -7,13 +7,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.publisher import node as world_node
-from sim.publisher.node import WorldNode, expected_nodes
-from team.driver import source
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, stamps
-from team.wire.codec import WireError, decoded, encoded
+from teamslam.sim.publisher import node as world_node
+from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.team.driver import source
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
+from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.support import fused_map
 from tests.teams import of, stream, world_of

@@ -3,14 +3,14 @@
 import msgspec
 import numpy as np
 
-from sim.radio.bus import behind_radio, plan_of, reach_in
-from sim.world.config import Radio, RadioWindow
-from sim.world.radio import reach_of
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats
-from team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
-from team.wire.codec import encoded
+from teamslam.sim.radio.bus import behind_radio, plan_of, reach_in
+from teamslam.sim.world.config import Radio, RadioWindow
+from teamslam.sim.world.radio import reach_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import submap
 from tests.teams import stream

@@ -7,13 +7,13 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from sim.cli.main import app
-from sim.datasets.folder_writer import write_folder
-from sim.in_memory.team import final_map, run_team
-from sim.recorded.data_set import log_or_run
-from sim.scenarios.source import streams_of
-from sim.scenarios.toml import folder_scenario
-from team.wire import channels as ch
+from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.recorded.data_set import log_or_run
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.toml import folder_scenario
+from teamslam.team.wire import channels as ch
 from tests.sim.logs import scenario
 
 
@@ -54,7 +54,9 @@ def test_a_data_set_is_rerun_under_other_conditions(data_set: Path, tmp_path: Pa
 def test_a_data_set_without_changes_is_computed_once_and_told_with_its_notes(
     data_set: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sim.recorded.changed_run.changed_run", None)  # a second run would call it
+    monkeypatch.setattr(
+        "teamslam.sim.recorded.changed_run.changed_run", None
+    )  # a second run would call it
     (data_set / "r2" / "truth.csv").unlink()
     result = CliRunner().invoke(app, ["rerun", str(data_set)])
     assert result.exit_code == 0, result.output

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.datasets.folder_writer import write_folder
-from sim.publisher.source import Source
-from sim.recorded.streams import recorded_streams
-from sim.world.streams import WorldStreams
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids, from_stamps
-from team.wire.codec import encoded
+from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.publisher.source import Source
+from teamslam.sim.recorded.streams import recorded_streams
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.sim.datasets.test_folder import read
 

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from central.desk.evaluation.evaluation import evaluate
-from central.desk.verification.differences import ARRAYS
-from central.desk.verification.recorded import RerunError
-from central.desk.verification.verification import Verification, verify
-from sim.cli.rerun import app
-from sim.recorded.changed_run import changed_run
-from sim.recorded.changes import Changes
-from sim.recorded.noise import with_noise
-from sim.scenarios.checks import ScenarioError
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.models import increment_of
-from team.pairs import PAIRS
-from team.recording.reader import Log
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats, from_floats
-from team.wire.bus import Sample
-from team.wire.codec import encoded
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.verification.differences import ARRAYS
+from teamslam.central.desk.verification.recorded import RerunError
+from teamslam.central.desk.verification.verification import Verification, verify
+from teamslam.sim.cli.rerun import app
+from teamslam.sim.recorded.changed_run import changed_run
+from teamslam.sim.recorded.changes import Changes
+from teamslam.sim.recorded.noise import with_noise
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.models import increment_of
+from teamslam.team.pairs import PAIRS
+from teamslam.team.recording.reader import Log
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
 from tests.teams import LOCALISERS, Team, config, stream, world_of
@@ -224,7 +224,7 @@ def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team
     robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
     team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sim.publisher.node.BATCH", 4)  # the world is not at its end so soon
+        patch.setattr("teamslam.sim.publisher.node.BATCH", 4)  # the world is not at its end so soon
         while len(team.sent[ch.SUBMAP.key("r1")]) < 3:
             assert team.step()
         team.kill("r1", patience=not dies)

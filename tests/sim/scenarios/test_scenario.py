@@ -5,9 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from central.desk.verification.recorded import Recorded
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import (
+from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.scenario import (
     builtin_names,
     dumps,
     load,
@@ -15,14 +15,14 @@ from sim.scenarios.scenario import (
     scenario_warnings,
     with_options,
 )
-from sim.scenarios.source import streams_of
-from sim.world.config import SimulatedWorld, UtiasWorld
-from team import former_names
-from team.association import AssociationProfile
-from team.pairs import PAIRS
-from team.wire import messages as m
-from team.wire.codec import decoded, encoded
-from team.wire.digest import configured
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
+from teamslam.team import former_names
+from teamslam.team.association import AssociationProfile
+from teamslam.team.pairs import PAIRS
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 
 SMALL = """

@@ -7,18 +7,18 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
-from sim.cli.main import app
-from sim.scenarios.scenario import Scenario, load
-from sim.scenarios.source import streams_of
-from sim.world.config import (
+from teamslam.central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
+from teamslam.sim.cli.main import app
+from teamslam.sim.scenarios.scenario import Scenario, load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import (
     FolderWorld,
     LiveWorld,
     SimulatedWorld,
     UnlabelledWorld,
     UtiasWorld,
 )
-from team.config import (
+from teamslam.team.config import (
     AssociationSettings,
     Bounds,
     FrontEnd,
@@ -28,7 +28,7 @@ from team.config import (
     RobotConfig,
     Sensor,
 )
-from team.pairs import ESTIMATORS, RULES
+from teamslam.team.pairs import ESTIMATORS, RULES
 from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from sim.scenarios.checks import ScenarioError
-from sim.scenarios.scenario import load
-from team.driver.measured import MeasurementError, observations
+from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.scenario import load
+from teamslam.team.driver.measured import MeasurementError, observations
 
 
 @pytest.mark.parametrize("place", ["[defaults.sensor]", '[[robots]]\nid = "r1"\n[robots.sensor]'])

@@ -4,11 +4,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.world.config import SimulatedWorld
-from sim.world.forms import claimed, measured_increments, measured_steering, seen_from, with_errors
-from sim.world.sensing import Visible
-from sim.world.simulator import simulated
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.forms import (
+    claimed,
+    measured_increments,
+    measured_steering,
+    seen_from,
+    with_errors,
+)
+from teamslam.sim.world.sensing import Visible
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 MOTION = MotionModel(
     forward=MotionNoise(0.1), turn=MotionNoise(0.05), lateral=MotionNoise(0.04)

@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
 
 
 def streams(form: str, identities: str):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim.world.config import SimulatedWorld
-from sim.world.simulator import simulated
-from team.config import RobotConfig
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulated
+from teamslam.team.config import RobotConfig
 
 ROBOT = RobotConfig("r1")
 

@@ -5,19 +5,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sim.in_memory.team import final_map, run_team
-from sim.scenarios.scenario import Scenario, load
-from sim.scenarios.source import streams_of
-from sim.studies.rules.team_keyframes import TeamKeyframes
-from sim.world.config import SimulatedWorld
-from sim.world.odometry import measured_speeds
-from sim.world.simulator import simulated
-from sim.world.streams import WorldStreams
-from team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from team.estimation.models import increment_of
-from team.estimation.se2 import compose, inverse, logarithm
-from team.robot.node import RobotNode
-from team.wire import messages as m
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.rules.team_keyframes import TeamKeyframes
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.odometry import measured_speeds
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.models import increment_of
+from teamslam.team.estimation.se2 import compose, inverse, logarithm
+from teamslam.team.robot.node import RobotNode
+from teamslam.team.wire import messages as m
 from tests import build
 from tests.teams import driven, published
 

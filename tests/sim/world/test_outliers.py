@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from sim.scenarios.scenario import load
-from sim.scenarios.source import streams_of
-from sim.world.streams import WorldStreams
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import WorldStreams
 from tests.sim.world.test_simulator import content, true_detections
 
 

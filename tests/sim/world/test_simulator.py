@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 
-from sim.scenarios.scenario import Scenario, load, with_options
-from sim.world.config import SimulatedWorld
-from sim.world.paths import Limits, driven, followed, moved, wrapped
-from sim.world.simulator import simulated
-from sim.world.streams import (
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.paths import Limits, driven, followed, moved, wrapped
+from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.streams import (
     OBSERVATIONS,
     ODOMETRY,
     SIGHTINGS,
@@ -21,7 +21,7 @@ from sim.world.streams import (
     WorldStreams,
     grouped,
 )
-from team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 angles = st.floats(-np.pi, np.pi)
 

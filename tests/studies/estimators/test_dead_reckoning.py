@@ -4,11 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.studies.estimators import dead_reckoning
-from team.config import MotionModel, MotionNoise, Sensor
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.models import Increment, increment_of
-from team.estimation.se2 import between, compose, exponential, logarithm
+from teamslam.sim.studies.estimators import dead_reckoning
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.se2 import between, compose, exponential, logarithm
 
 MOTION = MotionModel(
     "turn-then-drive", forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=np.deg2rad(3.0))

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.studies.estimators import ekf_slam
-from sim.studies.estimators.ekf_slam import EkfSlam
-from team.config import Sensor
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from team.estimation.hybrid_slam import innovation as innovations
-from team.estimation.models import Increment
-from team.estimation.se2 import compose, exponential
+from teamslam.sim.studies.estimators import ekf_slam
+from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from teamslam.team.estimation.hybrid_slam import innovation as innovations
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)

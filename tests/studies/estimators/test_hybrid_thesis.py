@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from sim.studies.estimators import hybrid_thesis
-from sim.studies.estimators.hybrid_thesis import ThesisState
-from team.config import Sensor
-from team.estimation.models import Increment
+from teamslam.sim.studies.estimators import hybrid_thesis
+from teamslam.sim.studies.estimators.hybrid_thesis import ThesisState
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.models import Increment
 
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
 MOTION = Increment(np.array([1.0, 0.0, 0.1]), np.diag([0.05, 0.02, 0.05]) ** 2)

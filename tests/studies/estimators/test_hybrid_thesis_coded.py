@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sim.studies.estimators import hybrid_thesis_coded
-from sim.studies.estimators.hybrid_thesis_coded import CodedState
-from team.config import Sensor
-from team.estimation.hybrid_slam.fastslam import effective_sample_size
-from team.estimation.models import Increment
+from teamslam.sim.studies.estimators import hybrid_thesis_coded
+from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.hybrid_slam.fastslam import effective_sample_size
+from teamslam.team.estimation.models import Increment
 
 SENSOR = Sensor(range_sigma=2.0, bearing_sigma=0.1)
 MOTION = Increment(np.array([1.0, 0.0, 0.0]), np.diag([0.05, 0.0, 0.05]) ** 2)

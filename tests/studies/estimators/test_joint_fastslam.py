@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.studies.estimators import joint_fastslam, plain_fastslam
-from sim.studies.estimators.robot_step import RobotStep
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.models import Increment
+from teamslam.sim.studies.estimators import joint_fastslam, plain_fastslam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.models import Increment
 from tests.estimation.team_rounds import LANDMARKS, OTHER, SENSOR, STARTS, team_run, wrap
 
 PROPOSALS = ["fastslam1", "fastslam2"]

@@ -6,13 +6,13 @@ import functools
 import numpy as np
 import pytest
 
-from sim.studies.estimators import localisation
-from team.config import Sensor
-from team.estimation.consistency import chi2_interval, nees, state_error
-from team.estimation.hybrid_slam import fastslam
-from team.estimation.hybrid_slam import innovation as innovations
-from team.estimation.models import Increment
-from team.estimation.se2 import compose, exponential
+from teamslam.sim.studies.estimators import localisation
+from teamslam.team.config import Sensor
+from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam import innovation as innovations
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.estimator_runs import keyframes_of, run, world
 
 IDS = np.array([2, 5, 9], np.uint32)

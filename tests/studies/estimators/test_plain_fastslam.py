@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sim.studies.estimators import plain_fastslam
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.hybrid_slam.fastslam import Particles
-from team.estimation.models import increment_of
-from team.estimation.randomness import generator
+from teamslam.sim.studies.estimators import plain_fastslam
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.models import increment_of
+from teamslam.team.estimation.randomness import generator
 from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, ROBOT, drive, driven
 
 PROPOSALS = ["fastslam1", "fastslam2"]

@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from sim.studies.estimators import svd_joining
-from sim.studies.estimators.svd_joining import PointPairs, TooFewPointsError
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.map_joining import joining
-from team.estimation.map_joining.joining import EMPTY_FOLD
-from team.estimation.se2 import compose, transformed
-from team.estimation.submap import LocalMap
+from teamslam.sim.studies.estimators import svd_joining
+from teamslam.sim.studies.estimators.svd_joining import PointPairs, TooFewPointsError
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.estimation.map_joining import joining
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD
+from teamslam.team.estimation.se2 import compose, transformed
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth, team, wrap
 
 poses = st.builds(

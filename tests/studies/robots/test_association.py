@@ -4,14 +4,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.desk.evaluation.association import AssociationResult, association_result
-from central.desk.evaluation.log import collect_log
-from sim.in_memory.team import run_team
-from sim.scenarios.scenario import load, with_options
-from sim.scenarios.source import streams_of
-from sim.studies.estimators import nearest_neighbour
-from team.config import UNNAMED
-from team.estimation.models import Increment
+from teamslam.central.desk.evaluation.association import AssociationResult, association_result
+from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.estimators import nearest_neighbour
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.models import Increment
 
 STEPS = 60
 

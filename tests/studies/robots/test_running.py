@@ -4,25 +4,25 @@ import msgspec
 import numpy as np
 import pytest
 
-from sim.studies.estimators import dead_reckoning, ekf_slam, localisation, plain_fastslam
-from sim.studies.robots.estimator import (
+from teamslam.sim.studies.estimators import dead_reckoning, ekf_slam, localisation, plain_fastslam
+from teamslam.sim.studies.robots.estimator import (
     NOTHING_KNOWN,
     AbsorbsMaps,
     InitialPose,
     KnownMap,
     estimator_of,
 )
-from sim.studies.robots.running import POSE_FLOOR
-from team import translate
-from team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from team.estimation.models import Increment, corrected, increment_of
-from team.estimation.odometry import OdometryInterval
-from team.estimation.randomness import generator
-from team.pairs import PAIRS, rules_for
-from team.robot.node import robot_node
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
+from teamslam.sim.studies.robots.running import POSE_FLOOR
+from teamslam.team import translate
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
+from teamslam.team.estimation.models import Increment, corrected, increment_of
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.pairs import PAIRS, rules_for
+from teamslam.team.robot.node import robot_node
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
 from tests.teams import LANDMARKS, LOCALISERS, config, driven, of, published, stream
 
 STREAM = stream("r1", 12)

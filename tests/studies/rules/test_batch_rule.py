@@ -4,18 +4,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from central.config import CentralConfig
-from central.node import make_centre
-from sim.scenarios.scenario import load, with_options
-from sim.studies.batch_reference.reference import batch_map
-from sim.studies.rules import batch_rule
-from sim.studies.rules.batch_rule import taken_as_white
-from team import translate
-from team.config import FrontEnd, RobotConfig, Sensor
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
-from team.wire.digest import configured
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.studies.batch_reference.reference import batch_map
+from teamslam.sim.studies.rules import batch_rule
+from teamslam.sim.studies.rules.batch_rule import taken_as_white
+from teamslam.team import translate
+from teamslam.team.config import FrontEnd, RobotConfig, Sensor
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.sim.reruns import messages, team_samples
 from tests.teams import config, of, published, stream

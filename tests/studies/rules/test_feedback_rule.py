@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from sim.studies.rules.feedback_rule import RULES, RoundsCentre
-from team import translate
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import decoded, encoded
+from teamslam.central.config import CentralConfig
+from teamslam.sim.studies.rules.feedback_rule import RULES, RoundsCentre
+from teamslam.team import translate
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.support import packed, spd
 from tests.teams import of

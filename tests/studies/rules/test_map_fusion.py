@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.studies.rules.map_fusion import (
+from teamslam.sim.studies.rules.map_fusion import (
     covariance_intersection,
     kalman,
     kalman_per_axis,
 )
-from team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.estimation.gaussian import LandmarkGaussian
 from tests.estimation.submap_world import correlated
 
 RULES = [kalman, kalman_per_axis, covariance_intersection]

@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from central.node import make_centre
-from sim.studies.rules.map_fusion import kalman
-from team import translate
-from team.estimation.consistency import chi2_interval, nees
-from team.estimation.gaussian import LandmarkGaussian
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import from_floats, from_ids
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.sim.studies.rules.map_fusion import kalman
+from teamslam.team import translate
+from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import packed, spd
 from tests.teams import of

@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from central.node import make_centre
-from sim.studies.estimators import joint_fastslam
-from sim.studies.estimators.robot_step import RobotStep
-from sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
-from team import translate
-from team.estimation.models import increment_of
-from team.estimation.randomness import generator
-from team.wire import channels as ch
-from team.wire import messages as m
-from team.wire.arrays import floats
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
-from team.wire.digest import configured
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.sim.studies.estimators import joint_fastslam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
+from teamslam.team import translate
+from teamslam.team.estimation.models import increment_of
+from teamslam.team.estimation.randomness import generator
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import configured
 from tests import build
 from tests.teams import config, of, published, stream
 

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from central.config import CentralConfig
-from central.node import make_centre
-from sim.studies.estimators import svd_joining
-from sim.studies.estimators.svd_joining import PointPairs
-from sim.studies.rules.svd_rule import tied
-from team import translate
-from team.estimation.contribution import Stream
-from team.estimation.gaussian import LandmarkGaussian
-from team.estimation.se2 import inverse, transformed
-from team.wire import channels as ch
-from team.wire.bus import Outgoing
-from team.wire.codec import encoded
+from teamslam.central.config import CentralConfig
+from teamslam.central.node import make_centre
+from teamslam.sim.studies.estimators import svd_joining
+from teamslam.sim.studies.estimators.svd_joining import PointPairs
+from teamslam.sim.studies.rules.svd_rule import tied
+from teamslam.team import translate
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.gaussian import LandmarkGaussian
+from teamslam.team.estimation.se2 import inverse, transformed
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire.bus import Outgoing
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.teams import Submaps, of, published, stream, submaps_of
 
