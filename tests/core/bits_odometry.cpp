@@ -47,7 +47,8 @@ void run_odometry(bool turns_first, bool is_mounted) {
     const motion::Odometry::Unmeasured spread = {0.2, 0.1, 0.3};
     const std::optional<motion::Odometry::Unmeasured> added = k % 11 ? std::nullopt : std::optional(spread);
     if (k % 3) {
-      odometry.drive(0.01 + 0.1 * (0.5 + uniform()), uniform(), k % 5 ? 2.0 * uniform() : 1e-4 * uniform(), added);
+      const double duration = 0.01 + 0.1 * (0.5 + uniform()), forward = uniform();
+      odometry.drive(duration, forward, (k % 5 ? 2.0 : 1e-4) * uniform(), added);
     } else {
       motion::Moved moved{{uniform(), 0.3 * uniform(), uniform()}, 0.2, std::nullopt};
       if (k % 2) moved.covariance = {{{0.2, 0.01, 0.0}, {0.01, 0.3, 0.02}, {0.0, 0.02, 0.1}}};
@@ -77,7 +78,8 @@ void run_scans(bool with_claims) {
   std::vector<models::Claim> claims;
   const models::Calibration calibration{0.1, 1.02, 0.05, {{0.01, 0.02, 0.03}}, 0.2, 0.5, 5.0, 1.0};
   for (std::uint32_t k = 0; k < 30; k++) {
-    const auto [range, bearing, is_accepted] = calibration.correct(3.0 + 5.0 * uniform(), 3.0 * uniform());
+    const double raw = 3.0 + 5.0 * uniform();
+    const auto [range, bearing, is_accepted] = calibration.correct(raw, 3.0 * uniform());
     add(range), add(bearing), add(double(is_accepted));
     ids.push_back(k * 7 % 5);
     ranges.push_back(3.0 + uniform()), bearings.push_back(6.0 * uniform());
@@ -103,7 +105,8 @@ void run_models() {
   for (int k = 0; k < 300; k++) {
     const se2::Pose<double> pose{9.0 * uniform(), uniform(), 7.0 * uniform()};
     const models::Claim claim{0.1, 0.02, 0.2, double(k % 3) - 1.0};
-    const models::Reading z = models::reading_of(3.0 + uniform(), 6.0 * uniform(), {0.1, 0.01, 1.0, 0.2, 1.0}, claim);
+    const double range = 3.0 + uniform();
+    const models::Reading z = models::reading_of(range, 6.0 * uniform(), {0.1, 0.01, 1.0, 0.2, 1.0}, claim);
     const auto placed = models::place(pose, z);
     for (const double x : {placed.x, placed.y, placed.xx, placed.xy, placed.yy}) add(x);
     const models::Polar seen = models::polar(pose, {uniform(), 4.0 * uniform()});

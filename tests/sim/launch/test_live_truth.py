@@ -78,7 +78,9 @@ def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
 
 
 @pytest.mark.parametrize("joint", [True, False])
-def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> None:
+def test_the_map_is_judged_by_its_joint_covariance_where_there_is_one_and_the_newest_counts(
+    joint: bool,
+) -> None:
     errors, ids = LiveErrors(), [2, 5, 7]
     positions = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 6.0]])
     errors.take(
@@ -99,9 +101,11 @@ def test_the_map_is_judged_by_landmark_and_the_newest_counts(joint: bool) -> Non
             dof=2,
         )
         errors.take(ch.FUSED_MAP, fused)
+    whole = np.tile(deviation, 3)
     blocks = [P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)]
-    expected = [deviation @ np.linalg.solve(block, deviation) for block in blocks]
-    assert errors.landmarks.mean == pytest.approx(np.mean(expected) / 2)
+    alone = [deviation @ np.linalg.solve(block, deviation) for block in blocks]
+    expected = whole @ np.linalg.solve(P, whole) / 6 if joint else np.mean(alone) / 2
+    assert errors.landmarks.mean == pytest.approx(expected)
     assert errors.landmarks.count == 3
 
 
