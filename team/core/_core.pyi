@@ -134,12 +134,12 @@ def solve_factored(L: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDAr
 
 def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], int]:
     """
-    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in team.estimation.gaussian.FAULTS of why there is none.
+    Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in teamslam.team.estimation.gaussian.FAULTS of why there is none.
     """
 
 def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
-    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; team.estimation.gaussian.curved describes it.
+    Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; teamslam.team.estimation.gaussian.curved describes it.
     """
 
 def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
@@ -621,7 +621,9 @@ def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.floa
     """
 
 class MotionModel:
-    """The parameters of a motion model, as of `team.config.MotionModel`."""
+    """
+    The parameters of a motion model, as of `teamslam.team.config.MotionModel`.
+    """
 
     def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
         """

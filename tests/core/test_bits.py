@@ -135,7 +135,7 @@ def test_the_type_stub_is_that_of_the_library() -> None:
 
 
 def test_the_level_can_be_chosen() -> None:
-    command = [sys.executable, "-c", "from team import core; print(core.level)"]
+    command = [sys.executable, "-c", "from teamslam.team import core; print(core.level)"]
     levels = {}
     for level in ("base", "absent"):
         ended = subprocess.run(

@@ -78,7 +78,7 @@ def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
 
 
 @pytest.mark.parametrize("joint", [True, False])
-def test_the_map_is_judged_by_its_joint_covariance_where_there_is_one_and_the_newest_counts(
+def test_the_newest_map_is_judged_by_its_joint_covariance_if_there_is_one(
     joint: bool,
 ) -> None:
     errors, ids = LiveErrors(), [2, 5, 7]
