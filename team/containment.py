@@ -26,7 +26,7 @@ MOST_ANSWERS = 1000
 """Most attempts of a node to continue after one message."""
 LONGEST_TEXT = 1000
 """Longest text of an exception or a key in a fault [characters]."""
-_OURS = ("team.", "central.", "sim.")
+_OURS = ("teamslam.",)
 
 
 @runtime_checkable

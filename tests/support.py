@@ -491,7 +491,7 @@ def examples() -> Iterator[m.Message]:
         message="submap/1",
         error="ValueError",
         text="no frame",
-        place="teamslam.central.node:CentralNode.handle:58",
+        place="central.node:CentralNode.handle:58",
         digest=b"\x01\x02\x03\x04\x05\x06\x07\x08",
     )
     yield build.liveliness(node="robot/alpha")

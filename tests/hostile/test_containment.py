@@ -69,7 +69,7 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
         ("ZeroDivisionError", "no way", BROKEN_NS)
     }
     for fault in told:
-        assert re.fullmatch(r"team\.robot\.mapper:Mapper\.drive:\d+", fault.place)
+        assert re.fullmatch(r"teamslam\.team\.robot\.mapper:Mapper\.drive:\d+", fault.place)
     assert_each_measurement_once(samples)
     for robot in ("r1", "r2"):
         (done,) = messages(samples, ch.ROBOT_DONE, robot)
@@ -224,7 +224,7 @@ def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_
     stop = threading.Event()
     stop.set()
     robot = RobotShell(MemoryBus(network), config("r1"), stop, patience_s=0.0)
-    with pytest.raises(FaultyRunError, match=r"central/submaps: \w+ at team\.robot"):
+    with pytest.raises(FaultyRunError, match=r"central/submaps: \w+ at teamslam\.team\.robot"):
         robot.run()
     assert robot.node.next_measurement == 0
     assert len(faults([s for s in viewer.receive() if s.key.endswith("fault")])) == 1

@@ -155,7 +155,7 @@ class Processes:
         def alone() -> bool:
             # Before it has become the program that it is to be, a child looks as its parent.
             lines = self.alive().items()
-            found[:] = [pid for pid, line in lines if {"sim", *words} <= set(line)]
+            found[:] = [pid for pid, line in lines if {"teamslam", *words} <= set(line)]
             return len(found) == 1
 
         await until(alone, f"one process `{' '.join(words)}`")

@@ -75,7 +75,7 @@ def standing(pid: int) -> tuple[int, int, int]:
 
 def other(team: Processes, words: tuple[str, ...]) -> int | None:
     """The id of the process of these words, if there is one."""
-    found = [pid for pid, line in team.alive().items() if {"sim", *words} <= set(line)]
+    found = [pid for pid, line in team.alive().items() if {"teamslam", *words} <= set(line)]
     return found[0] if found else None
 
 

@@ -87,8 +87,8 @@ def children(launch: int, folder: Path) -> dict[int, list[str]]:
             with suppress(OSError):
                 if (entry / "cwd").readlink() == folder:
                     line = (entry / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
-                    if "sim" in line:
-                        found[int(entry.name)] = line[line.index("sim") + 1 :]
+                    if "teamslam" in line:
+                        found[int(entry.name)] = line[line.index("teamslam") + 1 :]
     return found
 
 

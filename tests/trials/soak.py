@@ -68,8 +68,8 @@ def children(parent: int) -> dict[int, str]:
             words = (entry / "cmdline").read_text().split("\0")
         except (OSError, IndexError):
             continue
-        if ppid == parent and "sim" in words:
-            told = words[words.index("sim") + 1 :]
+        if ppid == parent and "teamslam" in words:
+            told = words[words.index("teamslam") + 1 :]
             found[int(entry.name)] = f"robot {told[-2]}" if told[0] == "robot" else told[0]
     return found
 

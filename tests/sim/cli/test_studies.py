@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[3]
 def without_studies(folder: Path) -> Path:
     for package in ("team", "central"):
         (folder / package).symlink_to(ROOT / package)
+    shutil.copytree(ROOT / "teamslam", folder / "teamslam", symlinks=True)
     left_out = shutil.ignore_patterns("studies", "__pycache__")
     shutil.copytree(ROOT / "sim", folder / "sim", ignore=left_out)
     return folder
