@@ -9,6 +9,7 @@ there is no further thread, the order of arrival is preserved across subscriptio
 never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
 """
 
+import atexit
 import threading
 import time
 from collections.abc import Collection
@@ -98,6 +99,8 @@ class ZenohBus:
         self._recovery = Recovery(self._session, self._prefix, self._admit)
         self._queries = Queries(self._session, self._prefix, self._queue.put)
         self._link = RouterLink(self._session, connect, keys)
+        # While the interpreter ends no thread of Zenoh may call it any more.
+        atexit.register(self._end_session)
 
     def __enter__(self) -> Self:
         return self
@@ -117,8 +120,12 @@ class ZenohBus:
                 self.publish_totals()
             self._closed.set()
             self._flush()
-            self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
+            atexit.unregister(self._end_session)
+            self._end_session()
             self._queue.put(None)
+
+    def _end_session(self) -> None:
+        self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
 
     def _flush(self) -> None:
         """Wait until the router has received the publications, which a closing session may drop.
