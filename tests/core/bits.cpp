@@ -1,10 +1,7 @@
 // Hashes of all results of made-up windows, and their smoothers: the same for every compiler and processor.
 //
-// Built by tests/core/test_bits.py together with the sources of team/core. Its inputs come from a
-// generator of its own, since those of the standard library differ between libraries.
-#include <cstdint>
-#include <cstdio>
-
+// Built by tests/core/test_bits.py together with the sources of team/core.
+#include "bits.hpp"
 #include "consensus.hpp"
 #include "sensitivity.hpp"
 
@@ -13,27 +10,7 @@ using window::Rows;
 
 namespace {
 
-std::uint64_t state = 20210917, hash = 1469598103934665603u;
-
-double uniform() {  // Knuth's MMIX generator
-  state = state * 6364136223846793005u + 1442695040888963407u;
-  return double(state >> 11) * 0x1p-53;
-}
-
-double normal() {
-  double sum = -6.0;
-  for (int k = 0; k < 12; k++) sum += uniform();
-  return sum;
-}
-
-void add(double x) {  // FNV-1a
-  std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
-  for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
-}
-
-void add(std::span<const double> numbers) {
-  for (const double x : numbers) add(x);
-}
+using bits::add, bits::normal, bits::uniform;
 
 void add(const Rows& rows) {
   for (std::size_t k = 0; k < rows.rows(); k++) add(rows.numbers(k));
@@ -126,9 +103,9 @@ void run_smoother(int number) {
 }
 
 std::uint64_t hash_of(void (*run)(int)) {
-  hash = 1469598103934665603u;
+  bits::hash = bits::EMPTY;
   for (int number = 0; number < 40; number++) run(number);
-  return hash;
+  return bits::hash;
 }
 
 }  // namespace

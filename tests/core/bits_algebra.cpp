@@ -1,7 +1,5 @@
 // Hash of dense algebra, quantiles and poses: one number for every compiler and processor, as bits.cpp.
-#include <cstdint>
-#include <cstdio>
-
+#include "bits.hpp"
 #include "chi2.hpp"
 #include "gaussian.hpp"
 #include "se2.hpp"
@@ -10,17 +8,7 @@ using namespace teamslam;
 
 namespace {
 
-std::uint64_t state = 20210917, hash = 1469598103934665603u;
-
-double uniform() {  // Knuth's MMIX generator
-  state = state * 6364136223846793005u + 1442695040888963407u;
-  return double(state >> 11) * 0x1p-53 - 0.5;
-}
-
-void add(double x) {  // FNV-1a
-  std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
-  for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
-}
+using bits::add, bits::centred;
 
 void add(dense::Const a) {
   for (std::size_t i = 0; i < a.rows; i++)
@@ -30,7 +18,7 @@ void add(dense::Const a) {
 dense::Matrix drawn(std::size_t rows, std::size_t columns) {
   dense::Matrix made(rows, columns);
   for (std::size_t i = 0; i < rows; i++)
-    for (std::size_t j = 0; j < columns; j++) made[i][j] = uniform();
+    for (std::size_t j = 0; j < columns; j++) made[i][j] = centred();
   return made;
 }
 
@@ -65,14 +53,14 @@ void add(const se2::Pose<double>& pose) {
 int main() {
   for (const std::size_t n : {1, 3, 8, 31, 32, 45, 70, 133}) run_matrices(n);
   for (int k = 0; k < 2000; k++) {
-    const se2::Pose<double> a{9.0 * uniform(), uniform(), 7.0 * uniform()}, b{uniform(), uniform(), 1e-3 * uniform()};
+    const se2::Pose<double> a{9.0 * centred(), centred(), 7.0 * centred()}, b{centred(), centred(), 1e-3 * centred()};
     add(se2::between(a, se2::compose(se2::inverse(b), a)));
     add(se2::exponential(se2::logarithm(k % 2 ? a : b)));
     add(se2::transformed(a, {b.x, b.y}).x);
-    const double below = 0.5 + uniform(), dof = 1.0 + 900.0 * (0.5 + uniform());
+    const double below = 0.5 + centred(), dof = 1.0 + 900.0 * (0.5 + centred());
     if (below > 0.0) add(chi2::quantile(below, 1.0 - below, dof));
     const dense::Matrix A = drawn(3, 3);
     add(gaussian::curved(a.heading, dense::product(A, dense::transposed(A))));
   }
-  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+  bits::print();
 }

@@ -1,34 +1,12 @@
 // Hash of all results of made-up maps and chains of submaps: one number for every compiler and processor (see bits.cpp).
-#include <cstdint>
-#include <cstdio>
-
+#include "bits.hpp"
 #include "chain.hpp"
 
 using namespace teamslam;
 
 namespace {
 
-std::uint64_t state = 20210917, hash = 1469598103934665603u;
-
-double uniform() {  // Knuth's MMIX generator
-  state = state * 6364136223846793005u + 1442695040888963407u;
-  return double(state >> 11) * 0x1p-53;
-}
-
-double normal() {
-  double sum = -6.0;
-  for (int k = 0; k < 12; k++) sum += uniform();
-  return sum;
-}
-
-void add(double x) {  // FNV-1a
-  std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
-  for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
-}
-
-void add(std::span<const double> numbers) {
-  for (const double x : numbers) add(x);
-}
+using bits::add, bits::normal, bits::uniform;
 
 struct RandomMap {
   std::vector<std::uint32_t> ids;
@@ -49,7 +27,8 @@ RandomMap random_map(double (&pose)[3]) {
     const double x = 5.0 * double(id % 5) - pose[0], y = 4.0 * double(id / 5) - pose[1];
     made.ids.push_back(id);
     made.mean.push_back(c * x + s * y + 0.1 * normal());
-    made.mean.push_back(c * y - s * x + (uniform() < 0.03 ? 3.0 : 0.1) * normal());
+    const double sigma = uniform() < 0.03 ? 3.0 : 0.1;
+    made.mean.push_back(c * y - s * x + sigma * normal());
   }
   const std::size_t n = made.mean.size();
   dense::Matrix root(n, n + 2);
@@ -93,5 +72,5 @@ void run_map(int number) {
 
 int main() {
   for (int number = 0; number < 40; number++) run_map(number);
-  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+  bits::print();
 }

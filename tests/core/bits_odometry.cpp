@@ -1,7 +1,5 @@
 // Hash of odometry, reduced scans and h by angles: one number for every compiler and processor, as bits.cpp.
-#include <cstdint>
-#include <cstdio>
-
+#include "bits.hpp"
 #include "calibration.hpp"
 #include "odometry.hpp"
 #include "reduction.hpp"
@@ -10,17 +8,7 @@ using namespace teamslam;
 
 namespace {
 
-std::uint64_t state = 20260917, hash = 1469598103934665603u;
-
-double uniform() {  // Knuth's MMIX generator
-  state = state * 6364136223846793005u + 1442695040888963407u;
-  return double(state >> 11) * 0x1p-53 - 0.5;
-}
-
-void add(double x) {  // FNV-1a
-  std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
-  for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
-}
+using bits::add, bits::centred;
 
 void add(const motion::Increment& of) {
   for (const double x : {of.mean.x, of.mean.y, of.mean.heading}) add(x);
@@ -28,7 +16,7 @@ void add(const motion::Increment& of) {
     for (const double x : row) add(x);
 }
 
-motion::Densities densities() { return {0.1 + 0.1 * uniform(), 0.1 + 0.1 * uniform(), 0.1 + 0.1 * uniform()}; }
+motion::Densities densities() { return {0.1 + 0.1 * centred(), 0.1 + 0.1 * centred(), 0.1 + 0.1 * centred()}; }
 
 void run_odometry(bool turns_first, bool is_mounted) {
   motion::Model model;
@@ -47,10 +35,10 @@ void run_odometry(bool turns_first, bool is_mounted) {
     const motion::Odometry::Unmeasured spread = {0.2, 0.1, 0.3};
     const std::optional<motion::Odometry::Unmeasured> added = k % 11 ? std::nullopt : std::optional(spread);
     if (k % 3) {
-      const double duration = 0.01 + 0.1 * (0.5 + uniform()), forward = uniform();
-      odometry.drive(duration, forward, (k % 5 ? 2.0 : 1e-4) * uniform(), added);
+      const double duration = 0.01 + 0.1 * (0.5 + centred()), forward = centred();
+      odometry.drive(duration, forward, (k % 5 ? 2.0 : 1e-4) * centred(), added);
     } else {
-      motion::Moved moved{{uniform(), 0.3 * uniform(), uniform()}, 0.2, std::nullopt};
+      motion::Moved moved{{centred(), 0.3 * centred(), centred()}, 0.2, std::nullopt};
       if (k % 2) moved.covariance = {{{0.2, 0.01, 0.0}, {0.01, 0.3, 0.02}, {0.0, 0.02, 0.1}}};
       odometry.drive(moved, 0.1, 0.5, 0.25, added);
     }
@@ -78,12 +66,12 @@ void run_scans(bool with_claims) {
   std::vector<models::Claim> claims;
   const models::Calibration calibration{0.1, 1.02, 0.05, {{0.01, 0.02, 0.03}}, 0.2, 0.5, 5.0, 1.0};
   for (std::uint32_t k = 0; k < 30; k++) {
-    const double raw = 3.0 + 5.0 * uniform();
-    const auto [range, bearing, is_accepted] = calibration.correct(raw, 3.0 * uniform());
+    const double raw = 3.0 + 5.0 * centred();
+    const auto [range, bearing, is_accepted] = calibration.correct(raw, 3.0 * centred());
     add(range), add(bearing), add(double(is_accepted));
     ids.push_back(k * 7 % 5);
-    ranges.push_back(3.0 + uniform()), bearings.push_back(6.0 * uniform());
-    claims.push_back({0.1 + 0.1 * uniform(), 0.02 * uniform(), 0.1 + 0.1 * uniform(), double(k % 3) - 1.0});
+    ranges.push_back(3.0 + centred()), bearings.push_back(6.0 * centred());
+    claims.push_back({0.1 + 0.1 * centred(), 0.02 * centred(), 0.1 + 0.1 * centred(), double(k % 3) - 1.0});
   }
   std::vector<window::Scan> scans;
   std::vector<se2::Pose<double>> poses;
@@ -91,7 +79,7 @@ void run_scans(bool with_claims) {
     const auto part = [&](auto& of) { return std::span(of).subspan(6 * k, 6); };
     scans.push_back({part(ids), part(ranges), part(bearings), {}});
     if (with_claims && k % 2) scans.back().claims = part(claims);
-    poses.push_back({uniform(), uniform(), 7.0 * uniform()});
+    poses.push_back({centred(), centred(), 7.0 * centred()});
   }
   const window::Reduced found = window::reduce(scans, poses);
   for (std::size_t k = 0; k < found.ids.size(); k++) {
@@ -103,13 +91,13 @@ void run_scans(bool with_claims) {
 
 void run_models() {
   for (int k = 0; k < 300; k++) {
-    const se2::Pose<double> pose{9.0 * uniform(), uniform(), 7.0 * uniform()};
+    const se2::Pose<double> pose{9.0 * centred(), centred(), 7.0 * centred()};
     const models::Claim claim{0.1, 0.02, 0.2, double(k % 3) - 1.0};
-    const double range = 3.0 + uniform();
-    const models::Reading z = models::reading_of(range, 6.0 * uniform(), {0.1, 0.01, 1.0, 0.2, 1.0}, claim);
+    const double range = 3.0 + centred();
+    const models::Reading z = models::reading_of(range, 6.0 * centred(), {0.1, 0.01, 1.0, 0.2, 1.0}, claim);
     const auto placed = models::place(pose, z);
     for (const double x : {placed.x, placed.y, placed.xx, placed.xy, placed.yy}) add(x);
-    const models::Polar seen = models::polar(pose, {uniform(), 4.0 * uniform()});
+    const models::Polar seen = models::polar(pose, {centred(), 4.0 * centred()});
     const auto innovation = models::innovation_of(z, seen);
     for (const double x : {innovation.of_range, innovation.of_bearing, innovation.rr, innovation.rb, innovation.bb}) add(x);
     for (const auto& row : models::pose_jacobian(seen.range, seen.bearing))
@@ -122,9 +110,10 @@ void run_models() {
 }  // namespace
 
 int main() {
+  bits::state = 20260917;
   for (const bool turns_first : {false, true})
     for (const bool is_mounted : {false, true}) run_odometry(turns_first, is_mounted);
   for (int k = 0; k < 50; k++) run_scans(k % 2);
   run_models();
-  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+  bits::print();
 }

@@ -1,32 +1,12 @@
 // Hash of all results of made-up sparse systems: one number for every compiler and processor (see bits.cpp).
-#include <cstdint>
-#include <cstdio>
-
+#include "bits.hpp"
 #include "sparse.hpp"
 
 using namespace teamslam;
 
 namespace {
 
-std::uint64_t state = 20210917, hash = 1469598103934665603u;
-
-double uniform() {  // Knuth's MMIX generator
-  state = state * 6364136223846793005u + 1442695040888963407u;
-  return double(state >> 11) * 0x1p-53;
-}
-
-double normal() {
-  double sum = -6.0;
-  for (int k = 0; k < 12; k++) sum += uniform();
-  return sum;
-}
-
-void add(std::span<const double> numbers) {  // FNV-1a
-  for (const double x : numbers) {
-    std::uint64_t bits = __builtin_bit_cast(std::uint64_t, x);
-    for (int k = 0; k < 8; k++, bits >>= 8) hash = (hash ^ (bits & 255)) * 1099511628211u;
-  }
-}
+using bits::add, bits::normal, bits::uniform;
 
 // Every second system is dense enough for a panel that is factored by blocks.
 void run_sparse(int number) {
@@ -62,5 +42,5 @@ void run_sparse(int number) {
 
 int main() {
   for (int number = 0; number < 40; number++) run_sparse(number);
-  std::printf("%016llx\n", static_cast<unsigned long long>(hash));
+  bits::print();
 }
