@@ -1,6 +1,7 @@
 """Runs of experiments: in processes of their own, kept as they come, none lost by another's end."""
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -8,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from joblib.externals.loky.process_executor import _ExecutorManagerThread
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -158,19 +159,34 @@ def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
     assert time.monotonic() - begun < 200.0
 
 
+@pytest.mark.parametrize("error", [KeyError, ValueError])
 def test_leaving_while_a_case_is_handed_over_leaves_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = _ExecutorManagerThread.is_shutting_down
+    """The pool's thread fails with a KeyError on that case; another error is shown."""
+    task = counted(1.0)
 
-    def later(self: _ExecutorManagerThread) -> bool:
-        time.sleep(0.3)  # until the main thread has left, with the next case in the pool's queue
-        return bool(asked(self))
+    class PoolThread(threading.Thread):
+        __module__ = TerminatedWorkerError.__module__
 
-    monkeypatch.setattr(_ExecutorManagerThread, "is_shutting_down", later)
-    runs = Cases(tmp_path).run([counted(float(each)) for each in range(6)], 2)
+        def run(self) -> None:
+            raise error("a case")
+
+    def left_early(*_: object) -> Iterator[Done]:
+        try:
+            yield Done(task, {})
+        finally:
+            thread = PoolThread()
+            thread.start()
+            thread.join()
+
+    shown: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", shown.append)
+    monkeypatch.setattr(Cases, "_parallel", left_early)
+    runs = Cases(tmp_path).run([task, counted(2.0)], 2)
     next(runs)
     runs.close()  # type: ignore[attr-defined] # a generator
+    assert [each.exc_type for each in shown] == [each for each in [error] if each is not KeyError]
 
 
 def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:
