@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "gauss_newton.hpp"
 #include "gaussian.hpp"
 
 namespace teamslam::maps {
@@ -12,8 +13,7 @@ using dense::Matrix;
 using Numbers = std::vector<double>;
 
 constexpr double SHARES[] = {1.0, 0.5, 0.25, 0.125, 0.0625};  // of an undamped step, tried before damping
-constexpr double LEAST_DAMPING = 1e-4, MOST_DAMPING = 1e8;
-constexpr double ROUNDING = 1e-10;  // relative rise of the cost accepted as rounding near the minimum
+constexpr double MOST_DAMPING = 1e8;
 
 // The largest size of a number; NaN where there is one.
 double largest(const Numbers& x) {
@@ -143,14 +143,14 @@ struct Chain::Problem {
         if (damping > 0.0 && share < 1.0) break;
         Numbers after = moved(step, share);
         const double now = cost(after);
-        if (now <= chi2 * (1.0 + ROUNDING) + ROUNDING) {
+        if (gauss_newton::is_accepted(now, chi2)) {
           state = std::move(after);
           chi2 = now;
-          return {damping > LEAST_DAMPING ? damping / 10.0 : 0.0, change};
+          return {gauss_newton::lower_damping(damping), change};
         }
       }
       if (refused == elementary::INF) refused = change;
-      damping = pack::max(10.0 * damping, LEAST_DAMPING);
+      damping = gauss_newton::raise_damping(damping);
     }
     return {elementary::INF, refused};
   }

@@ -1,5 +1,7 @@
 #include "estimate.hpp"
 
+#include "gauss_newton.hpp"
+
 namespace teamslam::graph {
 
 namespace {
@@ -331,11 +333,11 @@ Step Estimate::take_step(double damping, int halvings, double most_damping) cons
     double share = 1.0;
     for (int k = 0; k <= (damping != 0.0 ? 0 : halvings); k++, share *= 0.5) {
       const Estimate after(graph_, moved(step, share), scale_, sighting_scale_, loss_);
-      if (cost_of(after) <= before * (1.0 + ROUNDING) + ROUNDING)
-        return {after.state_, damping > LEAST_DAMPING ? damping / 10.0 : 0.0, largest};
+      if (gauss_newton::is_accepted(cost_of(after), before))
+        return {after.state_, gauss_newton::lower_damping(damping), largest};
     }
     if (!refused) refused = largest;
-    damping = pack::max(10.0 * damping, LEAST_DAMPING);
+    damping = gauss_newton::raise_damping(damping);
   }
   return {{}, elementary::INF, refused.value_or(elementary::INF)};
 }

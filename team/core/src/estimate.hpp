@@ -11,8 +11,6 @@
 namespace teamslam::graph {
 
 inline constexpr double LEAST_WEIGHT = 1e-6;  // of a landmark, so that each stays determined
-inline constexpr double LEAST_DAMPING = 1e-4;
-inline constexpr double ROUNDING = 1e-10;  // the relative rise of the cost that is rounding near the minimum
 
 struct Loss {
   std::optional<double> robust_c;  // Cauchy's scale; none for least squares
