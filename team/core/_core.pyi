@@ -734,21 +734,6 @@ class Odometry:
     def forget_sightings(self) -> None:
         """Forget the marked sightings."""
 
-class Random:
-    """
-    Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
-    of the count of numbers drawn before.
-    """
-
-    def __init__(self, key: bytes) -> None:
-        """Begin at the first number of a key of 16 bytes."""
-
-    def uniform(self) -> float:
-        """Draw a number in [0, 1)."""
-
-    def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
-        """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
-
 def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
 

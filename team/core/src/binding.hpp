@@ -235,7 +235,6 @@ void bind_graph(nb::module_& m);
 void bind_maps(nb::module_& m);
 void bind_models(nb::module_& m);
 void bind_motion(nb::module_& m);
-void bind_random(nb::module_& m);
 void bind_se2(nb::module_& m);
 void bind_sparse(nb::module_& m);
 void bind_window(nb::module_& m);
