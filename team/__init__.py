@@ -1,1 +1,1 @@
-"""What every robot carries (estimation, wire, recording) and the robot itself."""
+"""The robot, and the parts that every process shares: estimation, wire, recording."""

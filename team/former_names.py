@@ -16,7 +16,7 @@ VALUES = {("outlier_kind", "reading"): "measurement"}
 
 
 def with_current_names(value: Any) -> Any:
-    """What was decoded from the JSON of a scenario or a configuration, with today's names."""
+    """Replace former names in the decoded JSON of a scenario or a configuration."""
     if isinstance(value, list):
         return [with_current_names(each) for each in value]
     if not isinstance(value, dict):

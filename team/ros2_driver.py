@@ -54,7 +54,7 @@ OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
 
 @runtime_checkable
 class Robot(Protocol):
-    """What is needed of a driver."""
+    """The methods of a driver that are used here."""
 
     @property
     def sensor_mount(self) -> tuple[float, float, float] | None:
@@ -125,12 +125,12 @@ class Ros2Driver:
 
     @property
     def keys(self) -> list[str]:
-        """What to subscribe to."""
+        """Key expressions to subscribe to."""
         return expressions(sorted(self._names - self._static), self._domain)
 
     @property
     def latched(self) -> list[str]:
-        """What was published once, before or after this driver has begun: static transforms."""
+        """Key expressions of latched topics (static transforms), published once at any time."""
         return expressions(sorted(self._static), self._domain)
 
     tokens = (BRIDGE_TOKENS,)
@@ -297,7 +297,7 @@ class Ros2Driver:
         return question if now - self._undecided_at_s > SILENT_S else ""
 
     def warnings(self) -> tuple[str, ...]:
-        """What is lost or late, why, and what to do."""
+        """Describe lost and late messages, with cause and remedy."""
         said = [
             f"{topic}: {count:,} messages were published and never came, "
             f"{100.0 * count / (count + self.lost.numbered[topic]):.1f} %: a queue of the "

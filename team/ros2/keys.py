@@ -12,7 +12,7 @@ RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
 ESCAPED = "%"
-"""What rmw_zenoh writes for / in its liveliness tokens."""
+"""The character for / in the liveliness tokens of rmw_zenoh."""
 STATIC = "tf_static"
 MOVING = "tf"
 
