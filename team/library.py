@@ -16,7 +16,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from teamslam.team.estimation.hybrid_slam import window as windows
@@ -186,12 +186,11 @@ def submap_of(
     closing a window are not used. Raises NotACovarianceError for a degenerate window.
     Brooks and Bailey 2009, HybridSLAM.
     """
-    window = windows.opened(front_end or FrontEnd(), sensor)
+    window = windows.open_window(front_end or FrontEnd(), sensor)
+    random = core.Random(generator.bytes(16))
     for keyframe in keyframes:
         taken = keyframe.calibrated(sensor)
-        window = windows.advanced(
-            window, taken.increment, taken.ids, taken.ranges, taken.bearings, generator
-        )
+        windows.advance(window, taken.increment, taken.ids, taken.ranges, taken.bearings, random)
     return windows.gaussian(window)
 
 

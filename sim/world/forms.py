@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from teamslam.sim.world.odometry import Column, deviation
 from teamslam.sim.world.sensing import Visible
+from teamslam.team import core
 from teamslam.team.config import MotionModel, Sensor
 
 Rows = Float[np.ndarray, "K 3"]
@@ -20,14 +21,14 @@ LARGEST_CORRELATION = 0.8
 def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:
     """Sensor poses for base poses and a mount."""
     x, y, heading = mount
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    c, s = core.cos(poses[:, 2]), core.sin(poses[:, 2])
     return np.column_stack([
         poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, poses[:, 2] + heading
     ])  # fmt: skip
 
 
 def _turned(xy: Float[np.ndarray, "K 2"], angle: Column) -> Float[np.ndarray, "K 2"]:
-    c, s = np.cos(angle), np.sin(angle)
+    c, s = core.cos(angle), core.sin(angle)
     return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
 
 
@@ -54,8 +55,9 @@ def measured_increments(
     shares = np.sqrt(1.0 - correlation**2)
     ahead, left, turn = sigmas.T * normals.T
     left = correlation * sigmas[:, 1] * normals[:, 2] + shares * left
-    half = np.sinc(0.5 * turn / np.pi)
-    moved = half[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
+    half = 0.5 * turn
+    chord = np.divide(core.sin(half), half, out=np.ones_like(half), where=half != 0.0)
+    moved = chord[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
     measured_turn = true_turn - turn
     measured = displacement - _turned(moved, measured_turn)
     angle = np.mod(measured_turn + np.pi, 2.0 * np.pi) - np.pi
@@ -97,7 +99,7 @@ def claimed(
     if points:
         angle = np.pi * uniform[:, 2]
         a, b = (sensor.range_sigma * first) ** 2, (sensor.range_sigma * second) ** 2
-        c, s = np.cos(angle), np.sin(angle)
+        c, s = core.cos(angle), core.sin(angle)
         return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c])
     a, b = sensor.range_sigma * first, sensor.bearing_sigma * second
     rho = LARGEST_CORRELATION * (2.0 * uniform[:, 2] - 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
+from teamslam.team import core
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def _of_ranges(
     points: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """(rr, rb, bb) of points with (xx, xy, yy): J S Jᵀ with J = ∂(range, bearing)/∂(x, y)."""
-    ranges = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-6)
+    ranges = np.maximum(core.hypot(points[:, 0], points[:, 1]), 1e-6)
     c, s = (points / ranges[:, np.newaxis]).T
     xx, xy, yy = covariances.T
     rr = c * c * xx + 2.0 * c * s * xy + s * s * yy

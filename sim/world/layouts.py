@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teamslam.sim.world.config import SimulatedWorld
+from teamslam.team import core
 
 INNER = 0.1
 """Least wall distance of a landmark, as a share of a room's side."""
@@ -24,5 +25,5 @@ def _twins(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray,
     count = world.landmark_count
     first = rng.uniform(0.0, world.size_m, ((count + 1) // 2, 2))
     angle = rng.uniform(0.0, 2.0 * np.pi, len(first))
-    second = first + world.twin_m * np.column_stack((np.cos(angle), np.sin(angle)))
+    second = first + world.twin_m * np.column_stack((core.cos(angle), core.sin(angle)))
     return np.asarray(np.concatenate((first, second))[:count])

@@ -7,6 +7,7 @@ noise, converted back through its calibration. The formulas follow the sources, 
 import numpy as np
 from jaxtyping import Float
 
+from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise
 
 Column = Float[np.ndarray, " K"]
@@ -35,11 +36,11 @@ def measured_speeds(
     |d| = (|v| − turn_drag·|ω|)·t; they are divided by the scales.
     """
     of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
-    forward = np.hypot(deviation(motion.forward, seconds, steps), of_way)
-    turn = np.hypot(deviation(motion.turn, seconds, steps), of_turn)
+    forward = core.hypot(deviation(motion.forward, seconds, steps), of_way)
+    turn = core.hypot(deviation(motion.turn, seconds, steps), of_turn)
     if motion.shares is not None:
         along, _, heading = _of_the_way(motion, steps, seconds)
-        forward, turn = np.hypot(forward, along), np.hypot(turn, heading)
+        forward, turn = core.hypot(forward, along), core.hypot(turn, heading)
     way = steps[:, 0] + forward * normals[:, 0]
     turned = steps[:, 1] + turn * normals[:, 1]
     if motion.wheel_base is not None:
@@ -58,10 +59,10 @@ def slip(
     """Final rotation [rad] and left slip [m] of a step, which odometry does not measure."""
     steps, duration = np.array([step]), np.array([seconds])
     _, _, of_turn = _interval_deviations(motion, steps, duration)
-    turn = np.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
+    turn = core.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
     left = deviation(motion.lateral, duration, steps) * normals[1]
     if motion.shares is not None:
-        sigma = np.hypot(
+        sigma = core.hypot(
             deviation(motion.lateral, duration, steps), _of_the_way(motion, steps, duration)[1]
         )
         left = sigma * normals[1]

@@ -6,11 +6,13 @@ cuts a polyline into equal steps, `driven` steers between way-points.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from math import atan2, cos, hypot, pi, sin
+from math import pi
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+
+from teamslam.team.core import atan2, cos, hypot, sin
 
 Kind = Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"]
 Pose = tuple[float, float, float]
@@ -54,17 +56,17 @@ def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
 
     A step across a corner is its chord. The first pose points along the first step.
     """
-    legs = np.hypot(*np.diff(way_points, axis=0).T)
+    legs = hypot(*np.diff(way_points, axis=0).T)
     arc = np.concatenate(([0.0], np.cumsum(legs)))
     at = np.linspace(0.0, arc[-1], steps + 1)
     xy = np.column_stack([np.interp(at, arc, way_points[:, i]) for i in (0, 1)])
     chord = np.diff(xy, axis=0)
-    heading = np.arctan2(chord[:, 1], chord[:, 0])
+    heading = atan2(chord[:, 1], chord[:, 0])
     heading = np.concatenate((heading[:1], heading))
     turns = np.array([wrapped(turn) for turn in np.diff(heading)])
     return Drive(
         poses=np.column_stack([xy, heading]),
-        steps=np.column_stack([np.hypot(chord[:, 0], chord[:, 1]), turns]),
+        steps=np.column_stack([hypot(chord[:, 0], chord[:, 1]), turns]),
     )
 
 
@@ -108,7 +110,7 @@ def moved(
         chord, direction = distance, end
     else:
         half = 0.5 * turn
-        chord, direction = distance * float(np.sinc(half / pi)), heading + half
+        chord, direction = distance * (sin(half) / half if half else 1.0), heading + half
     return (
         x + chord * cos(direction) - lateral * sin(end),
         y + chord * sin(direction) + lateral * cos(end),

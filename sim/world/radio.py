@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int64
 
 from teamslam.sim.world.config import Radio
 from teamslam.sim.world.streams import RobotStream
+from teamslam.team import core
 
 PERIOD_NS = 1_000_000_000
 """Team time [ns] of constant reach."""
@@ -50,7 +51,7 @@ def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
     if radio.comm_range_m is not None:
         at = [_positions(stream, times) for stream in streams]
         for k, (i, j) in enumerate(couples):
-            pairs[:, k] = np.hypot(*(at[i] - at[j]).T) <= radio.comm_range_m
+            pairs[:, k] = core.hypot(*(at[i] - at[j]).T) <= radio.comm_range_m
     if radio.windows:
         seconds = (times - first_ns) * 1e-9
         opened = np.zeros_like(pairs)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
+from teamslam.team import core
 from teamslam.team.config import Sensor
 
 SHORTEST_MEASUREMENT_M = 0.05
@@ -37,9 +38,9 @@ def visible(
     """
     dx = points[..., 0] - poses[:, :1]
     dy = points[..., 1] - poses[:, 1:2]
-    ranges = np.hypot(dx, dy)
+    ranges = core.hypot(dx, dy)
     steps, seen = np.nonzero((ranges >= nearest) & (ranges <= farthest))
-    bearings = on_circle(np.arctan2(dy[steps, seen], dx[steps, seen]) - poses[steps, 2])
+    bearings = on_circle(core.atan2(dy[steps, seen], dx[steps, seen]) - poses[steps, 2])
     inside = np.abs(bearings) <= 0.5 * field_of_view
     steps, seen = steps[inside], seen[inside]
     return Visible(steps, seen, ranges[steps, seen], bearings[inside])
@@ -59,7 +60,7 @@ def persistent(
     order = np.lexsort((seen.steps, seen.points))
     repeated = np.flatnonzero(np.diff(seen.points[order]) == 0) + 1
     gaps = np.diff(seen.steps[order])[repeated - 1] * step_s
-    correlation = np.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
+    correlation = core.exp(-gaps[:, np.newaxis] / np.maximum(times, SHORTEST_TIME_S))
     for row, rho in zip(repeated.tolist(), correlation, strict=True):
         before = constant[order[row - 1]]
         constant[order[row]] = rho * before + np.sqrt(1.0 - rho**2) * constant[order[row]]
@@ -88,10 +89,10 @@ def measurements(
         straight = raw
         for _ in range(LENS_ROUNDS):
             raw = straight + raw * (lens.linear + raw * (lens.square + raw * lens.cubic))
-    sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * seen.ranges)
+    sigma = core.hypot(sensor.range_sigma, sensor.range_sigma_per_m * seen.ranges)
     distances = seen.ranges + sigma * errors[:, 0]
     if sensor.range_is_depth:
-        distances = distances * np.cos(raw - sensor.optical_axis)
+        distances = distances * core.cos(raw - sensor.optical_axis)
     ranges = sensor.range_scale * distances + sensor.range_offset
     bearings = raw + sensor.bearing_sigma * errors[:, 1]
     return np.maximum(ranges, SHORTEST_MEASUREMENT_M), on_circle(bearings)

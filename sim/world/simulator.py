@@ -8,7 +8,6 @@ further robot leaves the others' noise unchanged.
 import hashlib
 from collections.abc import Iterator, Sequence
 from itertools import islice
-from math import atan2, hypot
 
 import numpy as np
 from jaxtyping import Float, Int64, UInt32
@@ -42,7 +41,9 @@ from teamslam.sim.world.streams import (
     grouped,
     moved,
 )
+from teamslam.team import core
 from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.core import atan2, hypot
 
 LEAST_RADIUS = 1.5
 """Turning radius of a simulated car, in wheel bases."""
@@ -94,7 +95,7 @@ def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[n
     if world.radius_m is None:
         return uniform * world.size_m
     radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
-    return np.column_stack((radius * np.cos(direction), radius * np.sin(direction)))
+    return np.column_stack((radius * core.cos(direction), radius * core.sin(direction)))
 
 
 def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> Drive:
@@ -253,7 +254,7 @@ def _observations(
         return _with_claims(world, robot, seen, (at_ns, offsets, ids), seed)
     ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
     if world.landmark_form == "points":
-        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+        points = np.column_stack([ranges * core.cos(bearings), ranges * core.sin(bearings)])
         return Detections(at_ns, offsets, ids, ranges, bearings, points)
     clean = Detections(at_ns, offsets, ids, ranges, bearings)
     if not world.outlier_share:
@@ -289,9 +290,9 @@ def _with_claims(
     covariances = claimed(seen, robot.sensor, world.landmark_claims, uniform, points=points)
     claims = covariances / world.claims_factor
     if points:
-        ahead = np.column_stack([np.cos(seen.bearings), np.sin(seen.bearings)])
+        ahead = np.column_stack([core.cos(seen.bearings), core.sin(seen.bearings)])
         xy = with_errors(seen.ranges[:, np.newaxis] * ahead, covariances, normals)
-        polar = np.hypot(xy[:, 0], xy[:, 1]), np.arctan2(xy[:, 1], xy[:, 0])
+        polar = core.hypot(xy[:, 0], xy[:, 1]), core.atan2(xy[:, 1], xy[:, 0])
         return Detections(*messages, *polar, xy, claims)
     true = np.column_stack([seen.ranges, seen.bearings])
     ranges, bearings = with_errors(true, covariances, normals).T

@@ -869,6 +869,21 @@ def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int6
     of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
     """
 
+class Random:
+    """
+    Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
+    of the count of numbers drawn before.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        """Begin at the first number of a key of 16 bytes."""
+
+    def uniform(self) -> float:
+        """Draw a number in [0, 1)."""
+
+    def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
+        """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 
@@ -966,9 +981,6 @@ class Window:
     @staticmethod
     def of_particles(poses: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], ids: NDArray[numpy.uint32], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], noise: Sequence[float], improved: bool = True) -> Window:
         """Make a window whose particles are these, without a keyframe."""
-
-    def copy(self) -> Window:
-        """Copy the window."""
 
     def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> Step:
         """

@@ -4,16 +4,27 @@ import hashlib
 
 import numpy as np
 
+from teamslam.team import core
+
+
+def random_numbers(seed: int, robot: str, incarnation: int, sequence: int) -> core.Random:
+    """Make the counter-based random numbers (Philox 4x64) of one window of one robot.
+
+    The key is the BLAKE2b digest of (seed, robot, incarnation, sequence), so streams of different
+    windows are independent, and none depends on the draws of another.
+    """
+    return core.Random(_key(seed, robot, incarnation, sequence))
+
 
 def generator(seed: int, robot: str, incarnation: int, sequence: int) -> np.random.Generator:
-    """Make the counter-based generator (Philox 4x64) of one window of one robot.
+    """Make NumPy's generator of the key of `random_numbers`, whose normal numbers are NumPy's."""
+    key = int.from_bytes(_key(seed, robot, incarnation, sequence), "little")
+    return np.random.Generator(np.random.Philox(key=key))
 
-    Its 128-bit key is the BLAKE2b digest of (seed, robot, incarnation, sequence), so streams of
-    different windows are independent, and none depends on the draws of another.
-    """
-    digest = hashlib.blake2b(
+
+def _key(seed: int, robot: str, incarnation: int, sequence: int) -> bytes:
+    return hashlib.blake2b(
         f"{seed}/{robot}/{incarnation}/{sequence}".encode(),
         digest_size=16,
         person=b"teamslam window",
     ).digest()
-    return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))

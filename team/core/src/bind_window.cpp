@@ -256,7 +256,6 @@ void bind_window(nb::module_& m) {
           },
           "poses"_a, "log_weights"_a, "ids"_a.noconvert(), "means"_a, "covariances"_a, "noise"_a, "improved"_a = true,
           "Make a window whose particles are these, without a keyframe.")
-      .def("copy", [](const Window& self) { return Window(self); }, "Copy the window.")
       .def(
           "advance",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,

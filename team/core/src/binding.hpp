@@ -237,6 +237,7 @@ void bind_models(nb::module_& m);
 void bind_motion(nb::module_& m);
 void bind_se2(nb::module_& m);
 void bind_sparse(nb::module_& m);
+void bind_random(nb::module_& m);
 void bind_window(nb::module_& m);
 
 }  // namespace teamslam::binding

@@ -23,5 +23,6 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_motion(m);
   binding::bind_se2(m);
   binding::bind_sparse(m);
+  binding::bind_random(m);
   binding::bind_window(m);
 }

@@ -15,7 +15,7 @@ from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from teamslam.team.estimation.hybrid_slam.outliers import OutlierGate
-from teamslam.team.estimation.hybrid_slam.redrawing import redrawn
+from teamslam.team.estimation.hybrid_slam.redrawing import redraw_paths
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
     AssociatedKeyframes,
     associate_keyframes,
@@ -24,7 +24,7 @@ from teamslam.team.estimation.hybrid_slam.window import Window
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.mount import of_base
 from teamslam.team.estimation.plausible import submap_beyond
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.estimation.submap import LocalMap
 
 DEPLETED = 10.0
@@ -56,9 +56,9 @@ class OpenWindow:
         front = config.front_end
         if times > 1:
             front = msgspec.structs.replace(front, particles=times * front.particles)
-        self.particles = windows.opened(front, config.sensor)
+        self.particles = windows.open_window(front, config.sensor)
         self._least = math.inf
-        self._generator = generator(config.seed, config.id, *self._key)
+        self._random = random_numbers(config.seed, config.id, *self._key)
         self.keyframes_ns: list[int] = []
 
     @property
@@ -118,20 +118,20 @@ class OpenWindow:
         self._take(self._gate.admit(bounded) if self._gate.judges else bounded)
 
     def _take(self, keyframe: Keyframe) -> None:
-        self.particles = windows.advanced(
+        windows.advance(
             self.particles,
             keyframe.increment,
             keyframe.ids,
             keyframe.ranges,
             keyframe.bearings,
-            self._generator,
+            self._random,
             keyframe.forward,
             own=keyframe.own,
         )
         self._least = min(self._least, self.particles.effective)
         self.keyframes_ns.append(keyframe.stamp_ns)
         if keyframe.is_node:
-            self.particles = windows.marked(self.particles, keyframe.stamp_ns)
+            windows.mark_node(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
         keyframes = self._gate.confirm() if self._gate.judges else tuple(self._keyframes)
@@ -148,7 +148,7 @@ class OpenWindow:
         if has_unnamed or self._gate.judges:
             self._take_all(keyframes)
         if has_unnamed:
-            self.particles = redrawn(self.particles, keyframes, self._generator)
+            redraw_paths(self.particles, keyframes, self._random)
         sensor = self._config.sensor
         white = sensor.range_white == sensor.bearing_white == 1.0
         if self._least < DEPLETED and white and not has_unnamed:
@@ -160,7 +160,7 @@ class OpenWindow:
             self._take(keyframe)
 
     def _go(self, rest: Increment, forward: np.ndarray) -> None:
-        self.particles = windows.moved(self.particles, rest, self._generator, forward)
+        windows.move(self.particles, rest, self._random, forward)
 
     def _try(self, step: Callable[..., None], *arguments: object) -> None:
         """Apply a step to the particles, unless one has failed before."""

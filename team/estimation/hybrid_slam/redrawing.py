@@ -14,7 +14,6 @@ correct what is not Gaussian, and the paths have no ancestors in common.
 
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 from jaxtyping import Float, Int64
 
@@ -36,10 +35,8 @@ uncertainty, as of particles (`open_window.DEPLETED`).
 """
 
 
-def redrawn(
-    window: Window, keyframes: Sequence[Keyframe], generator: np.random.Generator
-) -> Window:
-    """The window with paths drawn anew, if few lines of descent are left and the new ones are more.
+def redraw_paths(window: Window, keyframes: Sequence[Keyframe], random: core.Random) -> None:
+    """Draw the window's paths anew, if few lines of descent are left and the new ones are more.
 
     A sample counts by its effective size 1/Σ w², the particles with w summed over those that have
     one pose at the first keyframe. Draws 3 K M normal numbers, where it draws.
@@ -47,26 +44,24 @@ def redrawn(
     """
     weights = core.exp(window.particles.log_weights)
     if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
-        return window
+        return
     slots = _slots(window)
     scans = _scans(window, keyframes)
     landmarks = dense.product(weights, _rows(window.particles.means)).reshape(-1, 2)
     poses = window.core.mean_path()
     try:
         now = smooth_window(scans, slots, poses, landmarks)
-        paths, log_weights = _drawn(now, scans, len(weights), generator)
+        paths, log_weights = _drawn(now, scans, len(weights), random)
         means, covariances = _landmarks(window, paths, (scans, slots))
     except (np.linalg.LinAlgError, core.NotFiniteError):
-        return window
+        return
     log_weights += _likelihood(window, paths, means, covariances, (scans, slots))
     if not np.isfinite(log_weights).all():
-        return window
+        return
     log_weights, _ = normalise(log_weights)
     if effective_sample_size(log_weights) <= left:
-        return window
-    after = window.core.copy()
-    after.replace(paths, log_weights, means, covariances)
-    return msgspec.structs.replace(window, core=after)
+        return
+    window.core.replace(paths, log_weights, means, covariances)
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
@@ -103,13 +98,13 @@ def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
 
 
 def _drawn(
-    now: SmoothedWindow, scans: Scans, count: int, generator: np.random.Generator
+    now: SmoothedWindow, scans: Scans, count: int, random: core.Random
 ) -> tuple[Paths, Float[np.ndarray, " M"]]:
     """Paths from the smoothed window's Gaussian, and log p(path) − log q(path) but for a
     constant.
     """
     k = len(now.poses)
-    normals = generator.standard_normal((count, 3 * k))
+    normals = random.normals(count, 3 * k)
     L = dense.cholesky(now.covariance[: 3 * k, : 3 * k])
     xi = dense.product(normals, L.T).reshape(count, k, 3).transpose(1, 0, 2)
     paths = _composed(now.poses, xi)

@@ -7,7 +7,6 @@ and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
 import math
-from contextlib import suppress
 
 import msgspec
 import numpy as np
@@ -18,7 +17,7 @@ from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, noise_of, refused_by_name
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation_of
+from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
@@ -27,8 +26,10 @@ from teamslam.team.estimation.submap import NO_NODES, LocalMap
 STILL = np.zeros(3)
 
 
-class Window(msgspec.Struct, frozen=True, gc=False):
+class Window(msgspec.Struct, gc=False):
     """Particles since the window's start, their paths, and the measurements that they have used.
+
+    `advance`, `move` and `mark_node` change it.
 
     The core holds them; the properties are copies, K keyframes, N measurements and M particles.
     Poses are the sensor's, in the frame of the window's start of the sensor.
@@ -88,70 +89,64 @@ class Window(msgspec.Struct, frozen=True, gc=False):
         return self.core.effective
 
 
-def opened(front_end: FrontEnd, sensor: Sensor) -> Window:
+def open_window(front_end: FrontEnd, sensor: Sensor) -> Window:
     """Open a window: every particle exactly at zero, without landmarks or measurements."""
     improved = front_end.proposal == "fastslam2"
     particles = core.Window(front_end.particles, noise_of(sensor), improved, sensor.mount)
     return Window(front_end, sensor, particles)
 
 
-def advanced(
+def advance(
     window: Window,
     increment: Increment,
     ids: UInt32[np.ndarray, " n"],
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
-    generator: np.random.Generator,
+    random: core.Random,
     forward: Float[np.ndarray, "3"] = STILL,
     *,
     own: Own | None = None,
-) -> Window:
-    """One keyframe: the motion since the last one, then its measurements (there may be
-    none).
+) -> None:
+    """Take a keyframe: the motion since the last one, then its measurements (there may be none).
 
-    The measurements are accepted and corrected already (`models.scanned`).
+    The measurements are accepted and corrected already (`models.scanned`). The innovation does not
+    count them where their predictive covariance is singular.
     forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
     own: the noises that the measurements claim (`teamslam.team.estimation.scans`).
+    Raises NotACovarianceError, and leaves the window as it was.
     """
     noises = unclaimed(len(ids)) if own is None else own
     seen, count = (ids, ranges, bearings, noises), window.front_end.particles
     is_thin = window.effective < window.front_end.resample_below * count
-    uniform = generator.random() if is_thin else None
-    normals, after = generator.standard_normal((count, 3)), window.core.copy()
+    uniform = random.uniform() if is_thin else None
+    normals = random.normals(count, 3)
     with refused_by_name():
-        step = after.advance(increment.mean, increment.covariance, *seen, uniform, normals, forward)
-    expected = Innovation(step.squared, step.dof)
-    if not math.isfinite(step.squared):
-        expected = NOTHING
-        with suppress(NotACovarianceError):  # then it is not known how well they were predicted
-            expected = innovation_of(window.core, increment, seen)
-    return msgspec.structs.replace(window, core=after, innovation=window.innovation.plus(expected))
+        step = window.core.advance(
+            increment.mean, increment.covariance, *seen, uniform, normals, forward
+        )
+    if math.isfinite(step.squared):
+        window.innovation = window.innovation.plus(Innovation(step.squared, step.dof))
 
 
-def marked(window: Window, stamp_ns: int) -> Window:
+def mark_node(window: Window, stamp_ns: int) -> None:
     """Make the particles' poses at the last keyframe a pose node at this team time."""
-    after = window.core.copy()
-    after.mark()
-    return msgspec.structs.replace(
-        window, core=after, node_stamps=np.append(window.node_stamps, stamp_ns)
-    )
+    window.core.mark()
+    window.node_stamps = np.append(window.node_stamps, stamp_ns)
 
 
-def moved(
+def move(
     window: Window,
     increment: Increment,
-    generator: np.random.Generator,
+    random: core.Random,
     forward: Float[np.ndarray, "3"] = STILL,
-) -> Window:
+) -> None:
     """Move the particles without a keyframe, as from the last one to the window's end.
 
     It never resamples: the weights of the last measurements stay as they are.
     """
-    after = window.core.copy()
-    normals = generator.standard_normal((window.front_end.particles, 3))
+    normals = random.normals(window.front_end.particles, 3)
     with refused_by_name():
-        after.move(increment.mean, increment.covariance, normals, forward)
-    return msgspec.structs.replace(window, core=after)
+        window.core.move(increment.mean, increment.covariance, normals, forward)
 
 
 def gaussian(window: Window, *, running: bool = False) -> LocalMap:

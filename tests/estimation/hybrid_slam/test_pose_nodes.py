@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from teamslam.team import core
 from teamslam.team.config import FrontEnd, Sensor
 from teamslam.team.core import POSE_JITTER
 from teamslam.team.estimation.hybrid_slam import window as windows
@@ -22,12 +23,12 @@ def seen():
 
 def driven(marks, particles=200, sensor=SENSOR, biases=()):
     """Four keyframes; landmarks are seen at the first; marked as nodes: those in `marks`."""
-    generator = np.random.default_rng(1)
-    window = windows.opened(FrontEnd(particles=particles, biases=biases), sensor)
+    random = core.Random(b"a key of 16 byte")
+    window = windows.open_window(FrontEnd(particles=particles, biases=biases), sensor)
     for k in range(4):
-        window = windows.advanced(window, STEP, *(seen() if k == 0 else NOTHING), generator)
+        windows.advance(window, STEP, *(seen() if k == 0 else NOTHING), random)
         if k in marks:
-            window = windows.marked(window, 1000 * k)
+            windows.mark_node(window, 1000 * k)
     return window
 
 

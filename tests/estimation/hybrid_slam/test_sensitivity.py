@@ -20,7 +20,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.joining import JoinSettings, converged, folded, started
 from teamslam.team.estimation.models import increment_of, model_of
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from tests.estimation.submap_world import local_truth, team, wrap
@@ -41,8 +41,8 @@ MOTION = MotionModel(
 def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
     """A robot drives a curve among six landmarks, read without noise but with these errors."""
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
-    front = FrontEnd(particles=400, resample_below=0.0, biases=BIASES)
-    window, random = windows.opened(front, sensor), generator(1, "r1", 0, 0)
+    front = FrontEnd(particles=1600, resample_below=0.0, biases=BIASES)
+    window, random = windows.open_window(front, sensor), random_numbers(1, "r1", 0, 0)
     landmarks = np.array([[4, 3], [6, -3], [9, 2], [3, -4], [11, -2], [8, 6]], dtype=float)
     pose = np.zeros(3)
     for _ in range(8):
@@ -51,7 +51,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
         ranges = np.hypot(*offset.T)
         seen = np.flatnonzero(ranges < 8.0)
         bearings = wrap(np.arctan2(*offset.T[::-1]) - pose[2])[seen]
-        window = windows.advanced(
+        windows.advance(
             window,
             increment_of(MOTION, 1.0, 1.0 / (1.0 + forward_scale), 0.1),
             seen.astype(np.uint32),
@@ -78,14 +78,15 @@ def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements
 
 def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     front = FrontEnd(particles=10, biases=BIASES)
-    window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
+    window, random = windows.open_window(front, Sensor()), random_numbers(1, "r1", 0, 0)
     motion = msgspec.structs.replace(MOTION, calibrated_speed=(0.5, 2.0))
     seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
     step, column = (
         increment_of(motion, 1.0, 1.0, 0.1),
         model_of(motion).forward_column(1.0, 1.0, 0.1),
     )
-    local = windows.gaussian(windows.advanced(window, step, *seen, random, column))
+    windows.advance(window, step, *seen, random, column)
+    local = windows.gaussian(window)
     assert local.biases == ("bearing", "range_offset", "range_scale")
     assert local.sensitivity.shape == (3, 5)
 
@@ -95,9 +96,10 @@ def test_columns_change_nothing_else():
     made = []
     for biases in ((), BIASES):
         front = FrontEnd(particles=10, biases=biases)
-        window, random = windows.opened(front, Sensor()), generator(1, "r1", 0, 0)
+        window, random = windows.open_window(front, Sensor()), random_numbers(1, "r1", 0, 0)
         step = increment_of(MOTION, 1.0, 1.0, 0.1)
-        made.append(windows.gaussian(windows.advanced(window, step, *seen, random)))
+        windows.advance(window, step, *seen, random)
+        made.append(windows.gaussian(window))
     assert np.array_equal(made[0].mean, made[1].mean)
     assert np.array_equal(made[0].covariance, made[1].covariance)
     assert made[0].biases == ()
