@@ -133,7 +133,7 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
 def test_the_linear_algebra_of_a_command_has_one_thread() -> None:
     code = (
-        "import os, teamslam.sim.cli.main, numpy, scipy.linalg\n"
+        "import os, teamslam.sim.cli.entry, numpy, scipy.linalg\n"
         "for library in numpy, scipy: library.linalg.inv(numpy.eye(64))\n"
         "print(len(os.listdir('/proc/self/task')))"
     )
