@@ -9,10 +9,13 @@ import tomllib
 from importlib import metadata
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from teamslam.team import shapes
 
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
@@ -128,6 +131,27 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
     named = commands(ROOT / page, "make") | spoken
     assert named
     assert named <= targets
+
+
+def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> None:
+    """Each costs every robot of a team memory and time."""
+    code = (
+        "import sys; sys.argv = ['teamslam', 'robot', '--help']\n"
+        "from teamslam.sim.cli.entry import main\n"
+        "import teamslam.team.robot.main, teamslam.team.wire.zenoh.bus\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print(*sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    loaded = set(ran.stdout.splitlines()[-1].split())
+    assert "Run a robot" in ran.stdout
+    kept_out = {"jaxtyping", "mcap", "scipy", "matplotlib", "pydantic", "teamslam.sim.cli.main"}
+    assert loaded.isdisjoint(kept_out)
+
+
+def test_shapes_are_checked_in_tests() -> None:
+    assert shapes.Float is jaxtyping.Float
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
