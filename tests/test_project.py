@@ -136,7 +136,7 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
 def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> None:
     """Each costs every robot of a team memory and time."""
     code = (
-        "import sys; sys.argv = ['teamslam', 'robot', '--help']\n"
+        "import sys; sys.argv = ['teamslam', 'robot', 'waypoints', 'r9']\n"
         "from teamslam.sim.cli.entry import main\n"
         "import teamslam.team.robot.main, teamslam.team.wire.zenoh.bus\n"
         "try: main()\n"
@@ -145,7 +145,7 @@ def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> N
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     loaded = set(ran.stdout.splitlines()[-1].split())
-    assert "Run a robot" in ran.stdout
+    assert "has no robot 'r9'" in ran.stderr
     kept_out = {"jaxtyping", "mcap", "scipy", "matplotlib", "pydantic", "teamslam.sim.cli.main"}
     assert loaded.isdisjoint(kept_out)
 

@@ -10,6 +10,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
 from teamslam.sim.cli.options import FAILED, WRONG_USE  # noqa: E402
+from teamslam.sim.cli.plain import parse_plainly  # noqa: E402
 
 PROCESSES = ("router", "record", "central", "robot", "world")
 """Commands that run beside many others: the rest of the command line is not imported for them."""
@@ -18,7 +19,7 @@ PROCESSES = ("router", "record", "central", "robot", "world")
 def main() -> None:
     """Run a command; wrong use exits with 2, a failed run with 1, without a traceback."""
     try:
-        typer.main.get_command(_application())()
+        _run(sys.argv[1:])
     except Exception as error:
         from teamslam.team.wire.text import lines
 
@@ -30,17 +31,21 @@ def main() -> None:
         sys.exit(status)
 
 
-def _application() -> typer.Typer:
-    if len(sys.argv) > 1 and sys.argv[1] in PROCESSES:
-        from teamslam.sim.cli.help import new_application
-        from teamslam.sim.cli.nodes import app as processes
+def _run(words: list[str]) -> None:
+    if words and words[0] in PROCESSES:
+        from teamslam.sim.cli import nodes
 
-        app = new_application()
-        app.add_typer(processes)
-        return app
-    from teamslam.sim.cli.main import app as every_command
+        function = getattr(nodes, words[0])
+        arguments = parse_plainly(function, words[1:])
+        if arguments is not None:
+            try:
+                function(**arguments)
+            except typer.Exit as left:
+                sys.exit(left.exit_code)
+            return
+    from teamslam.sim.cli.main import app
 
-    return every_command
+    typer.main.get_command(app)()
 
 
 def _advice(error: Exception) -> tuple[int, str] | None:

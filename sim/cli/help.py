@@ -25,6 +25,7 @@ SECTIONS = {
 """Commands of `teamslam` by task, the most frequent first."""
 WIDEST = 100
 """Columns of a help text in a wide terminal."""
+WIDE = {"max_content_width": WIDEST}
 
 
 class Command(TyperCommand):
@@ -141,17 +142,3 @@ def _write_example(example: str | None, formatter: Any) -> None:
 def _first_sentence(text: str | None) -> str:
     first = " ".join((text or "").split("\n\n")[0].split())
     return first.removesuffix(".")
-
-
-def new_application() -> typer.Typer:
-    """`teamslam` without commands."""
-    return typer.Typer(
-        cls=Group,
-        help="Multi-robot SLAM as real processes over Zenoh.",
-        epilog="teamslam launch waypoints --view\nteamslam COMMAND --help",
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings={"max_content_width": WIDEST},
-    )

@@ -5,7 +5,7 @@ import typer
 from teamslam.sim.cli.calibrate import app as calibrate_commands
 from teamslam.sim.cli.compare import app as compare_commands
 from teamslam.sim.cli.drivers import app as driver_commands
-from teamslam.sim.cli.help import new_application
+from teamslam.sim.cli.help import WIDE, Group
 from teamslam.sim.cli.importing import app as import_commands
 from teamslam.sim.cli.keys import app as key_commands
 from teamslam.sim.cli.launch import app as launch_commands
@@ -19,7 +19,16 @@ from teamslam.sim.cli.status import app as status_commands
 from teamslam.sim.cli.studies import add_studies
 from teamslam.sim.cli.view import app as view_commands
 
-app = new_application()
+app = typer.Typer(
+    cls=Group,
+    help="Multi-robot SLAM as real processes over Zenoh.",
+    epilog="teamslam launch waypoints --view\nteamslam COMMAND --help",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings=WIDE,
+)
 for _part in (
     launch_commands, scenario_commands, node_commands, order_commands, key_commands,
     recorded_commands, rerun_commands, compare_commands, view_commands, calibrate_commands,
