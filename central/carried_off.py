@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
 from teamslam.team import core
@@ -28,6 +27,7 @@ from teamslam.team.estimation.map_joining.landmark_view import known
 from teamslam.team.estimation.map_joining.marginals import landmark_blocks
 from teamslam.team.estimation.se2 import compose, wrapped
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float, Int64
 
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the map: two also fit their mirror image."""

@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.fused import JOINT_LANDMARKS, version_entry
@@ -29,6 +28,7 @@ from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.misfits import worst_landmark
 from teamslam.team.estimation.map_joining.refusal import refusals
 from teamslam.team.estimation.map_joining.repetition import Repetition, find_repetitions
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

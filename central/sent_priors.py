@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.estimation.contribution import Stream
@@ -22,6 +21,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     landmark_blocks,
     last_pose,
 )
+from teamslam.team.shapes import Float, Int64, UInt32
 
 EVERY = 8
 """Most broadcasts between two priors, which bounds the robot's own submaps to join and the delay of

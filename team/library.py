@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team import core, translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
@@ -36,6 +35,7 @@ from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.registry import loaded
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import WireError, decoded

@@ -5,7 +5,6 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix, packed, unpacked
@@ -15,6 +14,7 @@ from teamslam.team.estimation.map_joining.joining import Contribution, InitialPo
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
 from teamslam.team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import (
     floats,

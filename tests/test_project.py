@@ -9,10 +9,13 @@ import tomllib
 from importlib import metadata
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from teamslam.team import shapes
 
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
@@ -130,10 +133,31 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
     assert named <= targets
 
 
+def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> None:
+    """Each costs every robot of a team memory and time."""
+    code = (
+        "import sys; sys.argv = ['teamslam', 'robot', 'waypoints', 'r9']\n"
+        "from teamslam.sim.cli.entry import main\n"
+        "import teamslam.team.robot.main, teamslam.team.wire.zenoh.bus\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print(*sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    loaded = set(ran.stdout.splitlines()[-1].split())
+    assert "has no robot 'r9'" in ran.stderr
+    kept_out = {"jaxtyping", "mcap", "scipy", "matplotlib", "pydantic", "teamslam.sim.cli.main"}
+    assert loaded.isdisjoint(kept_out)
+
+
+def test_shapes_are_checked_in_tests() -> None:
+    assert shapes.Float is jaxtyping.Float
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
 def test_the_linear_algebra_of_a_command_has_one_thread() -> None:
     code = (
-        "import os, teamslam.sim.cli.main, numpy, scipy.linalg\n"
+        "import os, teamslam.sim.cli.entry, numpy, scipy.linalg\n"
         "for library in numpy, scipy: library.linalg.inv(numpy.eye(64))\n"
         "print(len(os.listdir('/proc/self/task')))"
     )

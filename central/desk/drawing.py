@@ -4,9 +4,9 @@ from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.names import in_order
+from teamslam.team.shapes import Float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
 from teamslam.team import translate
@@ -17,6 +16,7 @@ from teamslam.team.containment import Boundary
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed, window_path
 from teamslam.team.robot.node import robot_node
+from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats

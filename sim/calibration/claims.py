@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
 from teamslam.sim.calibration.figures import huber
@@ -18,6 +17,7 @@ from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_quantile
 from teamslam.team.estimation.models import Increment, corrected
 from teamslam.team.estimation.se2 import between, logarithm
+from teamslam.team.shapes import Bool, Float
 
 SPAN_NS = 10_000_000_000
 LEAST = 30

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.claims import measured_and_true
@@ -24,6 +23,7 @@ from teamslam.sim.calibration.data import Reference, poses_at
 from teamslam.sim.calibration.figures import Figure, huber, jackknife
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team.config import Sensor
+from teamslam.team.shapes import Float, Int64
 
 LEAST = 200
 """Least number of detections, and of odometry turns."""

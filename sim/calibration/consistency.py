@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import brentq
 
 from teamslam.central.config import CentralConfig
@@ -36,6 +35,7 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost
 from teamslam.team.estimation.map_joining.merging import ages
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
+from teamslam.team.shapes import Float
 
 LEAST_LANDMARKS = 3
 """Two landmarks have one invariant only, their distance."""

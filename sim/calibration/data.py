@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.world.streams import (
@@ -18,6 +17,7 @@ from teamslam.sim.world.streams import (
 from teamslam.team.config import UNNAMED, MotionModel, RobotConfig
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
+from teamslam.team.shapes import Bool, Float, Int64
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0

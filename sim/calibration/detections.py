@@ -16,7 +16,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.sim.calibration.data import interval_of, scan_of
 from teamslam.sim.calibration.figures import Figure, left_out
@@ -27,6 +26,7 @@ from teamslam.team.estimation.association.clustering import Clusters, cluster_wi
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relative_to
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
+from teamslam.team.shapes import Float, Int64
 
 LEAST_TRIALS = 50
 LEAST_SEEN = 3

@@ -8,12 +8,12 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import least_squares
 
 from teamslam.sim.calibration.data import Reference
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.team.config import MotionModel, Sensor
+from teamslam.team.shapes import Float
 
 GROUPS = 5
 """Least number of parts left out in turn; fewer robots are cut into equal time stretches."""

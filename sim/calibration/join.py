@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.errors import Path, on_circle
@@ -37,6 +36,7 @@ from teamslam.team.estimation.map_joining.joining import (
     started,
 )
 from teamslam.team.estimation.se2 import compose
+from teamslam.team.shapes import Float, Int64
 
 LONGEST_NS = 250_000_000
 """Longest merged arc interval, since windows close at interval ends."""

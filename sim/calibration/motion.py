@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import minimize
 
 from teamslam.central.desk.evaluation.errors import on_circle
 from teamslam.sim.calibration.data import Reference, poses_at, sinc
 from teamslam.sim.calibration.figures import CalibrationError, huber
 from teamslam.sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
+from teamslam.team.shapes import Float
 
 STEPS = 40
 """Steps of a span, each an arc (or rotation and chord) of the true path."""

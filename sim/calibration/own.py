@@ -16,12 +16,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from scipy.stats import f as f_distribution
 
 from teamslam.sim.calibration.data import Reference
 from teamslam.sim.calibration.figures import CalibrationError, Figure, groups_of
 from teamslam.sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
+from teamslam.team.shapes import Float
 
 LEAST_ROBOTS = 3
 LEAST_LANDMARKS = 4

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 from scipy.optimize import least_squares, minimize
 
 from teamslam.central.desk.evaluation.errors import on_circle
@@ -18,6 +17,7 @@ from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
 from teamslam.sim.calibration.figures import CalibrationError, huber
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import corrected
+from teamslam.team.shapes import Float, Int64
 
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from teamslam.central.main import CentralShell
     from teamslam.central.peers.main import CentreShell, PeerShell
     from teamslam.team.config import RobotConfig
+    from teamslam.team.recording.own_log import OwnLog
     from teamslam.team.wire.bus import Bus
 
 _LOG = logging.getLogger("teamslam")
@@ -176,9 +178,6 @@ def robot(
     After a crash it resumes after its last submap. With --peers it keeps the
     whole team's submaps and computes the team's map itself.
     """
-    from contextlib import nullcontext
-
-    from teamslam.team.recording.own_log import own_log
     from teamslam.team.robot.main import RobotShell
     from teamslam.team.shell import process
 
@@ -197,7 +196,7 @@ def robot(
     check_names(resolved.team, name)
     with (
         process(f"robot-{name}") as stop,
-        nullcontext() if log is None else own_log(log, resolved.team) as tap,
+        _own_log(log, resolved) as tap,
         connect_bus(resolved.team, connect, keys, f"robot-{name}", stop) as bus,
     ):
         bus.tap = tap
@@ -206,6 +205,14 @@ def robot(
             _peer_shell(bus, resolved, config, stop, store, fold, keys).run()
         else:
             RobotShell(bus, config, stop, exchange=resolved.exchange).run()
+
+
+def _own_log(log: Path | None, scenario: Scenario) -> AbstractContextManager["OwnLog | None"]:
+    if log is None:
+        return nullcontext()
+    from teamslam.team.recording.own_log import own_log
+
+    return own_log(log, scenario.team)
 
 
 def _peer_shell(

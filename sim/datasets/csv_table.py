@@ -9,9 +9,9 @@ from math import isfinite, nan
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.datasets.tables import LARGEST, DatasetError, File
+from teamslam.team.shapes import Float, Int64, UInt32
 
 T = TypeVar("T")
 NANO = Decimal(10**9)

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.datasets.csv_table import CsvTable, cells_of, read_table
 from teamslam.sim.datasets.folder_files import name_table
@@ -19,6 +18,7 @@ from teamslam.sim.datasets.some_rows import covariances_of
 from teamslam.sim.datasets.tables import File
 from teamslam.sim.world.identities import in_order
 from teamslam.sim.world.streams import NO_LABEL, Detections
+from teamslam.team.shapes import Float, Int64, UInt32
 
 COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m")
 LABELS = ("landmark",)

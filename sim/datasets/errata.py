@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+
+from teamslam.team.shapes import Float
 
 
 @dataclass(frozen=True)

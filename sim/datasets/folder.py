@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.sim.datasets import folder_tables as rows
 from teamslam.sim.datasets.csv_table import CsvTable, read_table
@@ -38,6 +37,7 @@ from teamslam.sim.world.streams import (
     WorldStreams,
 )
 from teamslam.team.config import RobotConfig
+from teamslam.team.shapes import Float, Int64
 
 COVARIANCE = POSE_COVARIANCE
 TABLES = {

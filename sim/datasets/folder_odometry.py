@@ -1,7 +1,6 @@
 """Convert a robot's odometry.csv of any form to ordered intervals."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.sim.datasets.csv_table import CsvTable, conversion
 from teamslam.sim.datasets.folder_tables import (
@@ -18,6 +17,7 @@ from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_co
 from teamslam.sim.world.streams import Intervals, moved
 from teamslam.team.config import Bounds
 from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
+from teamslam.team.shapes import Bool, Float, Int64
 
 FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
 MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))

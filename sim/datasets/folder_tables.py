@@ -6,7 +6,6 @@ Unused rows are counted in notes, with reason and first line.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.sim.datasets.csv_table import CsvTable, conversion
 from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
@@ -17,6 +16,7 @@ from teamslam.sim.datasets.some_rows import (
     pose_covariances,
 )
 from teamslam.sim.world.streams import StartPose
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 SPEEDS = ("forward_m_s", "yaw_rate_rad_s")
 POSES = ("x_m", "y_m", "theta_rad")

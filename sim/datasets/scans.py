@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.sim.world.streams import Detections, grouped
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.datasets.csv_table import CsvTable
+from teamslam.team.shapes import Float
 
 POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 

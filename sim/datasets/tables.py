@@ -6,7 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+
+from teamslam.team.shapes import Float
 
 LARGEST = 4e9
 """Largest number of a data set (the time of the year 2096); stamps fit in int64 ns."""

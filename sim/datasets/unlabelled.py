@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.datasets.csv_table import CsvTable, read_table
 from teamslam.sim.datasets.detections_table import labels_of, scans_of
@@ -28,6 +27,7 @@ from teamslam.sim.world.streams import (
     StartPose,
     WorldStreams,
 )
+from teamslam.team.shapes import Float, Int64, UInt32
 
 FILES = ("odometry.csv", "detections.csv")
 COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")

@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.datasets.errata import erratum_of
 from teamslam.sim.datasets.tables import (
@@ -27,6 +26,7 @@ from teamslam.sim.datasets.utias_rows import start_pose
 from teamslam.sim.world.config import UtiasWorld, starts_unknown
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
+from teamslam.team.shapes import Float, UInt32
 
 ROBOTS = 5
 """Subjects 1 … 5 are robots, even without files; landmarks follow."""

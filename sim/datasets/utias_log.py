@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.sim.datasets.scans import Scans, count_note
 from teamslam.sim.datasets.tables import DatasetError, File, optional_table
 from teamslam.sim.datasets.utias_rows import intervals_of, measurements_of, truth_of
 from teamslam.sim.world.streams import Intervals
+from teamslam.team.shapes import Bool, Float, Int64
 
 TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
 ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")

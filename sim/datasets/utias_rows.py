@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.world.streams import Intervals
+from teamslam.team.shapes import Float, Int64
 
 LONG_GAP_NS = 2_000_000_000
 """Least reported gap in odometry or truth."""

@@ -5,7 +5,6 @@ from math import atan2
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.datasets.csv_table import CsvTable, read_table
 from teamslam.sim.datasets.folder_tables import (
@@ -18,6 +17,7 @@ from teamslam.sim.datasets.folder_tables import (
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
 from teamslam.sim.importing.tables import RobotTables
+from teamslam.team.shapes import Float
 
 QUATERNION = 8
 """Columns of a TUM trajectory: t x y z qx qy qz qw."""

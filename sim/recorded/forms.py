@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.datasets.detections_table import together
 from teamslam.sim.world.streams import NO_LABEL, Detections, Intervals
 from teamslam.team import translate
 from teamslam.team.estimation.scans import Scan
+from teamslam.team.shapes import Float, Int64, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
 

@@ -5,12 +5,12 @@ points with covariance. The formulas are independent of the filter's.
 """
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.world.odometry import Column, deviation
 from teamslam.sim.world.sensing import Visible
 from teamslam.team import core
 from teamslam.team.config import MotionModel, Sensor
+from teamslam.team.shapes import Float
 
 Rows = Float[np.ndarray, "K 3"]
 

@@ -6,10 +6,10 @@ The stream keeps the true identities, unpublished, for the evaluation.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 from teamslam.team import core
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Ambiguous landmark layouts: twins, and rooms with one pattern."""
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.team import core
+from teamslam.team.shapes import Float
 
 INNER = 0.1
 """Least wall distance of a landmark, as a share of a room's side."""

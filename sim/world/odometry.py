@@ -5,10 +5,10 @@ noise, converted back through its calibration. The formulas follow the sources, 
 """
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise
+from teamslam.team.shapes import Float
 
 Column = Float[np.ndarray, " K"]
 

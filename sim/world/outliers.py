@@ -5,10 +5,10 @@ comparable.
 """
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.world.config import OutlierKind
 from teamslam.sim.world.streams import Detections
+from teamslam.team.shapes import Float, UInt32
 
 
 def spoilt(

@@ -10,9 +10,9 @@ from math import pi
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.core import atan2, cos, hypot, sin
+from teamslam.team.shapes import Float
 
 Kind = Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"]
 Pose = tuple[float, float, float]

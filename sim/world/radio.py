@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.sim.world.config import Radio
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team import core
+from teamslam.team.shapes import Bool, Float, Int64
 
 PERIOD_NS = 1_000_000_000
 """Team time [ns] of constant reach."""

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
+from teamslam.team.shapes import Float, Int64
 
 SHORTEST_MEASUREMENT_M = 0.05
 """Least measured range [m]."""

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.world.config import SimulatedWorld, starts_unknown
 from teamslam.sim.world.forms import (
@@ -44,6 +43,7 @@ from teamslam.sim.world.streams import (
 from teamslam.team import core
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.core import atan2, hypot
+from teamslam.team.shapes import Float, Int64, UInt32
 
 LEAST_RADIUS = 1.5
 """Turning radius of a simulated car, in wheel bases."""

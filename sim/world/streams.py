@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt8, UInt32
+
+from teamslam.team.shapes import Bool, Float, Int64, UInt8, UInt32
 
 START = 0
 OBSERVATIONS = 1

@@ -8,11 +8,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import cholesky_factor
+from teamslam.team.shapes import Float
 
 MEDIAN_PRICE = 1.3
 """Ratio of the scatter of a χ² median of a few degrees of freedom to that of its mean."""

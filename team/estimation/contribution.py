@@ -7,12 +7,12 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Bias
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.shapes import Bool, Float, UInt32
 
 Stream: TypeAlias = tuple[str, int]
 """(robot, incarnation): one unbroken life of a robot's sensor stream."""

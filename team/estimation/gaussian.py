@@ -5,10 +5,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from teamslam.team.shapes import Float, Int64, UInt32
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]

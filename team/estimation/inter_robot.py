@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
@@ -20,6 +19,7 @@ from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.models import NEAREST_M, Increment, noise
 from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
+from teamslam.team.shapes import Float
 
 SightingKey: TypeAlias = tuple[int, str, int, str]
 """(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""

@@ -10,12 +10,12 @@ from typing import Self
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.core import NEAREST_M, located, predicted
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Bool, Float
 
 __all__ = [
     "NEAREST_M",

@@ -8,12 +8,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel
 from teamslam.team.estimation.models import Increment, increment_of, model_of
 from teamslam.team.estimation.se2 import Pose, logarithm
+from teamslam.team.shapes import Float
 
 
 class Moved(NamedTuple):

@@ -7,7 +7,6 @@ ground. A refusal is a value with its reason, not an error of the program.
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.team import core
 from teamslam.team.config import Bounds
@@ -15,6 +14,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Bool, Float
 
 Values = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]

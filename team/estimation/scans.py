@@ -10,11 +10,11 @@ SENSOR: the sensor's noise, at the predicted range.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
 from teamslam.team.estimation.models import NEAREST_M
+from teamslam.team.shapes import Bool, Float, UInt32
 
 SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
 Own = Float[np.ndarray, "_ _"]

@@ -5,7 +5,6 @@ Perturbations are on the right, in the tangent space of the pose they perturb:
 """
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.core import (
     adjoint,
@@ -18,6 +17,7 @@ from teamslam.team.core import (
     transformed,
     wrapped,
 )
+from teamslam.team.shapes import Float
 
 __all__ = [
     "Point",

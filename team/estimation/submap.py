@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, Bias
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 NO_NODES = np.empty(0, np.int64)
 NO_COLUMNS = np.empty((0, 0))

@@ -10,9 +10,9 @@ from array import array
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int64
 
 from teamslam.team.recording.inventory import intervals
+from teamslam.team.shapes import Int64
 from teamslam.team.wire.bus import NO_COUNTER, Sample
 from teamslam.team.wire.intervals import Interval, IntervalSet
 

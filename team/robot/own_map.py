@@ -8,7 +8,6 @@ odometry and the landmarks with identities.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.core import WholeMap
@@ -25,6 +24,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
 from teamslam.team.estimation.plausible import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float
 
 CLOUD_PARTICLES = 32
 """Particles in a cloud for viewers."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.ros2.definitions import types
+from teamslam.team.shapes import Float
 
 SIGMAS = 2.0
 """Radius of the ellipses in standard deviations: 86 % of a landmark's probability in the plane."""

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from math import atan2, pi, remainder
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.ros2.decoding import Quaternion, Transform, Vector
+from teamslam.team.shapes import Float
 
 DEEPEST = 32
 """Transforms between a sensor and its base at the most."""

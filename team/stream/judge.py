@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.team.config import Bounds
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.plausible import is_motion_spread as _spread
 from teamslam.team.rejection import Rejection
+from teamslam.team.shapes import Bool, Float
 
 LONGEST_NS = 2**62
 """Bound on the distance of two stamps."""

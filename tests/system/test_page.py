@@ -8,6 +8,7 @@ import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -124,7 +125,7 @@ def test_an_event_leads_to_its_time(page):
 def test_every_layer_can_be_switched_off(page):
     painted = "document.querySelector('#map').toDataURL()"
     seek(page, 30)
-    for name in ("95 % ellipses", "numbers", "paths", "truth"):
+    for name in ("95 % ellipses", "numbers", "online paths", "truth", "events"):
         page.ask("new Promise((done) => setTimeout(done, 200))")
         page.wait(f"window.before === (window.before = {painted})")  # it has come to rest
         page.ask(f"[...document.querySelectorAll('#layers button')]"
@@ -138,6 +139,54 @@ def test_traffic_and_errors_are_told(page):
     page.ask("document.querySelector('[data-robot=r3]').click()")
     page.wait("document.querySelector('#errors-of').textContent === 'r3'")
     assert 0.0 < float(page.text("[data-robot=r3] td:nth-child(6)")) < 2.0
+
+
+def test_the_map_is_written_as_svg_with_all_that_is_shown(page):
+    seek(page, 30)
+    written = ElementTree.fromstring(page.ask("teamslam.map.svg(30)"))
+    words = [each.text for each in written.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"r1", "r2", "r3"} <= set(words)
+    shown = page.ask("[...teamslam.store.mapAt(30).ids].map(String)")
+    assert set(shown) <= set(words)
+    paths = [each.get("d", "") for each in written.iter("{http://www.w3.org/2000/svg}path")]
+    assert len(paths) > 2 * len(shown)
+    assert not any("NaN" in path for path in paths)
+
+
+def test_the_keyboard_moves_time_and_follows_a_robot(page):
+    seek(page, 30)
+    for name, key in (("ArrowRight", "ArrowRight"), ("ArrowLeft", "ArrowLeft"), ("r", "r")):
+        page.call("Input.dispatchKeyEvent", type="keyDown", key=key)
+        page.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+        page.ask("new Promise((done) => setTimeout(done, 60))")
+        assert page.ask("teamslam.state.time") == {"ArrowRight": 31}.get(name, 30)
+    assert page.ask("teamslam.map.follow") == "r1"
+    page.wait(
+        "(() => { const [x, y] = teamslam.map.placeAt(teamslam.store.robots.get('r1'), 30);"
+        "const [a, b] = teamslam.map.centre; return Math.hypot(x - a, y - b) < 1e-6; })()"
+    )
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="f")
+    page.wait("teamslam.map.follow === null && teamslam.map.fitted")
+
+
+def test_every_control_is_reached_by_tab(page):
+    reached = page.ask(
+        "[...document.querySelectorAll('button, select, input, summary, [tabindex]')]"
+        ".filter((e) => e.offsetParent && e.tabIndex < 0).length"
+    )
+    assert reached == 0
+    page.ask("document.querySelector('#events li').focus()")
+    page.call("Input.dispatchKeyEvent", type="keyDown", key="Enter")
+    page.wait("document.querySelector('#now').textContent === '0.0'")
+
+
+def test_an_event_of_a_robot_is_where_the_robot_was(page):
+    event = "teamslam.store.events.find((e) => e.x === 'r1 is in the team\\'s map')"
+    place = page.ask(f"teamslam.store.placeOf({event})")
+    at = page.ask(f"teamslam.map.placeAt(teamslam.store.robots.get('r1'), {event}.t).slice(0, 2)")
+    assert place == pytest.approx(at)
+    seek(page, 30)
+    page.wait("teamslam.map.marks.length > 0")
 
 
 def test_it_fits_a_phone(page):

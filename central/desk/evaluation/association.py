@@ -9,10 +9,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64
 
 from teamslam.central.desk.evaluation.log import Collected
 from teamslam.team.config import UNNAMED
+from teamslam.team.shapes import Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids, stamps

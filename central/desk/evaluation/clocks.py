@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.desk.names import in_order
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.odometry import moved, steered
+from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 from scipy.linalg import solve_triangular
 
 from teamslam.team.estimation.consistency import chi2_interval, coverage, nees
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.map_joining.alignment import NEEDED, procrustes
 from teamslam.team.estimation.se2 import between
+from teamslam.team.shapes import Bool, Float, Int64
 
 TRUTH_GAP_NS = 1_000_000_000
 """Largest gap between truth samples that is interpolated."""

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 
 from teamslam.central.desk.evaluation.association import (
     AssociationResult,
@@ -50,6 +49,7 @@ from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import Log
+from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample

@@ -29,7 +29,6 @@ _AWAITED = (
     "waiting for ",
     "has not appeared yet",
     "no measurements of this team yet",
-    "no measurements of this team yet",
 )
 """Start-up states of a node, which are no events."""
 
@@ -192,8 +191,7 @@ class EventDetector:
             self._refused = refused
         for warning in status.warnings:
             gist = (status.node, without_decimals(warning))
-            awaited = any(text in warning for text in _AWAITED)
-            if gist in self._warned or awaited or _is_apart(warning):
+            if gist in self._warned or is_awaited(warning) or _is_apart(warning):
                 continue
             self._warned.add(gist)
             kind: Kind = "refused" if "refused" in warning else "warning"
@@ -213,6 +211,11 @@ def decision_words(decision: m.AssociationDecision) -> str:
         return f"{decision.about} wait: {decision.why} ({figures})"
     what = "merged by their maps" if decision.kind == "merge" else "closed a loop"
     return f"{decision.about} {what}: {figures}"
+
+
+def is_awaited(warning: str) -> bool:
+    """Whether a warning is the start-up state of a node, which is no event."""
+    return any(text in warning for text in _AWAITED)
 
 
 def _is_apart(reason: str) -> bool:

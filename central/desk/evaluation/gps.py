@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.desk.evaluation.errors import Path
 from teamslam.central.desk.evaluation.log import Collected
+from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps

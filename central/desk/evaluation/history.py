@@ -10,13 +10,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.central.desk.evaluation.events import MOST, Event, EventDetector
 from teamslam.central.desk.evaluation.log import head_of
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened

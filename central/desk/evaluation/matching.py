@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 from scipy.optimize import linear_sum_assignment
+
+from teamslam.team.shapes import Float, Int64
 
 
 @dataclass(frozen=True)

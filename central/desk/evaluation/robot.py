@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.errors import Path
 from teamslam.central.desk.evaluation.log import Collected
 from teamslam.team import translate
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats

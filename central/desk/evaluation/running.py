@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 
 from teamslam.central.desk.evaluation.errors import (
     BAND,
@@ -18,6 +17,7 @@ from teamslam.central.desk.evaluation.errors import (
 from teamslam.central.fused import START_POSES
 from teamslam.team import translate
 from teamslam.team.estimation.consistency import chi2_quantile, nees
+from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
 

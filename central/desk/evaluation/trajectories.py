@@ -7,7 +7,6 @@ Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012. `
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.errors import (
     Path,
@@ -18,6 +17,7 @@ from teamslam.central.desk.evaluation.errors import (
     rms,
     transform_points,
 )
+from teamslam.team.shapes import Float
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import (
     MAP_COLOUR,
@@ -17,6 +16,7 @@ from teamslam.central.desk.drawing import (
 from teamslam.central.desk.evaluation.evaluation import Evaluation
 from teamslam.central.desk.pictures.run import in_the_maps_frame, magnification, new_figure
 from teamslam.team import translate
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:  # Matplotlib is slow to import

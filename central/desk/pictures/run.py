@@ -7,7 +7,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import (
     MAP_COLOUR,
@@ -26,6 +25,7 @@ from teamslam.central.desk.paths import SmoothedPath
 from teamslam.central.desk.pictures.style import save
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.se2 import inverse
+from teamslam.team.shapes import Float
 
 # Matplotlib takes half a second to import.
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.central.desk.drawing import (
     MAP_COLOUR,
@@ -18,6 +17,7 @@ from teamslam.central.desk.evaluation.history import History
 from teamslam.central.desk.pictures.run import new_figure
 from teamslam.central.desk.pictures.style import save
 from teamslam.team.estimation.consistency import chi2_interval
+from teamslam.team.shapes import Bool, Float, Int64
 
 if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.export.take_home import write_map, write_paths
 from teamslam.central.desk.export.tum import write_trajectories
@@ -31,6 +30,7 @@ from teamslam.central.desk.report.tables import (
     team_rows,
     title_of,
 )
+from teamslam.team.shapes import Float
 
 LISTED_EVENTS = 200
 """Most events in the page's table; report.json has all."""

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team import translate
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 

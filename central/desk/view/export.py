@@ -1,6 +1,6 @@
 """Compute a recorded log's views as a viewer would have published them."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,13 +13,16 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import WireError
 
-_CHANNELS = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+VIEWED = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+"""Channels of a viewer."""
 
 
-def for_viewer(sample: Sample) -> tuple[ch.Channel, m.Message] | None:
-    """Channel and message of a sample for a viewer; None for other or invalid samples."""
+def for_viewer(
+    sample: Sample, channels: Collection[str] = VIEWED
+) -> tuple[ch.Channel, m.Message] | None:
+    """Channel and message of a sample of these channels; None for other or invalid samples."""
     found = ch.channel_of(sample.key)
-    if found is None or found[0].name not in _CHANNELS:
+    if found is None or found[0].name not in channels:
         return None
     try:
         channel, _, message = opened(sample)

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 from foxglove import messages as fox
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import ellipses
 from teamslam.central.desk.view.drawn import Landmarks
+from teamslam.team.shapes import Float
 from teamslam.team.wire.views import MAP_FRAME
 
 Shade = tuple[str, float]

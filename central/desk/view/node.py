@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import colour_of
 from teamslam.central.desk.evaluation.errors import PoseErrors
@@ -25,6 +24,7 @@ from teamslam.central.desk.view.drawn import (
     landmarks_of,
     place_points,
 )
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire import views

@@ -7,8 +7,10 @@ hello: team, title, colours, live. now: team time of all active robots. pose: ro
 xx, xy, yy, heading variance. outside: whether the robot is outside the team's map from now on; its
 poses are then not sent. frame: the robot's pose frame changes. err: rows of three errors, three 3σ
 bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as
-named. fig: a node's figures. bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of
-the log.
+named. sensor: range, field of view and mount. see: rows of a measurement: landmark, −1 without
+identity, or teammate; ahead [m], left [m]. link: a submap (to) or a prior (from) `central`. fig: a
+node's figures. wait: the start-up states of a node. bytes: [key, t, messages, bytes] of one second.
+ev: event. eof: end of the log.
 """
 
 import base64
@@ -20,21 +22,28 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.central.desk.drawing import ROBOT_COLOURS
-from teamslam.central.desk.evaluation.events import EventDetector
+from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
 from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
 from teamslam.central.desk.names import data_set_name
-from teamslam.central.desk.view.drawn import centre_particles, landmarks_of
+from teamslam.central.desk.view.drawn import centre_particles, landmarks_of, place_points
 from teamslam.central.desk.view.landmark_sets import sets_of
-from teamslam.central.desk.view.node import FORGET_NS
+from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, stamps
+from teamslam.team.wire.arrays import floats, ids, stamps
 from teamslam.team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
 """Least time between poses sent to the page, estimated or true."""
 MAP_SPACING_NS = 1_000_000_000
 """Least time between maps sent to the page."""
+SEEN_NS = 500_000_000
+"""Least time between measurements of one landmark sent to the page."""
+CHANNELS = frozenset(
+    channel.name
+    for channel in (*ViewerNode.listens, ch.ALIVE, ch.ROBOT_CONFIG, ch.OBSERVATIONS, ch.SIGHTINGS)
+)
+"""Channels whose messages `PageFrames.take` converts."""
 _OF_A_SET = ("set_submaps", "set_agrees")
 _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
@@ -62,16 +71,18 @@ class _Stream:
     frame: str | None = None
     pose_ns: int | None = None
     truth_ns: int | None = None
-    rows: dict[str, tuple[list[float], list[float]]] = field(default_factory=dict)
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seen_ns: dict[int | str, int] = field(default_factory=dict)
+    rows: dict[str, tuple[list[float], list[float | str]]] = field(default_factory=dict)
 
-    def add(self, kind: str, t: float, row: list[float]) -> None:
+    def add(self, kind: str, t: float, row: Sequence[float | str]) -> None:
         times, values = self.rows.setdefault(kind, ([], []))
         times.append(t)
         values += row
 
 
 class PageFrames:
-    """Convert samples to frames: `take` samples, `flush` finished frames."""
+    """Convert samples to frames: `count` samples, `take` their messages, `flush` frames."""
 
     def __init__(self) -> None:
         self._out: list[str] = []
@@ -84,6 +95,7 @@ class PageFrames:
         self._has_map = False
         self._map_ns: int | None = None
         self._figures_s: dict[str, tuple[int, float, float]] = {}
+        self._awaited: dict[str, list[str]] = {}
         self._newest_ns = 0
 
     def hello(self, team: str, metadata: Mapping[str, str], name: str, *, live: bool) -> None:
@@ -91,18 +103,22 @@ class PageFrames:
         title = title_of(team, metadata, name)
         self._add_frame("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
-    def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> None:
-        """Convert one sample, and its message if a viewer subscribes to it."""
+    def count(self, sample: Sample) -> None:
+        """Count a recorded sample as traffic, and show it where it links a robot and the centre."""
         found = ch.channel_of(sample.key)
-        channel = "" if found is None else found[0].name
+        channel, name = ("", "") if found is None else (found[0].name, found[1])
         if self._origin_ns is None and channel in _BEGIN:
             self._origin_ns = sample.stamp_ns
         place = (sample.key, int(self._t(sample.stamp_ns)))
         counted = self._traffic.setdefault(place, [0, 0])
         counted[0] += 1
         counted[1] += len(sample.payload)
-        if input_ is not None:
-            self._take(*input_)
+        if channel in (ch.SUBMAP.name, ch.PRIOR.name):
+            link = (name, "central") if channel == ch.SUBMAP.name else ("central", name)
+            t = self._t(
+                max(sample.stamp_ns, self._newest_ns)
+            )  # a prior follows the poses before it
+            self._add_frame("link", t=t, a=link[0], b=link[1])
 
     def flush(self, now_ns: int | None = None) -> list[str]:
         """Frames since the last call; now_ns: team time of the robots."""
@@ -137,15 +153,9 @@ class PageFrames:
             return 0.0
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
 
-    def _take(self, channel: ch.Channel, message: m.Message) -> None:
-        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead
-            self._newest_ns = max(self._newest_ns, message.stamp_ns)
-        timeless = isinstance(message, m.Liveliness | m.Status)
-        at_ns = self._newest_ns if timeless else message.stamp_ns
-        for event in self._detector.take(message, at_ns):
-            self._add_frame(
-                "ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text
-            )
+    def take(self, channel: ch.Channel, message: m.Message) -> None:
+        """Convert a message of one of the CHANNELS."""
+        self._add_events(message)
         match message:
             case m.InitialPose():
                 self._frames.take(message)
@@ -157,6 +167,10 @@ class PageFrames:
                 self._take_map(message)
             case m.Status():
                 self._take_status(message)
+            case m.Configuration():
+                self._take_sensor(message)
+            case m.Observations() | m.Points() | m.Detections() | m.Sightings():
+                self._take_measurements(message)
             case m.TruthLandmarks():
                 self._truth = TrueLandmarks.of(message)
                 places = self._truth.positions.ravel().tolist()
@@ -170,6 +184,16 @@ class PageFrames:
                 self._add_frame("path", r=message.robot, t=times, v=poses)
             case _:
                 pass
+
+    def _add_events(self, message: m.Message) -> None:
+        if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead
+            self._newest_ns = max(self._newest_ns, message.stamp_ns)
+        timeless = isinstance(message, m.Liveliness | m.Status | m.Configuration)
+        at_ns = self._newest_ns if timeless else message.stamp_ns
+        for event in self._detector.take(message, at_ns):
+            self._add_frame(
+                "ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text
+            )
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         stream = self._streams[message.robot]
@@ -208,6 +232,39 @@ class PageFrames:
                 stream.add("truth", self._t(at), [_short(v) for v in pose])
         stream.errors.take_truth(message)
 
+    def _take_sensor(self, message: m.Configuration) -> None:
+        sensor = json.loads(message.configuration).get("sensor", {})
+        robot = message.node.removeprefix("robot/")
+        x, y, heading = sensor.get("mount", (0.0, 0.0, 0.0))
+        self._streams[robot].mount = (x, y, heading)
+        within = {"range": sensor.get("max_range"), "view": sensor.get("field_of_view")}
+        self._add_frame("sensor", r=robot, mount=(x, y, heading), **within)
+
+    def _take_measurements(
+        self, message: m.Observations | m.Points | m.Detections | m.Sightings
+    ) -> None:
+        """Send measured places in the robot's frame, each landmark's at most each SEEN_NS."""
+        stream, at = self._streams[message.robot], message.stamp_ns
+        if isinstance(message, m.Points):
+            places = floats(message.positions, "positions").reshape(-1, 2)
+        else:
+            bearings = floats(message.bearings, "bearings")
+            ahead_left = np.column_stack([np.cos(bearings), np.sin(bearings)])
+            places = floats(message.ranges, "ranges")[:, np.newaxis] * ahead_left
+        names: Sequence[int | str]
+        match message:
+            case m.Sightings():
+                names = message.teammates
+            case m.Detections():
+                names = [-1] * len(places)
+            case _:
+                names = ids(message.ids, "ids").tolist()
+        due = {name for name in names if at >= stream.seen_ns.get(name, -SEEN_NS) + SEEN_NS}
+        stream.seen_ns |= dict.fromkeys(due, at)
+        for name, (x, y) in zip(names, place_points(places, stream.mount).tolist(), strict=True):
+            if name in due:
+                stream.add("see", self._t(at), [name, round(x, 3), round(y, 3)])
+
     def _add_errors(self, stream: _Stream) -> None:
         errors = stream.errors.known()
         stream.errors.forget((stream.pose_ns or 0) - FORGET_NS)
@@ -240,11 +297,15 @@ class PageFrames:
             final=message.final,
             joint=message.joint,
             rmse=None if fit is None else _short(fit.rmse_m),
-            nees=None if fit is None else _short(fit.nees_per_dof),
+            nees=_short(fit.nees_per_dof) if fit and (message.joint or message.final) else None,
             **unnamed,
         )
 
     def _take_status(self, message: m.Status) -> None:
+        awaited = [warning for warning in message.warnings if is_awaited(warning)]
+        if awaited != self._awaited.get(message.node, []):
+            self._awaited[message.node] = awaited
+            self._add_frame("wait", n=message.node, x=awaited)
         second = int(self._t(message.stamp_ns))
         shown = message.node == "central" or message.node.startswith("robot/")
         whole, agrees = (message.figures.get(name, 0.0) for name in _OF_A_SET)

@@ -20,13 +20,14 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from teamslam.central.desk.view.export import Viewing, for_viewer
+from teamslam.central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
+from teamslam.central.desk.view.export import VIEWED, Viewing, for_viewer
 from teamslam.central.desk.view.foxglove_proxy import proxy, refuse
 from teamslam.central.desk.view.foxglove_server import FoxgloveServer
-from teamslam.central.desk.view.page_frames import PageFrames
+from teamslam.central.desk.view.page_frames import CHANNELS, PageFrames
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.tail import Tail
-from teamslam.team.wire.bus import BusError
+from teamslam.team.wire.bus import BusError, Sample
 
 STREAM = "/stream"
 LOOK_S = 0.2
@@ -70,6 +71,7 @@ class Feed:
     ended: bool = False
     _page: PageFrames = field(default_factory=PageFrames)
     _viewing: Viewing = field(default_factory=Viewing)
+    _centre: PeersAsCentre = field(default_factory=PeersAsCentre)
     _greeted: bool = False
 
     def read_more(self, *, growing: bool) -> bool:
@@ -85,17 +87,25 @@ class Feed:
                 self.foxglove.team = log.team
             self._page.hello(log.team, log.metadata, self.tail.path.name, live=growing)
         for sample in samples:
-            input_ = for_viewer(sample)
-            self._page.take(sample, input_)
-            for view in self._viewing.take(sample, input_):
-                if self.foxglove is not None:
-                    self.foxglove.publish(view)
+            self._page.count(sample)
+            for each in with_centre_messages(self._centre, [sample]):
+                self._take(each)
         if samples:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
             self.frames += self._page.end(self._faults(), complete=True)
             self.ended = True
         return bool(samples)
+
+    def _take(self, sample: Sample) -> None:
+        input_ = for_viewer(sample, CHANNELS)
+        if input_ is None:
+            return
+        self._page.take(*input_)
+        if input_[0].name in VIEWED:
+            for view in self._viewing.take(sample, input_):
+                if self.foxglove is not None:
+                    self.foxglove.publish(view)
 
     def _faults(self) -> list[str]:
         found = [] if self.error is None else [self.error]

@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.config import BiasSigmas
 from teamslam.sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
@@ -27,6 +26,7 @@ from teamslam.sim.studies.batch_reference.measurements import Chain
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import NEAREST_M, predicted
 from teamslam.team.estimation.se2 import Point, wrapped
+from teamslam.team.shapes import Float
 
 BIASES = ("bearing", "range_offset", "range_scale")
 """Sensor biases of the centre's model, in state order."""

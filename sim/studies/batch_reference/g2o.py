@@ -10,7 +10,6 @@ https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, landmark_starts
@@ -24,6 +23,7 @@ from teamslam.sim.studies.batch_reference.reference import placed
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.models import predicted
 from teamslam.team.estimation.se2 import Point
+from teamslam.team.shapes import Float
 from teamslam.team.wire.bus import Sample
 
 Poses = Float[np.ndarray, "K 3"]

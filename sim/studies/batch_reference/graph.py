@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.evaluation import MapResult
 from teamslam.sim.studies.batch_reference.measurements import Chain
@@ -16,6 +15,7 @@ from teamslam.team.estimation.models import located, predicted
 from teamslam.team.estimation.se2 import Point, Pose, tangent
 from teamslam.team.extras import install_command
 from teamslam.team.registry import NotInstalledError
+from teamslam.team.shapes import Float
 
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.studies.batch_reference.graph import (
     FLOOR_SIGMAS,
@@ -27,6 +26,7 @@ from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.models import located, predicted
 from teamslam.team.estimation.se2 import Pose, compose, tangent
+from teamslam.team.shapes import Float, UInt32
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
 """A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning

@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 from msgspec import structs
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
@@ -20,6 +19,7 @@ from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.mount import moved_by
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
+from teamslam.team.shapes import Float, Int64, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened

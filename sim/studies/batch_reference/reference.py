@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.central.desk.evaluation.errors import (
     MapErrors,
@@ -51,6 +50,7 @@ from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
 from teamslam.team.estimation.mount import moved_by
 from teamslam.team.estimation.se2 import inverse, tangent
 from teamslam.team.registry import NotInstalledError
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3

@@ -7,13 +7,13 @@ pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound. T
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose, tangent
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

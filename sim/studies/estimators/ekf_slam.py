@@ -8,7 +8,6 @@ the covariance becomes too small (Julier and Uhlmann 2001).
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.studies.estimators.ekf_step import step
 from teamslam.team.config import Sensor
@@ -17,6 +16,7 @@ from teamslam.team.estimation.hybrid_slam.innovation import Innovation, joint_in
 from teamslam.team.estimation.models import Increment, variances
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ predicted range. All sums have a fixed order, so the bits are the same on every 
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.sim.studies.estimators.sight import see
 from teamslam.team import core
+from teamslam.team.shapes import Bool, Float, Int64
 
 Triple = tuple[float, float, float]
 NO_CLAIM = np.empty((1, 0))

@@ -8,7 +8,6 @@ state; map and association are the heaviest particle's.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import GATE, UNNAMED, Sensor
@@ -16,6 +15,7 @@ from teamslam.team.core import mean_direction
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.models import Increment
+from teamslam.team.shapes import Float, Int64
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ the weights start anew with each step, as in the text, not the program.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
@@ -18,6 +17,7 @@ from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
 from teamslam.team import core
@@ -21,6 +20,7 @@ from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 FIRST_RANGE_VAR = 15.0**2
 FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
 from teamslam.sim.studies.estimators.robot_step import RobotStep
@@ -18,6 +17,7 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
 from teamslam.sim.studies.estimators.sight import see
@@ -22,6 +21,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.models import Increment, variances
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ a landmark is new. A wrong pair is never undone.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.sim.studies.estimators import ekf_slam
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
@@ -20,6 +19,7 @@ from teamslam.team.estimation.association.scans import UNASSIGNED
 from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, Int64, UInt32
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ small, unlike that of `window`.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
@@ -19,6 +18,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.shapes import Float, UInt32
 
 
 class RobotStep(NamedTuple):

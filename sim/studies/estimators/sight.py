@@ -1,10 +1,10 @@
 """Distance and direction of landmarks, elementwise on arrays of any shape that broadcast."""
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation.models import NEAREST_M
+from teamslam.team.shapes import Float
 
 Array = Float[np.ndarray, "..."]
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -24,6 +23,7 @@ from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
 from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import Pose, wrapped
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float, Int64
 
 Weighting = Literal["identity", "spherical", "full"]
 SETTINGS = JoinSettings()

@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.central.desk.evaluation.errors import Path, PoseErrors, pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -21,6 +20,7 @@ from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, expect
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
+from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats

@@ -12,7 +12,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
 from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
@@ -39,6 +38,7 @@ from teamslam.team.estimation.contribution import Contribution, Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.estimation.map_joining import joining
 from teamslam.team.estimation.models import corrected
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened

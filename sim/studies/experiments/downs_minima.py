@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import Bounds, differential_evolution
 
 from teamslam.central.desk.drawing import BLUE, VERMILION
@@ -34,6 +33,7 @@ from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
 from teamslam.team.estimation.map_joining.alignment import procrustes
 from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.shapes import Float
 
 STEPS = 600
 """Steps of his simulator, after which most landmarks were detected."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, ORANGE, VERMILION
 from teamslam.central.desk.evaluation.errors import Path, pose_errors
@@ -30,6 +29,7 @@ from teamslam.sim.studies.experiments.xu import Method, with_particles
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, RobotConfig, Sensor
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats

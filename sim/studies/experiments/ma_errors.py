@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.studies.experiments.drawing import Curves
 from teamslam.sim.studies.experiments.experiment import (
@@ -28,6 +27,7 @@ from teamslam.sim.studies.experiments.ma import (
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
+from teamslam.team.shapes import Float
 
 
 class ErrorFigure(NamedTuple):

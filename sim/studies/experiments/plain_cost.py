@@ -15,12 +15,12 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 from scipy import sparse
 from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import splu
 
 from teamslam.team.estimation.map_joining.submap_graph import Graph
+from teamslam.team.shapes import Bool, Float, Int64
 
 Values = Float[np.ndarray, " _"]
 Rows = Float[np.ndarray, "_ _"]

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.evaluation.errors import Path, interpolate_truth
 from teamslam.central.desk.evaluation.evaluation import Evaluation
@@ -23,6 +22,7 @@ from teamslam.team import translate
 from teamslam.team.estimation.consistency import chi2_quantile
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold, converged
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.central.desk.drawing import BLACK, BLUE, RED, ROBOT_COLOURS, TRUTH_COLOUR, VERMILION
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -44,6 +43,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 

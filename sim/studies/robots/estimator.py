@@ -5,7 +5,6 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
@@ -17,6 +16,7 @@ from teamslam.team.pairs import ESTIMATORS
 from teamslam.team.registry import loaded
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.own_map import AT_ORIGIN, Cloud, InitialPose
+from teamslam.team.shapes import Float, UInt32
 
 
 class KnownMap(NamedTuple):

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -21,6 +20,7 @@ from teamslam.team.estimation.gaussian import (
     cholesky_factor,
     information,
 )
+from teamslam.team.shapes import Float, Int64
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 SEARCH_STEPS = 60

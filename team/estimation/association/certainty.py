@@ -16,13 +16,13 @@ be part of it. The marginals over all joint associations of the scan follow by b
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation.association.gating import compute_mahalanobis
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
 from teamslam.team.estimation.association.smoothing import SmoothedWindow
+from teamslam.team.shapes import Float, Int64
 
 LEAST = 0.1
 """Least probability that a detected landmark is in view."""

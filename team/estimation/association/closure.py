@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
@@ -53,6 +52,7 @@ from teamslam.team.estimation.association.voting import (
 )
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.se2 import compose
+from teamslam.team.shapes import Float
 
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""

@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
@@ -23,6 +22,7 @@ from teamslam.team.estimation.association.scans import (
 )
 from teamslam.team.estimation.association.smoothing import SmoothedWindow, smooth_window
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance, track_window
+from teamslam.team.shapes import Bool, Float, Int64
 
 RARE = 0.05
 """Significance level of the test for clutter."""

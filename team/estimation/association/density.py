@@ -15,10 +15,10 @@ from functools import cached_property
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
+from teamslam.team.shapes import Float
 
 CLOSE = 0.1
 """Quantile of the landmarks' spacings taken as the spacing within groups."""

@@ -12,13 +12,13 @@ per square metre,
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.scans import UNASSIGNED
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 

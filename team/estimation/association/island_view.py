@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
@@ -38,6 +37,7 @@ from teamslam.team.estimation.association.landmark_sets import Landmarks
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from teamslam.team.estimation.association.visibility import miss_probabilities
 from teamslam.team.estimation.contribution import Observation, Stream
+from teamslam.team.shapes import Bool, Float, Int64
 
 COMPARED = 6
 """Number of submaps that one submap is compared with: those with the most candidates."""

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
@@ -30,6 +29,7 @@ from teamslam.team.estimation.association.gating import (
     gate_pairs,
     required_llr,
 )
+from teamslam.team.shapes import Bool, Float
 
 PREGATE = 4.0
 """Multiple of the gate beyond which a pair is excluded for good."""

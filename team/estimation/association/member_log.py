@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, UInt32
 
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Stream
+from teamslam.team.shapes import Bool, UInt32
 
 KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")
 """The steps that merge landmarks."""

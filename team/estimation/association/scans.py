@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from teamslam.team.shapes import Float, Int64
 
 UNASSIGNED = -1
 """No identity, or no landmark."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.scans import (
@@ -14,6 +13,7 @@ from teamslam.team.estimation.association.scans import (
     rotations,
 )
 from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.shapes import Float, Int64
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""

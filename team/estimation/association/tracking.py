@@ -9,7 +9,6 @@ then enlarged by the jump.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
@@ -29,6 +28,7 @@ from teamslam.team.estimation.association.scans import (
 )
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.se2 import adjoint, compose, inverse
+from teamslam.team.shapes import Float, Int64
 
 FEW = 0.5
 """Share of matched detections in a scan below which a slip is suspected."""

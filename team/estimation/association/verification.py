@@ -9,12 +9,12 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.association.gating import Indices, Pair, evaluate_pairs
 from teamslam.team.estimation.association.island_view import IslandView
+from teamslam.team.shapes import Float
 
 WIDE = 3.0
 """Radius around a closure's places that an audit considers, in spacings."""

@@ -7,9 +7,9 @@ convex. A landmark of the other side in this polygon should have been observed.
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
+from teamslam.team.shapes import Bool, Float, Int64
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""

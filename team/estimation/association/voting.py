@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from teamslam.team.shapes import Bool, Float, Int64
 
 MOST_BINS = 60
 """Number of refined motions, those with the most votes."""

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
@@ -19,6 +18,7 @@ from teamslam.team.core import effective_sample_size, normalise, systematic_pare
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.shapes import Float, Int64, UInt32
 
 __all__ = [
     "Noise",

@@ -8,7 +8,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
@@ -18,6 +17,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles, noise_of, r
 from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import compose, tangent, wrapped
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
 """Ids, ranges [m], bearings [rad] and claimed noises of measurements."""

@@ -5,7 +5,6 @@ from bisect import insort
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 from msgspec.structs import force_setattr, replace
 
 from teamslam.team import core
@@ -16,6 +15,7 @@ from teamslam.team.estimation.models import Increment, model_of, scanned
 from teamslam.team.estimation.odometry import STANDING, OdometryInterval
 from teamslam.team.estimation.scans import Own, calibrated, unclaimed
 from teamslam.team.rejection import Rejection
+from teamslam.team.shapes import Bool, Float, UInt32
 
 NOTHING = np.empty(0, np.uint32), np.empty(0), np.empty(0), unclaimed(0)
 """The measurements of a keyframe without any."""

@@ -10,7 +10,6 @@ measurements of one teammate at one node are reduced to one.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.config import FrontEnd, Sensor
@@ -24,6 +23,7 @@ from teamslam.team.estimation.inter_robot import (
 )
 from teamslam.team.estimation.models import Increment, scanned
 from teamslam.team.rejection import Rejection
+from teamslam.team.shapes import Float
 
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""

@@ -15,7 +15,6 @@ correct what is not Gaussian, and the paths have no ancestors in common.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -27,6 +26,7 @@ from teamslam.team.estimation.hybrid_slam.reduction import variances
 from teamslam.team.estimation.hybrid_slam.window import Window
 from teamslam.team.estimation.scans import POINT
 from teamslam.team.estimation.se2 import adjoint, between, inverse
+from teamslam.team.shapes import Float, Int64
 
 Paths = Float[np.ndarray, "K M 3"]
 FEW = 10.0

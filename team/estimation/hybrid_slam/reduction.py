@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, Sensor
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import SENSOR, Own
 from teamslam.team.estimation.se2 import Pose
+from teamslam.team.shapes import Float, UInt32
 
 
 class KeyframeScan(msgspec.Struct, frozen=True, gc=False):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
 from msgspec.structs import replace
 
 from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
@@ -27,6 +26,7 @@ from teamslam.team.estimation.hybrid_slam.reduction import (
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, together
 from teamslam.team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
+from teamslam.team.shapes import Bool, Int64
 
 
 @dataclass(frozen=True)

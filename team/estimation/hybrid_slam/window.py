@@ -10,7 +10,6 @@ import math
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
@@ -22,6 +21,7 @@ from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
 from teamslam.team.estimation.submap import NO_NODES, LocalMap
+from teamslam.team.shapes import Float, Int64, UInt32
 
 STILL = np.zeros(3)
 

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.core import POSE_JITTER, on_group, sample_factor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.hybrid_slam.window import Window
 from teamslam.team.estimation.se2 import Pose, wrapped
+from teamslam.team.shapes import Float, Int64
 
 
 @dataclass(frozen=True)

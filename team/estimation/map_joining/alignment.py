@@ -8,13 +8,13 @@ it. Agreement is tested on the joint cost, which is not linearised about a drift
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import deviation, information
 from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.shapes import Float
 
 ITERATIONS = 10
 NEEDED = 2

@@ -15,12 +15,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.upper_triangle import packed_of, unpacked_of
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Int64
 
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.condensed_factor import (
@@ -39,6 +38,7 @@ from teamslam.team.estimation.map_joining.path_elimination import (
 )
 from teamslam.team.estimation.map_joining.resting import FIRST, beside, idle, split
 from teamslam.team.estimation.map_joining.submap_graph import Graph, without_nodes
+from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
 T = TypeVar("T")

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt32
 
 from teamslam.team import core
 from teamslam.team.config import Bias
@@ -34,6 +33,7 @@ from teamslam.team.estimation.map_joining.merging import ages
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from teamslam.team.estimation.map_joining.whole_map import end_pose, without
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Bool, Float, UInt32
 
 GATE = 18.420680744107813
 """99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`.

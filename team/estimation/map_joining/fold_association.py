@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.estimation.association.closure import (
     patch_step,
@@ -41,6 +40,7 @@ from teamslam.team.estimation.map_joining.merging import Merge, placed
 from teamslam.team.estimation.map_joining.minima import minimum
 from teamslam.team.estimation.map_joining.submap_graph import tied
 from teamslam.team.estimation.se2 import inverse
+from teamslam.team.shapes import Float
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:

@@ -20,7 +20,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
@@ -35,6 +34,7 @@ from teamslam.team.estimation.map_joining.least_squares import (
     robust_scale,
 )
 from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph
+from teamslam.team.shapes import Float, Int64
 
 STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a

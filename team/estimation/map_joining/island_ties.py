@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -19,6 +18,7 @@ from teamslam.team.estimation.map_joining import alignment
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import Graph, pose_node
 from teamslam.team.estimation.models import located
+from teamslam.team.shapes import Float
 
 JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""

@@ -8,12 +8,12 @@ the condensed factor's nodes, its covariances from theirs, Cov(x, z) = gain Cov(
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.map_joining.condensed_factor import Resting, nobody_rests, places
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.upper_triangle import between
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

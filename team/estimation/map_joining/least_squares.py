@@ -9,7 +9,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Int64
+
+from teamslam.team.shapes import Float, Int64
 
 Values = Float[np.ndarray, " _"]
 HALVINGS = 4

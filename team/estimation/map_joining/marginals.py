@@ -9,7 +9,6 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float, UInt32
 
 from teamslam.team.config import UNNAMED, Bias
 from teamslam.team.estimation.contribution import Stream
@@ -25,6 +24,7 @@ from teamslam.team.estimation.map_joining.landmark_view import (
     known,
     points_of,
 )
+from teamslam.team.shapes import Float, UInt32
 
 BELIEVED = 0.5
 """Least weight of a landmark in a submap for the submap to be believed about it."""

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int64
 
 from teamslam.team.estimation.contribution import Observation
+from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
 

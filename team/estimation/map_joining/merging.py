@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation.gaussian import deviation
@@ -33,6 +32,7 @@ from teamslam.team.estimation.map_joining.island_ties import (
 )
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
 from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
+from teamslam.team.shapes import Float, Int64
 
 WORTH_TELLING = 1.0
 """Least gain in χ² for which a search is reported: below, it found the place of the first guess."""

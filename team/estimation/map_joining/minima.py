@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation.consistency import chi2_limit
@@ -33,6 +32,7 @@ from teamslam.team.estimation.map_joining.nonlinearity import (
 )
 from teamslam.team.estimation.map_joining.relaxation import relaxed
 from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.shapes import Float
 
 Values = Float[np.ndarray, " _"]
 

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.resting import split
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

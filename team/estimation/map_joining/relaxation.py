@@ -15,10 +15,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation.map_joining.submap_graph import Graph
+from teamslam.team.shapes import Bool, Float, Int64
 
 Values = Float[np.ndarray, " _"]
 Indices = Int64[np.ndarray, " _"]

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team.estimation.contribution import Contribution, Key, Stream
 from teamslam.team.estimation.inter_robot import InterRobotFactor
@@ -27,6 +26,7 @@ from teamslam.team.estimation.map_joining.landmark_view import known, points_of
 from teamslam.team.estimation.map_joining.merging import ages, sighted
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
 from teamslam.team.estimation.se2 import compose, transformed
+from teamslam.team.shapes import Float
 
 Values = Float[np.ndarray, " _"]
 

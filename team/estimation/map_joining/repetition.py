@@ -18,7 +18,6 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
@@ -30,6 +29,7 @@ from teamslam.team.estimation.association.voting import (
 )
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.shapes import Bool, Float, Int64
 
 LEAST_PAIRS = 6
 """Least number of landmarks that repeat others."""

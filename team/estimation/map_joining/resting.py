@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -21,6 +20,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.landmark_view import resting_of
 from teamslam.team.estimation.map_joining.submap_graph import Graph, with_landmarks
 from teamslam.team.estimation.map_joining.upper_triangle import between, upper_of
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

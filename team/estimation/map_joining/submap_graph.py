@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, Bias
@@ -30,6 +29,7 @@ from teamslam.team.estimation.map_joining.condensed_factor import Condensed, pla
 from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]

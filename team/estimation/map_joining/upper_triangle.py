@@ -1,7 +1,8 @@
 """Symmetric matrices stored as upper triangles: the covariance of landmarks at rest."""
 
 import numpy as np
-from jaxtyping import Float, Int64
+
+from teamslam.team.shapes import Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]

@@ -9,12 +9,12 @@ linearised again, so the map is overconfident after many joins.
 import math
 
 import numpy as np
-from jaxtyping import Float, Int64, UInt32
 
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
 from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float, Int64, UInt32
 
 INDEFINITE, SINGULAR = 1, 2
 """Faults of the core: the covariance of the innovation of all known landmarks is not positive

@@ -1,6 +1,8 @@
 """The final map of a team without a centre is the one on which all its peers agree."""
 
 import hashlib
+import json
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -8,9 +10,12 @@ import pytest
 from teamslam.central.desk.agreement import Agreement
 from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.central.desk.view.server import Feed
 from teamslam.central.team_config import TeamConfig
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.config import RobotConfig
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.tail import Tail
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
@@ -146,6 +151,19 @@ def test_a_viewer_is_given_the_final_map_once_and_when_all_have_it() -> None:
         "the last robot's map; its conclusion is nothing new"
     )
     assert (found.key, found.payload) == (ch.FINAL_MAP.key(), encoded(TRUE))
+
+
+def test_the_page_shows_the_map_on_which_the_peers_agree(tmp_path: Path) -> None:
+    running = msgspec.structs.replace(TRUE, final=False)
+    with Recorder(tmp_path / "log.mcap", "t", {}) as recorder:
+        recorder.write([scenario(peers=True), sample(ch.TEAM_MAP, "r1", running), *HONEST])
+    feed = Feed(Tail(tmp_path / "log.mcap"))
+    while not feed.ended:
+        feed.read_more(growing=False)
+    told = [json.loads(frame) for frame in feed.frames]
+    assert [each["final"] for each in told if each["k"] == "map"] == [False, True]
+    sent = sum(messages for each in told if each["k"] == "bytes" for _, _, messages, _ in each["v"])
+    assert sent == 2 + len(HONEST), "what the page derives is no traffic"
 
 
 def test_a_launch_is_over_when_every_peer_has_a_final_map_of_its_own() -> None:

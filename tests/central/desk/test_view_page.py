@@ -27,7 +27,7 @@ from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.tail import Tail
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats
+from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -98,7 +98,8 @@ def test_the_page_is_told_when_a_robots_poses_are_in_another_frame() -> None:
 
     def take(channel: ch.Channel, robot: str, message: m.Message) -> None:
         sample = Sample(channel.key(robot), encoded(message), message.stamp_ns, 0, 0)
-        page.take(sample, (channel, message))
+        page.count(sample)
+        page.take(channel, message)
 
     for robot in ("r1", "r2"):
         start = build.initial_pose(robot=robot)
@@ -117,6 +118,55 @@ def test_the_page_is_told_when_a_robots_poses_are_in_another_frame() -> None:
             take(ch.OWN_POSE if own else ch.TEAM_POSE, robot, pose)
     told = [json.loads(frame) for frame in page.flush()]
     assert [(each["r"], each["t"]) for each in told if each["k"] == "frame"] == [("r2", 2.0)]
+
+
+def told_of(*messages: tuple[ch.Channel, m.Message]) -> list[dict[str, object]]:
+    page = PageFrames()
+    for channel, message in messages:
+        page.take(channel, message)
+    return [json.loads(frame) for frame in page.flush()]
+
+
+def test_the_page_gets_measurements_in_the_robots_frame() -> None:
+    """A sensor that looks to the left, half a metre ahead; a landmark at most twice a second."""
+    sensor = {"mount": [0.5, 0.0, np.pi / 2], "max_range": 30.0, "field_of_view": 2.0}
+    config = build.configuration(configuration=json.dumps({"sensor": sensor}))
+
+    def scan(stamp_ns: int, names: list[int]) -> tuple[ch.Channel, m.Message]:
+        return ch.OBSERVATIONS, build.observations(
+            stamp_ns=stamp_ns, ids=from_ids(names), ranges=from_floats(np.full(len(names), 2.0)),
+            bearings=from_floats(np.zeros(len(names))),
+        )  # fmt: skip
+
+    mate = build.sightings(
+        stamp_ns=10**9, teammates=("r2",), ranges=from_floats([1.0]),
+        bearings=from_floats([np.pi / 2]),
+    )  # fmt: skip
+    told = told_of(
+        (ch.ROBOT_CONFIG, config), scan(0, [7]), scan(2 * 10**8, [7, 8]), scan(6 * 10**8, [7]),
+        (ch.SIGHTINGS, mate),
+    )  # fmt: skip
+    (limits,) = (each for each in told if each["k"] == "sensor")
+    assert (limits["range"], limits["view"]) == (30.0, 2.0)
+    (seen,) = (each for each in told if each["k"] == "see")
+    assert seen["v"] == [7, 0.5, 2.0, 8, 0.5, 2.0, 7, 0.5, 2.0, "r2", -0.5, 0.0]
+
+
+def test_the_page_is_told_what_a_node_waits_for_and_when_no_more() -> None:
+    def status(*warnings: str) -> tuple[ch.Channel, m.Message]:
+        return ch.STATUS, build.status(node="world", warnings=warnings)
+
+    waits = "waiting for central"
+    told = told_of(status(waits), status(waits, "the disk is full"), status())
+    assert [each["x"] for each in told if each["k"] == "wait"] == [[waits], []]
+
+
+def test_a_running_map_without_cross_covariances_has_no_nees(frames) -> None:
+    """The report's NEES is that of the final map: one name has one definition."""
+    *running, final = frames["map"]
+    assert {each["nees"] for each in running} == {None}
+    assert {each["rmse"] is None for each in running} == {False}
+    assert final["nees"] is not None
 
 
 def test_the_page_gets_the_maps_and_how_they_fit(frames, samples):
@@ -149,6 +199,15 @@ def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
     times = {f["x"]: f["t"] for f in told(tmp_path / "early.mcap") if f["k"] == "ev"}
     assert times["the world has ended"] == SECONDS
     assert times["r1 is in the team's map"] == 4.8
+
+
+def test_a_submap_and_a_prior_are_links_to_and_from_the_centre():
+    page = PageFrames()
+    for channel in (ch.SUBMAP, ch.OWN_MAP, ch.PRIOR):
+        page.count(Sample(channel.key("r1"), b"", 10**9, 0, 0))
+    told = [json.loads(frame) for frame in page.flush()]
+    found = [(each["a"], each["b"]) for each in told if each["k"] == "link"]
+    assert found == [("r1", "central"), ("central", "r1")]
 
 
 def test_a_damaged_chunk_costs_the_page_no_more_than_itself(log, tmp_path):

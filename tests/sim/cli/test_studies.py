@@ -26,7 +26,7 @@ def without_studies(folder: Path) -> Path:
 def teamslam(folder: Path, *words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         # -S: without the editable install, which would find the studies where they are.
-        [sys.executable, "-S", "-c", "from teamslam.sim.cli.main import main; main()", *words],
+        [sys.executable, "-S", "-c", "from teamslam.sim.cli.entry import main; main()", *words],
         cwd=folder,
         env={"PYTHONPATH": os.pathsep.join([str(folder), *site.getsitepackages()])},
         capture_output=True,

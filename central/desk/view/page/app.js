@@ -1,6 +1,6 @@
 // The page: the stream of frames into the store, the time, and what is shown at it.
 
-import { LAYERS, MapView, gridStep } from './mapview.js';
+import { LAYERS, MARKS, MapView, gridStep } from './mapview.js';
 import { Plot, colour } from './plots.js';
 import { Store, inOrder, upTo } from './store.js';
 
@@ -61,21 +61,50 @@ function choose(name) {
   lookedAt = 0;
 }
 
+function follow(name) {
+  map.follow = name;
+  if (name && map.fitted) map.zoom(3);
+  $('follow').setAttribute('aria-pressed', String(Boolean(name)));
+  lookedAt = 0;
+}
+
+function showAll() {
+  follow(null);
+  map.fit();
+}
+
+map.onMove = () => follow(null);
 map.onPick = (x, y) => {
   const shown = store.mapAt(state.time);
-  const i = map.landmarkAt(shown, x, y);
-  $('why').hidden = i < 0;
-  if (i < 0) return;
-  const lines = shown.why && shown.why[i].length
-    ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]}${!shown.final && shown.n[i] === 12 ? ' or more' : ''} submaps`}`, ...shown.why[i]]
-    : [`landmark ${shown.ids[i]}, known by its name`];
-  $('why').textContent = lines.join('\n');
+  const i = map.landmarkAt(shown, x, y), events = map.eventsAt(x, y);
+  $('why').hidden = i < 0 && !events.length;
+  $('why').textContent = [...events.map((event) => `${event.t.toFixed(0)} s: ${event.x}`), ...(i < 0 ? [] : landmarkLines(shown, i))].join('\n');
 };
 
+function landmarkLines(shown, i) {
+  return shown.why && shown.why[i].length
+    ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]}${!shown.final && shown.n[i] === 12 ? ' or more' : ''} submaps`}`, ...shown.why[i]]
+    : [`landmark ${shown.ids[i]}, known by its name`];
+}
+
+// Files of what is shown.
+
+function download(blob, ending) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(blob);
+  link.download = `${store.hello.team}-${state.time.toFixed(0)}s.${ending}`;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+$('png').addEventListener('click', () => { map.draw(state.time); map.canvas.toBlob((blob) => download(blob, 'png')); });
+$('svg').addEventListener('click', () => download(new Blob([map.svg(state.time)], { type: 'image/svg+xml' }), 'svg'));
+
+$('layers').parentElement.open = innerWidth > 860;  // on a phone they would hide the map
 for (const [name, text] of LAYERS) {
   const button = document.createElement('button');
   button.textContent = text;
-  button.setAttribute('aria-pressed', 'true');
+  button.setAttribute('aria-pressed', String(map.on[name]));
   button.addEventListener('click', () => {
     map.on[name] = !map.on[name];
     button.setAttribute('aria-pressed', map.on[name]);
@@ -84,7 +113,8 @@ for (const [name, text] of LAYERS) {
 }
 $('zoom-in').addEventListener('click', () => map.zoom(1.4));
 $('zoom-out').addEventListener('click', () => map.zoom(1 / 1.4));
-$('fit').addEventListener('click', () => { map.follow = null; map.fit(); });
+$('fit').addEventListener('click', showAll);
+$('follow').addEventListener('click', () => follow(map.follow ? null : state.chosen));
 $('play').addEventListener('click', () => play(!moving()));
 $('speed').addEventListener('change', () => { state.speed = Number($('speed').value); });
 $('live').addEventListener('click', () => { state.following = true; state.playing = false; });
@@ -93,11 +123,13 @@ addEventListener('keydown', (event) => {
   if (event.target.matches('select') || event.ctrlKey || event.metaKey || event.altKey) return;
   const step = event.shiftKey ? 10 : 1;
   const done = {
-    ' ': () => play(!moving()), f: () => { map.follow = null; map.fit(); }, '+': () => map.zoom(1.4), '-': () => map.zoom(1 / 1.4),
+    ' ': () => play(!moving()), f: showAll, r: () => follow(map.follow ? null : state.chosen),
+    '+': () => map.zoom(1.4), '-': () => map.zoom(1 / 1.4),
     ArrowRight: () => { state.playing = false; seek(state.time + step); },
     ArrowLeft: () => { state.playing = false; seek(state.time - step); },
+    Home: () => { state.playing = false; seek(0); }, End: () => seek(end()),
   }[event.key];
-  if (done && !(event.key === ' ' && event.target.matches('button'))) { event.preventDefault(); done(); }
+  if (done && !(event.key === ' ' && event.target.matches('button, summary'))) { event.preventDefault(); done(); }
 });
 matchMedia('(prefers-color-scheme: light)').addEventListener('change', () => {
   map.readColours();
@@ -116,6 +148,7 @@ function turn(now) {
   const passed = Math.min((now - before) / 1000, 0.25);
   before = now;
   if (!store.hello) return;
+  const earlier = state.time;
   if (store.complete && !state.touched) state.time = end();
   else if (state.following && !store.complete) {
     state.playing = false;
@@ -128,6 +161,7 @@ function turn(now) {
       state.following = !store.complete;
     }
   }
+  if (moving() && passed > 0) map.pace = state.playing ? state.speed : Math.max(0.95 * map.pace + 0.05 * ((state.time - earlier) / passed), 1);
   const wanted = `${state.time}|${store.version}|${map.centre}|${map.scale}|${map.chosen}|${map.fitted}|${Object.values(map.on)}|${innerWidth}|${innerHeight}`;
   if (wanted !== drawn || map.pending || map.canvas.width !== Math.round(map.canvas.clientWidth * map.ratio)) {
     drawn = wanted;
@@ -165,6 +199,8 @@ function look() {
   $('end').textContent = end().toFixed(0);
   $('empty').hidden = [...store.robots.values()].some((robot) => robot.pose.length) || store.maps.length > 0;
   $('empty').textContent = store.complete ? 'This log has no poses and no map.' : 'waiting for the team …';
+  $('follow').title = $('follow').ariaLabel = `follow ${map.follow || state.chosen || 'a robot'} (R)`;
+  lookAtWaiting();
   lookAtMap();
   lookAtRobots();
   lookAtPeers();
@@ -173,6 +209,19 @@ function look() {
   const metres = gridStep(map.scale) * 2;
   $('scale').firstElementChild.style.width = `${metres * map.scale}px`;
   $('scale').lastElementChild.textContent = metres >= 1 ? `${metres} m` : `${Math.round(metres * 100)} cm`;
+}
+
+/** What a running team waits for, by the states of its nodes. */
+function lookAtWaiting() {
+  const nodes = new Map();
+  for (const [node, states] of store.complete ? [] : store.awaited) {
+    for (const each of states) nodes.set(each, [...(nodes.get(each) || []), node]);
+  }
+  const lines = [...nodes].map(([each, of]) => `${of.join(', ')}: ${each}`);
+  if (!store.complete && document.body.dataset.state === 'closed') lines.push('no connection to the server of this page: it is tried again');
+  else if (!store.robots.size) lines.push(store.complete ? 'the log has no poses' : 'no pose of a robot yet');
+  $('empty').hidden = !lines.length;
+  $('empty').textContent = lines.join('\n');
 }
 
 function put(id, text, level = '') {
@@ -189,8 +238,7 @@ function lookAtMap() {
   put('robot-count', here.filter((r) => store.stateAt(r, state.time) !== 'lost').length);
   $('rmse-box').hidden = $('nees-box').hidden = !store.trueMap;
   put('rmse', shown && shown.rmse !== null ? metresText(shown.rmse) : '–');
-  const kind = shown && shown.joint ? '' : ' (blocks only)';
-  put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) + kind : '–', '');
+  put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) : '–', '');
   const figures = store.figuresAt('central', state.time);
   const cost = figures && figures.joint_cost_per_dof;
   $('cost-box').hidden = !store.figures.has('central');
@@ -218,14 +266,14 @@ function lookAtRobots() {
       const row = document.createElement('tr');
       row.dataset.robot = robot.name;
       row.tabIndex = 0;
-      row.title = 'show its errors; twice: follow it';
+      row.title = 'show its errors; twice, or R: follow it';
       const cells = Array.from({ length: 6 }, () => row.insertCell());
       const dot = document.createElement('i');
       dot.className = 'dot';
       const note = document.createElement('small');
       cells[0].append(dot, robot.name, note);
       row.addEventListener('click', () => pick(robot.name));
-      row.addEventListener('dblclick', () => { map.follow = robot.name; });
+      row.addEventListener('dblclick', () => follow(robot.name));
       row.addEventListener('keydown', (event) => { if (event.key === 'Enter') pick(robot.name); });
       rows.set(robot.name, { row, cells, dot, note });
       return row;
@@ -333,13 +381,21 @@ function lookAtEvents() {
     list.store = store.hello;
     list.replaceChildren(...store.events.map((event) => {
       const item = document.createElement('li');
+      item.tabIndex = 0;
       const time = document.createElement('time');
       time.textContent = `${event.t.toFixed(0)} s`;
       const text = document.createElement('span');
       text.textContent = event.x;
       text.className = event.e;
       item.append(time, text);
-      item.addEventListener('click', () => { state.playing = false; seek(event.t); });
+      const show = () => {
+        state.playing = false;
+        seek(event.t);
+        const place = store.placeOf(event);
+        if (place) map.show(...place);
+      };
+      item.addEventListener('click', show);
+      item.addEventListener('keydown', (pressed) => { if (pressed.key === 'Enter') show(); });
       return item;
     }));
     drawTicks();
@@ -361,10 +417,9 @@ function drawTicks() {
   canvas.width = canvas.clientWidth * ratio;
   canvas.height = canvas.clientHeight * ratio;
   const g = canvas.getContext('2d'), half = 8 * ratio;
-  const marks = { lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good', closure: 'good', undone: 'warn', restarted: 'warn' };
   for (const event of store.events) {
-    if (!marks[event.e]) continue;
-    g.fillStyle = colour(marks[event.e]);
+    if (!MARKS[event.e]) continue;
+    g.fillStyle = colour(MARKS[event.e]);
     g.fillRect(half + (event.t / end()) * (canvas.width - 2 * half) - ratio, 0, 2 * ratio, 6 * ratio);
   }
 }
@@ -459,12 +514,6 @@ function drawConsistency() {
     line(scales.map((k) => k[0]), scales.map((k) => k[1]), { colour: colour('warn'), width: 1.5 });
     if (scales.length) legend.push(['warn', 'covariance scale of the team']);
     for (const [, v] of [...kept, ...scales]) high = Math.max(high, Math.min(1.15 * v, 5));
-  }
-  const fits = store.maps.filter((m) => m.nees !== null);
-  if (fits.length) {
-    line(fits.map((m) => m.t), fits.map((m) => m.nees), { colour: colour('landmark'), width: 1.5 });
-    legend.push(['landmark', 'map NEES per dof: blocks only, at the end joint']);
-    for (const m of fits) high = Math.max(high, Math.min(1.15 * m.nees, 5));
   }
   drawInnovations();
   const i = found ? upTo(found.t, state.time) - 1 : -1;

@@ -2,27 +2,35 @@
 // layers of their own; while time goes on, only what has been added to a path is painted.
 
 import { upTo } from './store.js';
+import { SvgContext } from './svg.js';
 
 const ELLIPSE = Math.sqrt(5.991);  // 95 % of a Gaussian in the plane
 const UNNAMED = 2 ** 31;           // from here on the map has numbered landmarks itself: a click says who they are
 const LABELS = 400;                // more landmarks than these have no numbers until they are near
 
 export const LAYERS = [
-  ['ellipses', '95 % ellipses'], ['labels', 'numbers'], ['paths', 'paths'], ['truth', 'truth'],
-  ['particles', 'particles'],
+  ['ellipses', '95 % ellipses'], ['labels', 'numbers'], ['paths', 'online paths'], ['smoothed', 'smoothed paths'],
+  ['truth', 'truth'], ['seen', 'measurements'], ['view', 'field of view'], ['links', 'messages'],
+  ['events', 'events'], ['particles', 'particles'],
 ];
+export const MARKS = {  // colour of an event on the map and above the slider
+  lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good',
+  closure: 'good', undone: 'warn', restarted: 'warn',
+};
+const PULSE_S = 0.8;               // of a message on its way, in seconds of the viewer
 
 export class MapView {
   constructor(canvas, store) {
     this.canvas = canvas;
     this.context = canvas.getContext('2d');
     this.store = store;
-    this.on = Object.fromEntries(LAYERS.map(([name]) => [name, true]));
+    this.on = Object.fromEntries(LAYERS.map(([name]) => [name, name !== 'view']));
     this.scale = 20;             // pixels per metre
     this.centre = [0, 0];        // metres
     this.fitted = true;          // until somebody moves the map
     this.follow = null;          // a robot's name
     this.chosen = null;
+    this.pace = 1;               // seconds of the team per second of the viewer
     this.landmarks = new OffscreenCanvas(1, 1);
     this.paths = new OffscreenCanvas(1, 1);
     this.painted = {};           // what the layers hold
@@ -39,7 +47,7 @@ export class MapView {
     const of = (name) => style.getPropertyValue(`--${name}`).trim();
     this.colours = {
       ground: of('ground'), grid: of('grid'), strong: of('grid-strong'), landmark: of('landmark'),
-      truth: of('truth'), text: of('text'), soft: of('soft'),
+      truth: of('truth'), text: of('text'), soft: of('soft'), good: of('good'), warn: of('warn'), bad: of('bad'),
     };
     this.painted = {};
   }
@@ -77,6 +85,14 @@ export class MapView {
     ];
   }
 
+  /** Move the map so that a place is on the screen, if it is not. */
+  show(x, y) {
+    const [u, v] = this.screen(x, y);
+    if (u > 0 && v > 0 && u < this.canvas.width && v < this.canvas.height) return;
+    this.centre = [x, y];
+    this.fitted = false;
+  }
+
   zoom(factor, at = null) {
     const w = this.canvas.clientWidth / 2, h = this.canvas.clientHeight / 2;
     const [px, py] = at || [w, h];
@@ -109,7 +125,7 @@ export class MapView {
         this.centre[1] + (now[1] - before[1]) / this.scale / fingers.size,
       ];
       this.fitted = false;
-      this.follow = null;
+      if (this.follow) this.onMove();
       if (fingers.size === 2) {
         const [a, b] = [...fingers.values()];
         const apart = Math.hypot(a[0] - b[0], a[1] - b[1]);
@@ -123,7 +139,7 @@ export class MapView {
     canvas.addEventListener('click', (event) => {
       if (this.onPick) this.onPick(event.offsetX * this.ratio, event.offsetY * this.ratio);
     });
-    canvas.addEventListener('dblclick', () => { this.follow = null; this.fit(); });
+    canvas.addEventListener('dblclick', () => { this.onMove(); this.fit(); });
   }
 
   draw(time) {
@@ -134,12 +150,32 @@ export class MapView {
       const i = robot ? this.store.poseAt(robot, time) : -1;
       if (i >= 0) { this.centre = [robot.pose.get(i, 0), robot.pose.get(i, 1)]; this.fitted = false; }
     }
-    const g = this.context;
     this.paintLayers(time);
-    this.blit(g);
-    if (this.on.particles) this.paintParticles(g, time);
-    for (const robot of this.store.robots.values()) this.paintRobot(g, robot, time);
+    this.blit(this.context);
+    this.paintMoving(this.context, time);
     this.frames++;
+  }
+
+  /** The text of an SVG file of what is shown. */
+  svg(time) {
+    const { width, height } = this.canvas, fast = this.fast;
+    const g = new SvgContext(width, height);
+    this.fast = false;
+    this.paintLandmarks(g, this.store.mapAt(time));
+    this.paintPaths(g, time, new Map());
+    this.paintMoving(g, time);
+    this.fast = fast;
+    return g.text();
+  }
+
+  paintMoving(g, time) {
+    const robots = [...this.store.robots.values()];
+    if (this.on.view) for (const robot of robots) this.paintView(g, robot, time);
+    if (this.on.seen) for (const robot of robots) this.paintSeen(g, robot, time);
+    if (this.on.particles) this.paintParticles(g, time);
+    if (this.on.events) this.paintEvents(g, time);
+    for (const robot of robots) this.paintRobot(g, robot, time);
+    if (this.on.links) this.paintLinks(g, time);
   }
 
   /**
@@ -167,14 +203,14 @@ export class MapView {
     this.fast = moved && !still && this.cost > 8;
     if (moved || fresh || this.painted.fast || (news && due)) {
       if (this.painted.fast && !this.fast) this.painted.paths = null;
-      this.paintLandmarks(map);
+      this.paintLandmarks(this.landmarks.getContext('2d'), map);
       this.painted = {
         ...this.painted, view, shape, map, trueMap: this.store.trueMap, scale: this.scale, centre: [...this.centre],
         fast: this.fast,
       };
       this.paintedAt = began;
     } else if (news) this.pending = true;
-    this.paintPaths(time, view);
+    this.extendPaths(time, view);
     if (this.paintedAt === began) this.cost = performance.now() - began;
     if (this.fast) this.pending = true;
   }
@@ -210,8 +246,7 @@ export class MapView {
     }
   }
 
-  paintLandmarks(map) {
-    const g = this.landmarks.getContext('2d');
+  paintLandmarks(g, map) {
     this.paintGrid(g);
     const r = this.ratio;
     if (this.on.truth && this.store.trueMap) {
@@ -276,7 +311,7 @@ export class MapView {
     return best;
   }
 
-  paintPaths(time, view) {
+  extendPaths(time, view) {
     const g = this.paths.getContext('2d');
     const inside = [...this.store.robots.values()].filter((robot) => !this.store.isOutside(robot, time));
     const shown = inside.map((robot) => `${robot.name} ${this.store.firstInFrame(robot, time)}`).join();
@@ -289,19 +324,26 @@ export class MapView {
     this.painted.shown = shown;
     this.painted.time = time;
     this.painted.store = this.store.hello;
-    if (!this.on.paths) return;
+    this.paintPaths(g, time, this.painted.ends);
+  }
+
+  /** Paint what `ends` lacks of the paths until a time; it gets how far each is painted. */
+  paintPaths(g, time, ends) {
     const r = this.ratio;
     g.lineJoin = 'bevel';
     for (const robot of this.store.robots.values()) {
-      if (this.on.truth) this.extendPath(g, robot, 'truth', robot.truth, time, this.colours.truth, 1 * r, 0.55);
+      if (this.on.truth) this.extendPath(g, ends, `truth ${robot.name}`, robot.truth, time, this.colours.truth, 1 * r, 0.55);
+      const beside = this.on.smoothed && robot.smoothed.length;
+      if (beside) this.extendPath(g, ends, `smoothed ${robot.name}`, robot.smoothed, time, robot.colour, 2.2 * r, 0.95);
+      // Poses from before a robot was in the team's frame are in its own frame.
+      if (this.on.paths && !this.store.isOutside(robot, time)) {
+        this.extendPath(g, ends, `pose ${robot.name}`, robot.pose, time, robot.colour, (beside ? 1 : 2) * r, beside ? 0.5 : 0.75, this.store.firstInFrame(robot, time));
+      }
     }
-    // Poses from before a robot was in the team's frame are in its own frame.
-    for (const robot of inside) this.extendPath(g, robot, 'pose', robot.pose, time, robot.colour, 2 * r, 0.75, this.store.firstInFrame(robot, time));
   }
 
-  extendPath(g, robot, what, series, time, colour, width, alpha, first = 0) {
-    const key = `${what} ${robot.name}`;
-    const from = Math.max(first, this.painted.ends.get(key) || 0);
+  extendPath(g, ends, key, series, time, colour, width, alpha, first = 0) {
+    const from = Math.max(first, ends.get(key) || 0);
     const to = series.at(time);
     if (to <= from) return;
     g.strokeStyle = colour;
@@ -316,11 +358,132 @@ export class MapView {
       if (i < to && Math.abs(nx - x) + Math.abs(ny - y) < 1.5) continue;  // nobody could see it
       if (Math.hypot(nx - x, ny - y) > 2.5 * this.scale * this.ratio + 400) g.moveTo(nx, ny); else g.lineTo(nx, ny);
       [x, y] = [nx, ny];
-      if (++drawn % 30 === 0) { g.stroke(); g.beginPath(); g.moveTo(x, y); }  // short ones are faster
+      if (++drawn % 30 === 0 && !g.text) { g.stroke(); g.beginPath(); g.moveTo(x, y); }  // short ones are faster
     }
     g.stroke();
     g.globalAlpha = 1;
-    this.painted.ends.set(key, to);
+    ends.set(key, to);
+  }
+
+  /** [x, y, heading] of a robot at a time; null where it has no place in the team's frame. */
+  placeAt(robot, time) {
+    const i = robot ? this.store.poseAt(robot, time) : -1;
+    return i < 0 ? null : between(robot.pose, i, time);
+  }
+
+  /** The sector in which a robot's sensor measures; without a stated range, as far as it has measured. */
+  paintView(g, robot, time) {
+    const place = this.placeAt(robot, time);
+    if (!place || !robot.reach) return;
+    const { mount, range, view } = robot.sensor || { mount: [0, 0, 0], range: Infinity, view: 2 * Math.PI };
+    const [x, y] = this.screen(...moved(place, mount[0], mount[1]));
+    const radius = Math.min(range, robot.reach) * this.scale * this.ratio;
+    const axis = -(place[2] + mount[2]), half = Math.min(view, 2 * Math.PI) / 2;
+    g.beginPath();
+    if (half < Math.PI) g.moveTo(x, y);
+    g.arc(x, y, radius, axis - half, axis + half);
+    g.closePath();
+    g.fillStyle = g.strokeStyle = robot.colour;
+    g.lineWidth = this.ratio;
+    g.globalAlpha = 0.06; g.fill();
+    g.globalAlpha = 0.35; g.stroke();
+    g.globalAlpha = 1;
+  }
+
+  /** Rays to the landmarks and teammates that a robot measures; dashed to a place that is not in the map. */
+  paintSeen(g, robot, time) {
+    const place = this.placeAt(robot, time), [first, end] = this.store.seenAt(robot, time);
+    if (!place || end <= first) return;
+    const map = this.store.mapAt(time), r = this.ratio, rays = new Map();
+    for (let i = first; i < end; i++) {
+      const name = robot.seen.get(i, 0);
+      rays.set(name === -1 ? `${name} ${i}` : name, i);
+    }
+    const [x, y] = this.screen(place[0], place[1]);
+    g.strokeStyle = robot.colour;
+    for (const [name, i] of rays) {
+      const k = map && typeof name === 'number' ? map.ids.indexOf(name) : -1;
+      const mate = typeof name === 'string' ? this.placeAt(this.store.robots.get(name), time) : null;
+      const known = k >= 0 ? [map.xy[2 * k], map.xy[2 * k + 1]] : mate;
+      const [u, v] = this.screen(...(known || moved(place, robot.seen.get(i, 1), robot.seen.get(i, 2))));
+      g.globalAlpha = mate ? 0.9 : 0.55;
+      g.lineWidth = (mate ? 2.2 : 1) * r;
+      g.setLineDash(known ? [] : [4 * r, 4 * r]);
+      g.beginPath(); g.moveTo(x, y); g.lineTo(u, v); g.stroke();
+      g.beginPath(); g.arc(u, v, (mate ? 8 : 5) * r, 0, 2 * Math.PI); g.stroke();
+    }
+    g.setLineDash([]);
+    g.globalAlpha = 1;
+  }
+
+  /** The centre has no place in the map: it is shown in the corner, where links end. */
+  hub() { return [this.canvas.width - 46 * this.ratio, this.canvas.height - 40 * this.ratio]; }
+
+  /** Pulses on links: a submap leaves in its robot's colour, a map comes back in that of landmarks. */
+  paintLinks(g, time) {
+    const r = this.ratio, lasts = PULSE_S * this.pace;
+    const at = (name) => {
+      if (name === 'central') return this.hub();
+      const place = this.placeAt(this.store.robots.get(name), time);
+      return place && this.screen(place[0], place[1]);
+    };
+    if (this.store.hasCentre) this.paintHub(g);
+    const { links, linkTimes } = this.store;
+    for (let i = upTo(linkTimes, time - lasts); i < links.length && links[i].t <= time; i++) {
+      const { t, from, to } = links[i];
+      const a = at(from), b = to === 'central' && !this.store.hasCentre ? null : at(to);
+      if (!a || !b) continue;
+      const share = (time - t) / lasts, x = a[0] + share * (b[0] - a[0]), y = a[1] + share * (b[1] - a[1]);
+      const back = from === 'central';
+      g.strokeStyle = g.fillStyle = back ? this.colours.landmark : this.store.robots.get(from).colour;
+      g.globalAlpha = 0.3; g.lineWidth = 1.2 * r;
+      g.beginPath(); g.moveTo(...a); g.lineTo(...b); g.stroke();
+      g.globalAlpha = 1;
+      g.beginPath(); g.arc(x, y, 4.5 * r, 0, 2 * Math.PI);
+      if (back) g.stroke(); else g.fill();
+    }
+    g.globalAlpha = 1;
+  }
+
+  paintHub(g) {
+    const r = this.ratio, [x, y] = this.hub();
+    g.fillStyle = this.colours.ground;
+    g.strokeStyle = this.colours.soft;
+    g.lineWidth = 1.5 * r;
+    g.beginPath(); g.rect(x - 9 * r, y - 9 * r, 18 * r, 18 * r); g.fill(); g.stroke();
+    g.font = `${11 * r}px system-ui, "DejaVu Sans", sans-serif`;
+    g.fillStyle = this.colours.soft;
+    g.textAlign = 'center';
+    g.fillText('centre', x, y + 22 * r);
+    g.textAlign = 'left';
+  }
+
+  paintEvents(g, time) {
+    const r = this.ratio;
+    this.marks = [];  // for clicks: x, y, event
+    for (const event of this.store.events) {
+      if (event.t > time + 1e-6) break;
+      if (!MARKS[event.e] || event.e === 'joined') continue;
+      if (!event.place && event.version !== this.store.version) {
+        event.version = this.store.version;  // poses may come after their event
+        event.place = this.store.placeOf(event);
+      }
+      if (!event.place) continue;
+      const [x, y] = this.screen(...event.place), size = 6 * r;
+      this.marks.push([x, y, event]);
+      g.beginPath();
+      g.moveTo(x, y - size); g.lineTo(x + size, y); g.lineTo(x, y + size); g.lineTo(x - size, y);
+      g.closePath();
+      g.fillStyle = this.colours[MARKS[event.e]];
+      g.strokeStyle = this.colours.ground;
+      g.lineWidth = 1.5 * r;
+      g.fill(); g.stroke();
+    }
+  }
+
+  /** The events that are marked within 12 pixels of a place on the screen. */
+  eventsAt(x, y) {
+    return (this.on.events && this.marks || []).filter(([u, v]) => Math.hypot(u - x, v - y) < 12 * this.ratio).map(([, , event]) => event);
   }
 
   paintParticles(g, time) {
@@ -330,13 +493,12 @@ export class MapView {
       if (i < 0 || time - robot.cloudTimes[i] > 30) continue;
       const points = robot.clouds[i], at = this.store.poseAt(robot, time);
       if (at < 0) continue;
-      const place = between(robot.pose, at, time), c = Math.cos(place[2]), s = Math.sin(place[2]);
+      const place = between(robot.pose, at, time);
       g.fillStyle = robot.colour;
       g.globalAlpha = 0.5;
       g.beginPath();
       for (let k = 0; k < points.length; k += 2) {
-        const ahead = points[k], left = points[k + 1];
-        const [x, y] = this.screen(place[0] + c * ahead - s * left, place[1] + s * ahead + c * left);
+        const [x, y] = this.screen(...moved(place, points[k], points[k + 1]));
         g.rect(x - r, y - r, 2 * r, 2 * r);
       }
       g.fill();
@@ -396,6 +558,12 @@ export class MapView {
     g.lineTo(...at(-2.5, size));
     g.closePath();
   }
+}
+
+/** The place that is so far ahead and left of a pose. */
+function moved([x, y, heading], ahead, left) {
+  const c = Math.cos(heading), s = Math.sin(heading);
+  return [x + c * ahead - s * left, y + s * ahead + c * left];
 }
 
 /** Half axes of the 95 % ellipse [m] and the direction of the major one [rad]. */

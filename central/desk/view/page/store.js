@@ -1,4 +1,4 @@
-// What the server has told of a team, in the order of team time; t is seconds since the start.
+// The frames of a team from the server, in the order of team time; t is seconds since the start.
 
 /** The number of entries of ascending `t` that are not later than `time`. */
 export function upTo(t, time) {
@@ -29,6 +29,8 @@ export const inOrder = new Intl.Collator('en', { numeric: true });  // r2 before
 const POSE = 7;   // x, y, heading, xx, xy, yy, heading's variance
 const ERROR = 7;  // x, y, heading, their 3σ, NEES per degree of freedom
 const TRUTH = 3;
+const SEEN = 3;   // landmark, −1 without identity, or teammate; ahead, left
+const PLACED = /\blandmarks? (\d+)/;
 
 function floats(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -52,6 +54,10 @@ export class Store {
     this.figures = new Map();
     this.traffic = new Map();
     this.events = [];
+    this.links = [];    // pulses: t, from, to
+    this.linkTimes = [];
+    this.awaited = new Map();
+    this.hasCentre = false;
     this.now = 0;
     this.complete = false;
     this.version = 0;
@@ -63,7 +69,7 @@ export class Store {
     if (!found) {
       found = {
         name, pose: new Series(POSE), error: new Series(ERROR), truth: new Series(TRUTH),
-        clouds: [], cloudTimes: [], smoothed: null, states: [], stateTimes: [], colour: '#888',
+        clouds: [], cloudTimes: [], smoothed: new Series(TRUTH), seen: new Series(SEEN), sensor: null, reach: 0, states: [], stateTimes: [], colour: '#888',
         outside: new Series(1), frames: new Series(0),
       };
       this.robots.set(name, found);
@@ -103,8 +109,13 @@ export class Store {
         robot.cloudTimes.push(frame.t);
         break;
       }
-      case 'path': this.robot(frame.r).smoothed = frame; break;
+      case 'path': this.robot(frame.r).smoothed.push(frame.t, frame.v); break;
+      case 'sensor': this.robot(frame.r).sensor = frame; break;
+      case 'see': this.takeSeen(this.robot(frame.r), frame); break;
+      case 'link': this.takeLink(frame.t, frame.a, frame.b); break;
+      case 'wait': this.awaited.set(frame.n, frame.x); break;
       case 'fig': {
+        this.takeReceived(frame);
         if (!this.figures.has(frame.n)) this.figures.set(frame.n, { t: [], f: [] });
         const found = this.figures.get(frame.n);
         if (!found.t.length || frame.t >= found.t[found.t.length - 1]) {
@@ -126,6 +137,27 @@ export class Store {
     this.maps.push(map);
     this.mapTimes.push(last === undefined ? frame.t : Math.max(frame.t, last));
     this.extend(map.xy, 2);
+  }
+
+  takeSeen(robot, frame) {
+    robot.seen.push(frame.t, frame.v);
+    for (let i = 0; i < frame.v.length; i += SEEN) robot.reach = Math.max(robot.reach, Math.hypot(frame.v[i + 1], frame.v[i + 2]));
+  }
+
+  takeLink(t, from, to) {
+    if (from === 'central') this.hasCentre = true;
+    const i = upTo(this.linkTimes, t);
+    this.links.splice(i, 0, { t, from, to });
+    this.linkTimes.splice(i, 0, t);
+  }
+
+  /** A peer's count of a teammate's submaps that has grown is a submap that came over. */
+  takeReceived({ n, t, f }) {
+    const found = this.figures.get(n), before = found ? found.f[found.f.length - 1] : {};
+    for (const [name, count] of Object.entries(f)) {
+      const from = name.startsWith('set_submaps.') ? name.slice(12) : n.slice(6);
+      if (from !== n.slice(6) && count > (before[name] || 0)) this.takeLink(t, from, n.slice(6));
+    }
   }
 
   takeTraffic(key, t, messages, bytes) {
@@ -166,6 +198,20 @@ export class Store {
   firstInFrame(robot, time) {
     const i = robot.frames.at(time);
     return i < 0 ? 0 : upTo(robot.pose.t, robot.frames.t[i] - 1e-6);
+  }
+
+  /** Rows of what a robot has measured within the last second: [first, end). */
+  seenAt(robot, time) { return [upTo(robot.seen.t, time - 1), upTo(robot.seen.t, time)]; }
+
+  /** The place of an event: of its robot or the first one that it names, else of a landmark of its map; null: none. */
+  placeOf(event) {
+    const words = [event.n.replace('robot/', ''), ...event.x.split(/[^\w]+/)];
+    const robot = this.robots.get(words.find((word) => this.robots.has(word)));
+    const i = robot ? this.poseAt(robot, event.t) : -1;
+    if (i >= 0) return [robot.pose.get(i, 0), robot.pose.get(i, 1)];
+    const map = this.mapAt(event.t), named = PLACED.exec(event.x);
+    const k = map && named ? map.ids.indexOf(Number(named[1])) : -1;
+    return k < 0 ? null : [map.xy[2 * k], map.xy[2 * k + 1]];
   }
 
   stateAt(robot, time) {
