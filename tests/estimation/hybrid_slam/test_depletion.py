@@ -12,7 +12,7 @@ from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.se2 import between
 
 WINDOWS = {1011: 34, 1022: 34, 1074: 21}
-"""Windows of r1 of `thesis` by seed: odometry off by three sigma beside landmarks that are close."""
+"""Windows of r1 of `thesis` by seed: odometry off by three sigma beside close landmarks."""
 
 
 def nees_of_window(seed, sequence):
