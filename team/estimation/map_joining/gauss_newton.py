@@ -25,6 +25,7 @@ from teamslam.team import core
 from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.least_squares import (
     HALVINGS,
@@ -110,8 +111,12 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """Robust scale c of each submap at its age."""
-        return self._scale_at(self.age)
+        """Robust scale c of each submap at its age; ∞ for a saved map (`saved_maps` tests it)."""
+        scale = self._scale_at(self.age)
+        for f, submap in enumerate(self.graph.submaps):
+            if is_map(submap.contribution.stream):
+                scale[f] = np.inf
+        return scale
 
     @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
@@ -304,7 +309,9 @@ def settled(island: Island) -> tuple[Island, int, float]:
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
-        narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
+        narrow = settings.robust_c is None or not (
+            np.isfinite(scales) & (scales > settings.robust_c)
+        ).any()
         island, (damping, change) = _iteration(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
