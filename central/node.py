@@ -100,7 +100,7 @@ class CentralNode:
         """Make the first messages of the node: its configuration, and the maps of earlier days."""
         for saved in self._maps:
             self.file(saved)
-        maps = [Outgoing(ch.SAVED_MAP, saved.name, saved) for saved in self._maps]
+        maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._maps]
         return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement), *maps]
 
     # Receive.

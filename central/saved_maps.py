@@ -8,8 +8,8 @@ import numpy as np
 from teamslam.team import core, translate
 from teamslam.team.config import BIASES, UNNAMED
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import Island

@@ -4,7 +4,9 @@ The file is one message (`teamslam.team.wire.messages.SavedMap`), checked when i
 wire.
 """
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +18,6 @@ from teamslam.team.wire.codec import WireError, decoded, encoded
 
 LEAF_SIGMA = 1e-3
 """Standard deviation [m, rad] of the end pose of a saved map's submap, which nothing depends on."""
-SUFFIX = ".map"
 
 
 class SavedMapError(ValueError):
@@ -77,3 +78,46 @@ def submap_of(saved: m.SavedMap) -> m.Submap:
         seen=b"\1" * len(counts),
         keyframes=min(1, len(counts)),
     )
+
+
+def map_name(text: str) -> str:
+    """Check the name of a map; raises SavedMapError."""
+    if re.fullmatch("[a-z][a-z0-9_]{0,31}", text) is None:
+        raise SavedMapError(
+            f"{text!r} is no name of a map: up to 32 small letters, digits and _, a letter first; "
+            "give one by --name"
+        )
+    return text
+
+
+def map_figures(saved: m.SavedMap) -> dict[str, Any]:
+    """Figures of a saved map for people and JSON: provenance, and each landmark with its own
+    standard deviations, the shared errors taken as zero.
+    """
+    numbers = ids(saved.ids, "ids").tolist()
+    points = floats(saved.means, "means").reshape(-1, 2).tolist()
+    covariance = unpacked(floats(saved.covariance, "covariance"), 2 * len(numbers))
+    sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 2).tolist()
+    counts = ids(saved.counts, "counts").tolist()
+    return {
+        "name": saved.name,
+        "frame": saved.frame,
+        "stamp_s": saved.stamp_ns * 1e-9,
+        "sets": [each.hex() for each in saved.sets],
+        "biases": list(saved.biases),
+        "software": saved.software,
+        "core": saved.core,
+        "landmarks": [
+            {
+                "landmark": number,
+                "x_m": x,
+                "y_m": y,
+                "sigma_x_m": sigma_x,
+                "sigma_y_m": sigma_y,
+                "submaps": count,
+            }
+            for number, (x, y), (sigma_x, sigma_y), count in zip(
+                numbers, points, sigmas, counts, strict=True
+            )
+        ],
+    }

@@ -1,10 +1,10 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 The set holds submaps, the inter-robot measurements from them, initial poses, orders that withdraw a
-robot, an operator's verdicts on landmarks, and saved maps of earlier days. A submap is complete when all inter-robot
-measurements that it announces are stored. Admission enforces law 1: a submap whose measurements
-overlap another's, or that differs from a stored one of the same name, is refused with the reason.
-Centre, peers and verification use the same class.
+robot, an operator's verdicts on landmarks, and saved maps of earlier days. A submap is complete
+when all inter-robot measurements that it announces are stored. Admission enforces law 1: a submap
+whose measurements overlap another's, or that differs from a stored one of the same name, is refused
+with the reason. Centre, peers and verification use the same class.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,8 +59,9 @@ class SubmapStore:
     """The members of the team's set, each in one place.
 
     chains: the submaps available to a map, of streams with an initial pose; they grow in place.
-    maps: the saved maps of earlier days, by name. withdrawals: an operator's first order on each withdrawn robot. verdicts: those in force, with
-    their landmarks in order. refused: number of refused members.
+    maps: the saved maps of earlier days, by name. withdrawals: an operator's first order on each
+    withdrawn robot. verdicts: those in force, with their landmarks in order. refused: number of
+    refused members.
     """
 
     def __init__(self) -> None:

@@ -30,7 +30,11 @@ all: a late joiner, and a receiver after a cut link, receives every message.
 
 _PLACE = re.compile(r"\{(robot|node|view)\}")
 _NAME = "[a-z][a-z0-9_]{0,31}"
-_PATTERNS = {"robot": f"(?:map-)?{_NAME}", "node": f"{_NAME}(?:/{_NAME})?", "view": f"{_NAME}(?:/{_NAME})?"}
+_PATTERNS = {
+    "robot": f"(?:map-)?{_NAME}",
+    "node": f"{_NAME}(?:/{_NAME})?",
+    "view": f"{_NAME}(?:/{_NAME})?",
+}
 
 
 @dataclass(frozen=True)

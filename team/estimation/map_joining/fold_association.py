@@ -35,7 +35,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     settled,
 )
-from teamslam.team.estimation.map_joining.joining import Fold, merged_islands
+from teamslam.team.estimation.map_joining.joining import Fold, merged_islands, precedence
 from teamslam.team.estimation.map_joining.merging import Merge, placed
 from teamslam.team.estimation.map_joining.minima import minimum
 from teamslam.team.estimation.map_joining.submap_graph import tied

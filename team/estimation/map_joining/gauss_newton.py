@@ -309,9 +309,10 @@ def settled(island: Island) -> tuple[Island, int, float]:
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
-        narrow = settings.robust_c is None or not (
-            np.isfinite(scales) & (scales > settings.robust_c)
-        ).any()
+        narrow = (
+            settings.robust_c is None
+            or not (np.isfinite(scales) & (scales > settings.robust_c)).any()
+        )
         island, (damping, change) = _iteration(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):

@@ -27,8 +27,8 @@ from teamslam.team.estimation.contribution import (
     InitialPoseFactor,
     Key,
     Stream,
-    moment,
     is_map,
+    moment,
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor, SightingKey

@@ -30,8 +30,8 @@ from teamslam.team.estimation.map_joining.island_ties import (
     headings_that_fit,
     ties,
 )
-from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
+from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
 from teamslam.team.shapes import Float, Int64
 

@@ -126,7 +126,7 @@ def _tests(
     right[bias_at] -= dense.product(shifts, own)
     right[np.repeat(graph.fixed, np.diff(graph.offset))] = 0.0
     M = own[columns] - dense.product(right.T, island.posterior.solve(right))
-    found: list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float] | None] = []
+    found: list[tuple[Float[np.ndarray, 2], Float[np.ndarray, "2 2"], float] | None] = []
     for k, first in zip(tested, range(0, len(columns), 2), strict=True):
         block = M[first : first + 2, first : first + 2]
         block = 0.5 * (block + block.T)
@@ -254,8 +254,9 @@ def disagreeing(
     if count < LEAST_AGREEING or 2 * count <= n:
         of = next(each for island in (main, other) for each in maps_of(island.graph))
         return (
-            f"{n} shared landmarks disagree: no more than {count} of {named(of.contribution.stream)}"
-            " are at one place; it is the map of another site, or half of the site has changed"
+            f"{n} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
+            f"{count} are at one place; it is the map of another site, or half of the site has "
+            "changed"
         )
     return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
 

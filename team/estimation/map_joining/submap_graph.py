@@ -137,8 +137,8 @@ class Graph:
     the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
     replaces older submaps, if any (`condensing`). gone: number of a stream's submaps in
     `condensed`; `streams` begins after them. former: the node of a moved landmark's old place, by
-    (saved map, id); the id is that of its present place. memory: observations of the condensed submaps for data
-    association, where landmarks have no names.
+    (saved map, id); the id is that of its present place. memory: observations of the condensed
+    submaps for data association, where landmarks have no names.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]

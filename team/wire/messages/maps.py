@@ -28,7 +28,6 @@ from teamslam.team.wire.messages.base import (
 )
 from teamslam.team.wire.messages.orders import Judgement
 
-
 ChangeState = Literal["unchanged", "moved", "gone", "new"]
 MOST_SAVED = 2000
 """Most landmarks of a saved map, whose joint covariance has 64 MB."""
