@@ -41,6 +41,8 @@ STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
 tenth of the shift by condensing (docs/decisions/25).
 """
+PLAIN = 1e9
+"""Robust scale at which Cauchy's loss is χ² to the last bit."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -111,11 +113,11 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """Robust scale c of each submap at its age; ∞ for a saved map (`saved_maps` tests it)."""
+        """Robust scale c of each submap at its age; PLAIN for a saved map (see `saved_maps`)."""
         scale = self._scale_at(self.age)
-        for f, submap in enumerate(self.graph.submaps):
-            if is_map(submap.contribution.stream):
-                scale[f] = np.inf
+        if self.settings.robust_c is not None:
+            saved = [is_map(each.contribution.stream) for each in self.graph.submaps]
+            scale[np.flatnonzero(saved)] = PLAIN
         return scale
 
     @cached_property
@@ -309,9 +311,8 @@ def settled(island: Island) -> tuple[Island, int, float]:
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
-        narrow = (
-            settings.robust_c is None
-            or not (np.isfinite(scales) & (scales > settings.robust_c)).any()
+        narrow = settings.robust_c is None or bool(
+            ((scales == settings.robust_c) | (scales == PLAIN)).all()
         )
         island, (damping, change) = _iteration(island, damping)
         count += 1
