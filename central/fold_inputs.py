@@ -7,15 +7,22 @@ fold without some robots reads the same inputs.
 import math
 from collections.abc import Collection, Mapping, Sequence
 
+import msgspec
+
 from teamslam.central.config import CentralConfig
 from teamslam.central.members import Members
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Contribution, Stream, named
+from teamslam.team.estimation.contribution import (
+    Contribution,
+    Stream,
+    is_map,
+    named,
+)
 from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from teamslam.team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
 from teamslam.team.wire.digest import digest_of
-from teamslam.team.wire.messages import SightingFactor, Submap
+from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap
 
 
 class FoldInputs:
@@ -24,7 +31,8 @@ class FoldInputs:
     def __init__(self, config: CentralConfig) -> None:
         self.tick_ns = round(config.tick_s * 1e9)
         self._bounds = config.bounds
-        self._members = Members(self.tick_ns, config.least_sigma)
+        self._bounds_of_map = msgspec.structs.replace(config.bounds, submap_landmarks=MOST_SAVED)
+        self._members = Members(self.tick_ns, config.least_sigma, config.covariance_factor)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
@@ -77,9 +85,13 @@ class FoldInputs:
             for key in self._members.keys(tick, ()):
                 if key[1] == robot:
                     each = self._members.contribution(key)
-                    if submap_beyond(each.local, self._bounds) is None:
+                    if self._beyond(each) is None:
                         found.setdefault(each.stream, []).append(each)
         return found
+
+    def _beyond(self, submap: Contribution) -> str | None:
+        bounds = self._bounds_of_map if is_map(submap.stream) else self._bounds
+        return submap_beyond(submap.local, bounds)
 
     def raised(self, without: Collection[str]) -> Mapping[str, int]:
         """Count, by robot, the folded submaps whose covariance was raised to the least one."""
@@ -95,7 +107,7 @@ class FoldInputs:
         submaps = [self._members.contribution(key) for key in order]
         outside = {}
         for each in submaps:
-            why = submap_beyond(each.local, self._bounds)
+            why = self._beyond(each)
             if why is not None:
                 outside[each.key] = why
         sightings, starts, set_aside = [], [], []

@@ -14,7 +14,7 @@ from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, membe
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.verification import find_possible_duplicates
-from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.contribution import Stream, is_map, named
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.alignment import SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
@@ -63,6 +63,7 @@ def team_map(
     covariance_scale: float,
     biases: Sequence[BiasEstimate],
     reasons: tuple[str, ...],
+    changes: tuple[m.LandmarkChange, ...] = (),
 ) -> m.FusedMap:
     """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
 
@@ -105,6 +106,7 @@ def team_map(
         memberships=memberships_of(fold.landmarks, tail == "final"),
         decisions=decisions_of(fold.landmarks),
         verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
+        changes=changes,
     )
 
 
@@ -299,7 +301,7 @@ def trajectories(
 ) -> list[Outgoing]:
     """Make the path of every stream in the team's frame: the end poses of its submaps."""
     paths = []
-    for robot, incarnation in sorted(fold.home):
+    for robot, incarnation in sorted(stream for stream in fold.home if not is_map(stream)):
         if fold.home[(robot, incarnation)] != fold.main_key:
             continue
         found = marginals.trajectory(fold, robot, incarnation)

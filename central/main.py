@@ -37,7 +37,7 @@ class CentralShell:
 
     patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
     that the scenario does not name. store: file of the set, from which a restarted centre
-    continues.
+    continues. maps: saved maps of earlier days.
     """
 
     def __init__(
@@ -50,10 +50,11 @@ class CentralShell:
         *,
         admit: bool = False,
         store: Path | None = None,
+        maps: Sequence[m.SavedMap] = (),
     ) -> None:
         self._bus = bus
         self._stored = None if store is None else StoredSet(store)
-        self.node = make_centre(config, robots, admit=admit)
+        self.node = make_centre(config, robots, admit=admit, maps=maps)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited

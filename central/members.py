@@ -12,7 +12,7 @@ from dataclasses import replace
 from weakref import WeakValueDictionary
 
 from teamslam.team import translate
-from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.contribution import Contribution, is_map
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.plausible import with_least_spread
 from teamslam.team.wire.digest import Digest
@@ -28,8 +28,14 @@ class Members:
     Tick b has the submaps that end in (b·tick, (b + 1)·tick].
     """
 
-    def __init__(self, tick_ns: int, least_sigma: tuple[float, float] = (0.0, 0.0)) -> None:
+    def __init__(
+        self, tick_ns: int, least_sigma: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
+    ) -> None:
+        """File members. factor: the join's on the covariances of submaps, which a saved map's
+        covariance contains.
+        """
         self.tick_ns = tick_ns
+        self._factor = factor
         self._least_sigma = least_sigma
         self._raised: set[Key] = set()
         self._ticks: dict[int, dict[Key, Submap]] = {}
@@ -81,11 +87,15 @@ class Members:
         """Decode a submap, with its covariance raised to the least one."""
         found = self._made.get(key)
         if found is None:
-            claimed = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
-            local = with_least_spread(claimed.local, self._least_sigma)
-            found = claimed if local is claimed.local else replace(claimed, local=local)
-            if found is not claimed:
-                self._raised.add(key)
+            found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
+            local = found.local
+            if is_map(found.stream):
+                local = replace(local, covariance=local.covariance / self._factor)
+            else:
+                local = with_least_spread(local, self._least_sigma)
+                if local is not found.local:
+                    self._raised.add(key)
+            found = found if local is found.local else replace(found, local=local)
             self._made[key] = found
         return found
 

@@ -49,6 +49,7 @@ class CentralNode:
         ch.SIGHTING_FACTOR,
         ch.ORDER,
         ch.VERDICT,
+        ch.SAVED_MAP,
     )
     fold_class: ClassVar[type[SubmapFold]] = SubmapFold
 
@@ -63,6 +64,7 @@ class CentralNode:
         )
         self._door = Door(robots)
         self._admits = admit
+        self._maps: tuple[m.SavedMap, ...] = ()
         self._admitted: list[str] = []
         self._broadcasts = 0
         self._begin_set()
@@ -90,9 +92,16 @@ class CentralNode:
         others = (ch.ROBOT_CONFIG,) if self._admits else ()
         return tuple(dict.fromkeys((*self.inputs, *own, *others)))
 
+    def load_maps(self, maps: Sequence[m.SavedMap]) -> None:
+        """Load saved maps of earlier days, before `begin`."""
+        self._maps = tuple(maps)
+
     def begin(self) -> list[Outgoing]:
-        """Make the first message of the node: its configuration."""
-        return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement)]
+        """Make the first messages of the node: its configuration, and the maps of earlier days."""
+        for saved in self._maps:
+            self.file(saved)
+        maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._maps]
+        return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement), *maps]
 
     # Receive.
 
@@ -169,7 +178,7 @@ class CentralNode:
             case m.Withdrawal():
                 return self._follow(message)
             case _:
-                self.store.add(message)
+                self._warn_of_refusal(self.store.add(message))
                 return []
 
     def _file_submap(self, submap: m.Submap) -> list[Outgoing]:
@@ -397,7 +406,13 @@ def node_class(config: CentralConfig) -> type[CentralNode]:
 
 
 def make_centre(
-    config: CentralConfig, robots: Sequence[str], *, admit: bool = False
+    config: CentralConfig,
+    robots: Sequence[str],
+    *,
+    admit: bool = False,
+    maps: Sequence[m.SavedMap] = (),
 ) -> CentralNode:
     """Make the node of the configured fusion rule; raises NotInstalledError."""
-    return node_class(config)(config, robots, admit=admit)
+    centre = node_class(config)(config, robots, admit=admit)
+    centre.load_maps(maps)
+    return centre

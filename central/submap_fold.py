@@ -20,10 +20,12 @@ from teamslam.central.join_messages import (
     trajectories,
 )
 from teamslam.central.monitor import NOTHING, finding
+from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.tick_fold import TickFold
 from teamslam.central.unnamed_landmarks import verdict_of
 from teamslam.team import translate
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.store import Stream, SubmapStore
@@ -73,6 +75,7 @@ class SubmapFold:
         self._without: set[str] = set()
         self._accused: Mapping[str, str] = {}
         self._sent_priors = SentPriors(PRIOR_LANDMARKS)
+        self._final: tuple[Fold, m.FusedMap] | None = None
 
     def fold_until(self, closed_ns: float) -> None:
         """Fold the ticks that end at this time or before."""
@@ -105,6 +108,13 @@ class SubmapFold:
             ticks = ticks.leave_out(self._accused, math.inf)
             fold = ticks.fold
         return self._messages(ticks, fold, tail, recorded)
+
+    def save_map(self, name: str) -> m.SavedMap:
+        """Make a saved map of the final map, the last one made; raises NothingToSaveError."""
+        if self._final is None or not self._final[0].contributions:
+            raise NothingToSaveError("there is no final map with a landmark")
+        before = {saved.author: saved for saved in self.store.maps.values()}
+        return save_map(*self._final, name, before)
 
     def _file_members(self) -> None:
         """Add the store's new members to the ticks; folded ticks are folded again."""
@@ -190,7 +200,9 @@ class SubmapFold:
             covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             biases=biases,
             reasons=self.findings if final else self.reasons,
+            changes=landmark_changes(fold, shown.ids) if final else (),
         )
+        self._final = (fold, fused) if final else None
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
         streams = (
@@ -211,6 +223,8 @@ class SubmapFold:
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
+            if is_map((robot, incarnation)):
+                continue
             latest[robot] = max(latest.get(robot, 0), incarnation)
         streams = sorted(latest.items())
         if fused.final:

@@ -54,6 +54,7 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
+from teamslam.team.estimation.map_joining.saved_maps import contradiction
 from teamslam.team.estimation.map_joining.submap_graph import CommonBias
 from teamslam.team.wire.messages import SightingFactor, Submap
 
@@ -278,6 +279,11 @@ class TickFold:
         self.undecided = ""
         if not self.convicts and math.isfinite(at):
             return False
+        wrong = contradiction(fold.main) if fold.contributions else None
+        if wrong is not None and self.convicts:
+            (author, _), reason = wrong
+            self._restart(self._conviction.withdraw(author, reason, at))
+            return True
         found = self._try_robots(fold, self._until_ns)
         if found is None:
             return False

@@ -24,6 +24,8 @@ UNNAMED = 2**31
 """Landmark ids below this are identities. Those from here on come from data association: 2³¹ + a
 local index in a submap, 2³¹ | a number of the first member in the team's map."""
 Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
+MAP = "map-"
+"""Before the name of a saved map, where members of the set have that of a robot."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 Exchange = Literal["continuous", "rendezvous"]
 """A robot sends each submap when it is closed, or all buffered submaps at an encounter."""

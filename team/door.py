@@ -8,6 +8,7 @@ arrival makes a true message fail.
 
 from collections.abc import Iterable, Iterator
 
+from teamslam.team.config import MAP
 from teamslam.team.wire import messages as m
 
 MOST_LIVES = 1_000
@@ -94,7 +95,7 @@ def _robots(message: m.Message) -> Iterator[str]:
             yield from (message.robot, message.teammate)
         case m.End():
             yield from (stream.robot for stream in message.streams)
-        case m.Withdrawal():
+        case m.Withdrawal() if not message.robot.startswith(MAP):
             yield message.robot
         case m.Verdict():
             yield from (message.judgement.first.robot, message.judgement.second.robot)

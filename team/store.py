@@ -1,10 +1,10 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 The set holds submaps, the inter-robot measurements from them, initial poses, orders that withdraw a
-robot, and an operator's verdicts on landmarks. A submap is complete when all inter-robot
-measurements that it announces are stored. Admission enforces law 1: a submap whose measurements
-overlap another's, or that differs from a stored one of the same name, is refused with the reason.
-Centre, peers and verification use the same class.
+robot, an operator's verdicts on landmarks, and saved maps of earlier days. A submap is complete
+when all inter-robot measurements that it announces are stored. Admission enforces law 1: a submap
+whose measurements overlap another's, or that differs from a stored one of the same name, is refused
+with the reason. Centre, peers and verification use the same class.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from teamslam.team.saved_map import submap_of
 from teamslam.team.wire import messages as m
 
 Stream = tuple[str, int]
@@ -58,13 +59,15 @@ class SubmapStore:
     """The members of the team's set, each in one place.
 
     chains: the submaps available to a map, of streams with an initial pose; they grow in place.
-    withdrawals: an operator's first order on each withdrawn robot. verdicts: those in force, with
-    their landmarks in order. refused: number of refused members.
+    maps: the saved maps of earlier days, by name. withdrawals: an operator's first order on each
+    withdrawn robot. verdicts: those in force, with their landmarks in order. refused: number of
+    refused members.
     """
 
     def __init__(self) -> None:
         self.streams: dict[Stream, StoredStream] = {}
         self.chains: dict[Stream, Sequence[m.Submap]] = {}
+        self.maps: dict[str, m.SavedMap] = {}
         self.withdrawals: dict[str, m.Withdrawal] = {}
         self.verdicts: set[m.Judgement] = set()
         self.refused = 0
@@ -86,6 +89,8 @@ class SubmapStore:
                 self.withdrawals.setdefault(message.robot, message)
             case m.Verdict():
                 self.add_verdict(message)
+            case m.SavedMap():
+                return self.add_map(message)
             case _:
                 pass
         return None
@@ -113,6 +118,33 @@ class SubmapStore:
             self.verdicts.discard(judgement)
         elif judgement not in self._revoked:
             self.verdicts.add(judgement)
+
+    def add_map(self, saved: m.SavedMap) -> str | None:
+        """Add a saved map as a stream of one submap without a start; return the reason if it is
+        refused.
+
+        Law 1: two maps with a set in common would count its measurements twice.
+        """
+        for other in self.maps.values():
+            if other.name != saved.name and {*other.sets} & {*saved.sets}:
+                return (
+                    f"the saved map {saved.name} has a set in common with {other.name}: load the "
+                    "later of the two, which contains the earlier one"
+                )
+        refused = self.add_submap(submap_of(saved))
+        if refused is None and saved.name not in self.maps:
+            self.maps[saved.name] = saved
+            self.add_start(
+                m.InitialPose(
+                    stamp_ns=0,
+                    robot=saved.author,
+                    incarnation=0,
+                    number=0,
+                    pose=b"",
+                    covariance=b"",
+                )
+            )
+        return refused
 
     def refuse(self, member: m.Submap | m.SightingFactor) -> None:
         """Mark the submap of a member as refused: it may never be in the map."""

@@ -419,6 +419,24 @@ def examples() -> Iterator[m.Message]:
                 same=True,
             ),
         ),
+        changes=(
+            m.LandmarkChange(landmark=4, state="moved", dx=0.5, dy=-0.25, sigma=0.125, chi2=17.0),
+            m.LandmarkChange(landmark=7, state="gone", expected=9.5),
+        ),
+    )
+    yield m.SavedMap(
+        stamp_ns=9_000,
+        name="site",
+        ids=two,
+        means=means,
+        covariance=packed(spd(4)),
+        biases=("range_scale",),
+        sensitivity=means,
+        counts=from_ids([3, 1]),
+        frame="alpha/1",
+        sets=(digest,),
+        software="1.2.3",
+        core="0123456789abcdef",
     )
     yield build.prior(
         stamp_ns=9_000,

@@ -26,8 +26,8 @@ class PeerCentre(Peer):
         super().__init__(CENTRE, central, robots, proofs=proofs)
 
     def begin(self) -> list[Outgoing]:
-        """Make the first message: the configuration."""
-        return self.fold.centre.begin()
+        """Make the first messages: the configuration, and the maps of earlier days."""
+        return [*self.fold.centre.begin(), *self._maps]
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
         """Select the fold's maps and orders; no robot needs this centre's credit."""

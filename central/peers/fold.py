@@ -66,7 +66,8 @@ class PeerFold:
         missed.
         """
         stated = self._peer.replica.statements
-        here = [r for r in stated if not {("given_up", 0), ("withdrawal", 0)} & stated[r].keys()]
+        gone = {("given_up", 0), ("withdrawal", 0)}
+        here = [robot for robot in self._robots if not gone & stated[robot].keys()]
         if self.centre.attendance.world_end is not None or not here:
             return []
         if not set(here) <= self._peer.replica.concluded.keys():

@@ -71,10 +71,12 @@ class PeerShell(RobotShell):
         exchange: Exchange = "continuous",
         when: FoldWhen = "always",
         signer: Signs | None = None,
+        maps: Sequence[m.SavedMap] = (),
         patience_s: float = SECOND_PATIENCE_S,
     ) -> None:
         super().__init__(bus, config, stop, patience_s, exchange)
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
+        self._peer.load_maps(maps)
         self.node = self._peer.node
         self.run_in(Shell(bus, self._peer, self._peer.name, stop, _ENDS))
         self.shell.take_end = self._peer.take_end
@@ -175,9 +177,11 @@ class CentreShell:
         *,
         store: Path | None = None,
         signer: Signs | None = None,
+        maps: Sequence[m.SavedMap] = (),
     ) -> None:
         self._bus = bus
         self._peer = PeerCentre(config, robots, signer)
+        self._peer.load_maps(maps)
         self._shell = Shell(bus, self._peer, CENTRE, stop, _ENDS)
         self._shell.take_end = self._peer.take_end
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)

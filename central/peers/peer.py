@@ -53,6 +53,7 @@ class Peer:
         self.others: set[str] = set()
         self.unpublished: list[Outgoing] = []
         self.newest: m.FusedMap | None = None
+        self._maps: list[Outgoing] = []
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
@@ -77,6 +78,12 @@ class Peer:
             robot in lost or (robot in concluded and concluded[robot].digest == self.final.digest)
             for robot in self.peer.replica.robots
         )
+
+    def load_maps(self, maps: Sequence[m.SavedMap]) -> None:
+        """Add saved maps of earlier days to the set, before `begin`."""
+        self._maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in maps]
+        for each in self._maps:
+            self.peer.take(member_in(each), self.name)
 
     def keep(self, members: Iterable[Member]) -> None:
         """Restore the stored set of an earlier process."""

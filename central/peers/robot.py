@@ -69,7 +69,7 @@ class PeerRobot(Peer):
         """Make the first messages: its configuration, and that of its fold."""
         announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
         config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
-        return [config, *self._certified(), *self._from_estimator(self.node.begin())]
+        return [config, *self._maps, *self._certified(), *self._from_estimator(self.node.begin())]
 
     def _certified(self) -> list[Outgoing]:
         """With keys, make the certificate of its signatures, and those of its stored members.

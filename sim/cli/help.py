@@ -15,12 +15,14 @@ NETWORK = "Network and keys"
 RARE = "Rarely needed"
 SECTIONS = {
     "Run a team": ("launch", "scenarios", "simulate"),
-    "Look at a run": ("view", "report", "compare", "rerun", "log", "verify-ledger", "repair"),
+    "Look at a run": (
+        "view", "report", "compare", "rerun", "map", "log", "verify-ledger", "repair",
+    ),
     "Use your data": ("import", "calibrate", "batch-reference", "experiment"),
     "Run one process": (
         "router", "record", "central", "robot", "driver", "world", "viewer", "replay",
     ),
-    "Operate a running team": ("status", "end", "withdraw", "verdict", "map", "keys"),
+    "Operate a running team": ("status", "end", "withdraw", "verdict", "keys"),
 }  # fmt: skip
 """Commands of `teamslam` by task, the most frequent first."""
 WIDEST = 100

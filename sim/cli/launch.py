@@ -25,16 +25,19 @@ from teamslam.sim.cli.options import (
     IdentitiesOption,
     JsonFile,
     Keys,
+    MapFiles,
     Peers,
     Pieces,
     Robots,
     Seed,
     SpeedText,
+    check_joins,
     check_pieces,
     fail,
     over_tls,
     parsed_speed,
     refuse_open_door,
+    saved_maps,
     scenario_for,
     scenario_of,
     set_aside,
@@ -90,6 +93,7 @@ def launch(
     ] = False,
     report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
     browser: Open = None,
+    map_: MapFiles = None,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -192,6 +196,7 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
+    check_joins(resolved, saved_maps(map_))
     from teamslam.sim.launch.plan import Plan
 
     plan = Plan(
@@ -204,6 +209,7 @@ def launch(
         end_silent_s=end_silent,
         keys=keys and keys.resolve(),
         insecure=insecure,
+        maps=tuple(map_ or ()),
     )
     for earlier_set in plan.earlier_sets:
         set_aside(earlier_set)

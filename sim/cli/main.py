@@ -10,6 +10,7 @@ from teamslam.sim.cli.importing import app as import_commands
 from teamslam.sim.cli.keys import app as key_commands
 from teamslam.sim.cli.launch import app as launch_commands
 from teamslam.sim.cli.log import app as log_tools
+from teamslam.sim.cli.maps import app as map_tools
 from teamslam.sim.cli.nodes import app as node_commands
 from teamslam.sim.cli.orders import app as order_commands
 from teamslam.sim.cli.recorded import app as recorded_commands
@@ -36,6 +37,7 @@ for _part in (
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)
+app.add_typer(map_tools)
 add_studies(app)
 
 

@@ -19,11 +19,13 @@ from teamslam.sim.cli.options import (
     EstimatorOption,
     FusionOption,
     Keys,
+    MapFiles,
     Peers,
     Robots,
     ScenarioArgument,
     Seed,
     SpeedText,
+    check_joins,
     check_names,
     connect_bus,
     fail,
@@ -32,6 +34,7 @@ from teamslam.sim.cli.options import (
     parsed_speed,
     refuse_existing,
     refuse_open_door,
+    saved_maps,
     scenario_of,
     signer_of,
 )
@@ -45,6 +48,7 @@ if TYPE_CHECKING:
     from teamslam.team.config import RobotConfig
     from teamslam.team.recording.own_log import OwnLog
     from teamslam.team.wire.bus import Bus
+    from teamslam.team.wire.messages import SavedMap
 
 _LOG = logging.getLogger("teamslam")
 
@@ -165,12 +169,13 @@ def robot(
     fold: Annotated[
         str,
         typer.Option(
-            help="With --peers: fold the set always, on request (`teamslam map`) and at the end, "
-            "or at the end only.",
+            help="With --peers: fold the set always, on request (`teamslam map peer`) and at the "
+            "end, or at the end only.",
             metavar="always|request|end",
             rich_help_panel=RARE,
         ),
     ] = "always",
+    map_: MapFiles = None,
 ) -> None:
     """Run a robot, which estimates from its sensor stream and publishes submaps, maps and
     poses.
@@ -194,6 +199,9 @@ def robot(
         known = ", ".join(each.id for each in resolved.robots)
         fail(f"{scenario} has no robot {name!r}; its robots: {known}", WRONG_USE)
     check_names(resolved.team, name)
+    maps = saved_maps(map_)
+    if maps and not resolved.peers:
+        fail("--map is for the centre, or for a robot with --peers", WRONG_USE)
     with (
         process(f"robot-{name}") as stop,
         _own_log(log, resolved) as tap,
@@ -202,7 +210,7 @@ def robot(
         bus.tap = tap
         _connected(resolved, connect)
         if resolved.peers:
-            _peer_shell(bus, resolved, config, stop, store, fold, keys).run()
+            _peer_shell(bus, resolved, config, stop, store, fold, keys, maps).run()
         else:
             RobotShell(bus, config, stop, exchange=resolved.exchange).run()
 
@@ -223,6 +231,7 @@ def _peer_shell(
     store: Path | None,
     fold: str,
     keys: Path | None,
+    maps: "Sequence[SavedMap]",
 ) -> "PeerShell":
     from teamslam.central.peers.fold import FoldWhen
     from teamslam.central.peers.main import PeerShell
@@ -244,6 +253,7 @@ def _peer_shell(
             exchange=scenario.exchange,
             when=cast(FoldWhen, fold),
             signer=signer,
+            maps=maps,
         )
     except SetFileError as error:
         fail(str(error), WRONG_USE)
@@ -277,6 +287,7 @@ def central(
             metavar="FILE",
         ),
     ] = None,
+    map_: MapFiles = None,
 ) -> None:
     """Run the central computer, which fuses the robots' maps and broadcasts the fused map back.
 
@@ -293,13 +304,15 @@ def central(
         fusion=fusion,
         peers=peers,
     )
+    maps = saved_maps(map_)
+    check_joins(resolved, maps)
     with (
         process("central") as stop,
         connect_bus(resolved.team, connect, keys, "central", stop) as bus,
     ):
         _connected(resolved, connect)
         try:
-            _central_shell(bus, resolved, stop, store, patience, keys).run()
+            _central_shell(bus, resolved, stop, store, patience, keys, maps).run()
         except SetFileError as error:
             fail(str(error), WRONG_USE)
 
@@ -311,6 +324,7 @@ def _central_shell(
     store: Path | None,
     patience: float | None,
     keys: Path | None,
+    maps: "Sequence[SavedMap]",
 ) -> "CentralShell | CentreShell":
     from teamslam.central.main import CentralShell
     from teamslam.central.peers.main import CentreShell
@@ -325,9 +339,10 @@ def _central_shell(
             patience,
             admit=scenario.admits,
             store=store,
+            maps=maps,
         )
     signer = signer_of(keys, "central", scenario.team)
-    return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer)
+    return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer, maps=maps)
 
 
 @app.command(cls=Command, epilog="teamslam record waypoints -o team.mcap")

@@ -7,6 +7,7 @@ import re
 import threading
 from collections.abc import Sequence
 from ipaddress import ip_address
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from teamslam.team.keys.signing import Signer
     from teamslam.team.recording.check import Finding
     from teamslam.team.recording.reader import Log
+    from teamslam.team.wire.messages import SavedMap
     from teamslam.team.wire.zenoh.bus import ZenohBus
 
 MOST_HOLES = 5
@@ -43,6 +45,14 @@ ScenarioArgument = Annotated[
 ]
 LogArgument = Annotated[
     Path, typer.Argument(help="An MCAP log of a team, or the folder of its run.")
+]
+MapFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--map",
+        help="A saved map of an earlier day, which the team's map joins; repeatable.",
+        metavar="FILE",
+    ),
 ]
 JsonFile = Annotated[
     Path | None,
@@ -292,6 +302,27 @@ def scenario_of(name: str) -> Scenario:
         except ScenarioError as error:
             raise ScenarioError(f"{name}: {error}") from None
     return load(name)
+
+
+def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
+    """Read saved maps; ends with 2 for an unusable file, or two maps of one name."""
+    from teamslam.team.saved_map import SavedMapError, read_map
+
+    try:
+        found = [read_map(path) for path in paths or ()]
+    except SavedMapError as error:
+        fail(str(error), WRONG_USE)
+    names = sorted(each.name for each in found)
+    twice = next((a for a, b in pairwise(names) if a == b), None)
+    if twice is not None:
+        fail(f"two maps have the name {twice}: save one of them by another --name", WRONG_USE)
+    return found
+
+
+def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
+    """End with 2 where maps are given to a team whose fusion rule joins no submaps."""
+    if maps and scenario.central.fusion != "join":
+        fail(f"--map: the fusion rule {scenario.central.fusion} joins no saved map", WRONG_USE)
 
 
 def check_names(team: str, robot: str | None = None) -> None:

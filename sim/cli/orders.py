@@ -1,4 +1,4 @@
-"""Commands that ask or order a running team: map, withdraw, verdict, end."""
+"""Commands that order a running team: withdraw, verdict, end."""
 
 from typing import Annotated
 
@@ -22,37 +22,6 @@ from teamslam.team.wire.arrays import ids
 Reason = Annotated[str, typer.Option(help="Why, for the log.")]
 
 app = typer.Typer()
-
-
-@app.command(name="map", cls=Command, epilog="teamslam map r3 --team waypoints")
-def map_(
-    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
-    team: TeamOption,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
-    ] = 60.0,
-) -> None:
-    """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
-    from teamslam.team.wire.arrays import floats
-    from teamslam.team.wire.bus import BusError
-    from teamslam.team.wire.channels import FOLD
-    from teamslam.team.wire.codec import decoded
-    from teamslam.team.wire.messages import FoldRequest, FusedMap
-
-    with connect_bus(team, connect, keys, "operator") as bus:
-        try:
-            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
-        except BusError as error:
-            fail(str(error), FAILED)
-    if not replies:
-        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
-    fused = decoded(replies[-1], FusedMap)
-    typer.echo("landmark,x,y")
-    means = floats(fused.means, "means").reshape(-1, 2)
-    for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
-        typer.echo(f"{landmark},{x:.4f},{y:.4f}")
 
 
 @app.command(cls=Command, epilog="teamslam withdraw r3 --team waypoints --reason 'wheel is loose'")

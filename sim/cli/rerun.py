@@ -16,7 +16,9 @@ from teamslam.sim.cli.options import (
     FusionOption,
     JsonFile,
     LogArgument,
+    MapFiles,
     fail,
+    saved_maps,
     warn_of_holes,
     write_json,
 )
@@ -63,6 +65,7 @@ def rerun(
         int | None,
         typer.Option(help="Seed of the estimators and of the losses.", min=0, metavar="N"),
     ] = None,
+    map_: MapFiles = None,
     noise: Annotated[
         list[str] | None,
         typer.Option(
@@ -124,6 +127,7 @@ def rerun(
     status 0 only if every robot that is not left out is in the final map, with
     --verify only if all is equal; else 1. 2: wrong use.
     """
+    saved_maps(map_)
     changes = Changes(
         without=tuple(without or ()),
         fusion=fusion,
@@ -137,6 +141,7 @@ def rerun(
         partitions=tuple(_partition(each) for each in partition or ()),
         unsafe_feedback=unsafe_feedback,
         noise=_noise(noise or []),
+        maps=tuple(map(str, map_ or ())),
     )
     if not verify:
         _compare(log, changes, json_file, output)

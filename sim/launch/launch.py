@@ -194,7 +194,7 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [
-        (f"robot-{r.id}", ["robot", *common, r.id, *plan.stores(r.id)])
+        (f"robot-{r.id}", ["robot", *common, r.id, *plan.stores(r.id), *plan.maps_of(r.id)])
         for r in plan.scenario.robots
     ]
     return [
@@ -204,7 +204,7 @@ def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list
         ),
         *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
         *(
-            [("central", ["central", *common, *plan.stores("central")])]
+            [("central", ["central", *common, *plan.stores("central"), *plan.maps_of("central")])]
             if plan.scenario.centre
             else []
         ),

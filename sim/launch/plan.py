@@ -19,11 +19,18 @@ class Plan:
     end_silent_s: float | None = None
     keys: Path | None = None
     insecure: bool = False
+    maps: tuple[Path, ...] = ()
 
     @property
     def door(self) -> list[str]:
         """Certificate option of every process; empty without keys."""
         return [] if self.keys is None else ["--keys", str(self.keys)]
+
+    def maps_of(self, node: str) -> list[str]:
+        """Options of the saved maps that a peer or centre loads."""
+        if not (self.scenario.peers or node == "central"):
+            return []
+        return [word for path in self.maps for word in ("--map", str(path.resolve()))]
 
     def set_file(self, node: str) -> Path:
         """File of a node's set of submaps; node "*": pattern of all."""

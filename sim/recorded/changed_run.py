@@ -1,5 +1,7 @@
 """Run the recorded team's nodes in memory, on the same measurements with changes."""
 
+from pathlib import Path
+
 import msgspec
 
 from teamslam.sim.in_memory.links import Conditions, Partition
@@ -10,19 +12,23 @@ from teamslam.sim.recorded.unsafe import unsafe_robot
 from teamslam.sim.recorded.world import RecordedWorld, Samples
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, with_options
+from teamslam.team.config import MAP
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.robot.node import robot_node
+from teamslam.team.saved_map import read_map
 from teamslam.team.wire.bus import Sample
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     """Samples of the changed run, as of a recorder.
 
-    Raises ScenarioError for a meaningless change, RerunError for missing measurements.
+    Raises ScenarioError for a meaningless change, SavedMapError, RerunError for missing
+    measurements.
     """
     world = RecordedWorld(log, changes.without)
     scenario = changed_scenario(world.scenario, changes)
     world.announce(scenario)
+    world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
     node = unsafe_robot if changes.unsafe_feedback else robot_node
     return list(run_nodes(scenario, world, conditions, node))
@@ -32,7 +38,7 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
     """The recorded scenario with the changes; raises ScenarioError."""
     names = [robot.id for robot in scenario.robots]
     asked = {*changes.without, *(r for robots, _ in changes.partitions for r in robots)}
-    for name in sorted(asked - set(names)):
+    for name in sorted(each for each in asked - set(names) if not each.startswith(MAP)):
         raise ScenarioError(f"no robot {name} in the log; there are {', '.join(names)}")
     robots = tuple(robot for robot in scenario.robots if robot.id not in changes.without)
     if not robots:

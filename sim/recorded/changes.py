@@ -13,7 +13,7 @@ class Changes:
     without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
     centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
     when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
-    kind (`teamslam.sim.recorded.noise`).
+    kind (`teamslam.sim.recorded.noise`). maps: saved maps of earlier days, by path.
     """
 
     without: tuple[str, ...] = ()
@@ -28,3 +28,4 @@ class Changes:
     partitions: tuple[tuple[tuple[str, ...], Span], ...] = ()
     unsafe_feedback: bool = False
     noise: tuple[tuple[str, float], ...] = ()
+    maps: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from teamslam.team.wire.digest import configured
 STEP_NS = 1_000_000_000
 """Team time between two checks of the nodes' answers."""
 _TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
-_SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.END)
+_SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.SAVED_MAP, ch.END)
 
 
 @runtime_checkable
@@ -75,6 +75,8 @@ class RecordedWorld:
                     truths.append((message.stamp_ns, Outgoing(channel, name, message)))
                 case m.TruthLabels() | m.TruthPositions() if name not in without:
                     self._outgoing.append(Outgoing(channel, name, message))
+                case m.SavedMap() if message.author not in without:
+                    self.load_maps([message])
                 case m.TruthLandmarks():
                     self._outgoing.append(Outgoing(channel, "", message))
                 case m.Configuration():
@@ -90,6 +92,10 @@ class RecordedWorld:
         self.last_ns = self._waiting[-1][0] if self._waiting else 0
         self.now_ns = self.first_ns
         self._ended = False
+
+    def load_maps(self, maps: Iterable[m.SavedMap]) -> None:
+        """Publish saved maps of earlier days with the first messages."""
+        self._outgoing += [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in maps]
 
     @property
     def scenario(self) -> Scenario:

@@ -264,11 +264,11 @@ class SubmapFactor:
 
     mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).
     sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with
-    which the bias moves it, 0 or 1; -1 for none. A state is additive; `at` has the index in it of the
-    first number of each member.
+    which the bias moves it, 0 or 1; -1 for none. is_measured: False for a saved map, whose errors belong
+    to no range. A state is additive; `at` has the index in it of the first number of each member.
     """
 
-    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> None: ...
+    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64], is_measured: bool = True) -> None: ...
 
     def with_errors(self, sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> SubmapFactor:
         """Make the same submap with other biases."""

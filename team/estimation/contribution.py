@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import Bias
+from teamslam.team.config import MAP, Bias
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.shapes import Bool, Float, UInt32
@@ -26,8 +26,15 @@ UNIX_S = 1e9
 """Team times from here on [s] are Unix times (2001)."""
 
 
+def is_map(stream: Stream) -> bool:
+    """Whether a stream is the saved map of an earlier day."""
+    return stream[0].startswith(MAP)
+
+
 def named(stream: Stream) -> str:
-    """Name a stream: `r3 (incarnation 2)`."""
+    """Name a stream: `r3 (incarnation 2)`, or `the saved map site`."""
+    if is_map(stream):
+        return f"the saved map {stream[0].removeprefix(MAP)}"
     return f"{stream[0]} (incarnation {stream[1]})"
 
 
@@ -55,7 +62,10 @@ class Observation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0."""
+    """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0.
+
+    A saved map is a submap, too, with landmarks only: its end pose is at its start.
+    """
 
     robot: str
     incarnation: int
@@ -96,6 +106,7 @@ class Contribution:
             np.column_stack([P[x, x], P[x, x + 1], P[x + 1, x + 1]]),
             local.sensitivity,
             np.array([RANGE_POWER[each] for each in local.biases], np.int64),
+            is_measured=not is_map(self.stream),
         )
 
 

@@ -4,10 +4,12 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
+from teamslam.team.config import MAP
 from teamslam.team.door import MOST_LIVES
 from teamslam.team.peers.members import Member
 from teamslam.team.peers.replica import (
     MOST_INTERVALS,
+    MOST_MAPS,
     MOST_SEQUENCES,
     MOST_STREAMS,
     Replica,
@@ -69,7 +71,7 @@ def make_request(
     statements = tuple(
         each.robot
         for each in summary.statements
-        if each.robot in replica.robots
+        if (each.robot in replica.robots or each.robot.startswith(MAP))
         and each.digest != getattr(replica.stated_of(each.robot), "digest", None)
         and ((each.robot, 0), -3) not in not_now
     )
@@ -87,7 +89,7 @@ def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
     """Whether a summary exceeds the bounds of this team's set."""
     return (
         len(summary.holdings) > MOST_STREAMS * len(replica.robots)
-        or len(summary.statements) > len(replica.robots)
+        or len(summary.statements) > len(replica.robots) + MOST_MAPS
         or any(len(each.sequences) > 2 * MOST_INTERVALS for each in summary.holdings)
     )
 

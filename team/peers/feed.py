@@ -10,7 +10,7 @@ from teamslam.team.wire import messages as m
 def feed_order(message: m.Message) -> int:
     """Rank of a statement in a fold's input: before the streams (negative) or after them."""
     match message:
-        case m.Withdrawal() | m.Verdict():
+        case m.Withdrawal() | m.Verdict() | m.SavedMap():
             return -1
         case m.GivenUp():  # a given-up robot whose stream has ended is complete
             return 2

@@ -1,8 +1,8 @@
 """A member of the team's set: a message's original bytes and its name in the set.
 
 Members are the inputs of a map: initial poses, submaps and their inter-robot measurements, orders
-(withdrawals, robots given up), verdicts on identities and `Done`; and `Concluded`, which is no
-input.
+(withdrawals, robots given up), verdicts on identities, saved maps and `Done`; and `Concluded`,
+which is no input.
 """
 
 import hashlib
@@ -14,7 +14,9 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
 
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
-STATED = (ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.CONCLUDED, ch.CERTIFICATE)
+STATED = (
+    ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.SAVED_MAP, ch.CONCLUDED, ch.CERTIFICATE,
+)  # fmt: skip
 CHANNELS = (*STREAMED, *STATED)
 """The channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20
@@ -60,7 +62,9 @@ def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
 
 
 def about(message: m.Message) -> str:
-    """Robot to whose share of the set a member belongs."""
+    """Robot, or saved map, to whose share of the set a member belongs."""
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
+    if isinstance(message, m.SavedMap):
+        return message.author
     return str(getattr(message, "robot", ""))

@@ -161,8 +161,8 @@ class PeerNode:
         self._fed.clear()
         self._new_messages = [
             member.message
-            for robot in self.replica.robots
-            for _, member in sorted(self.replica.statements[robot].items())
+            for _, statements in sorted(self.replica.statements.items())
+            for _, member in sorted(statements.items())
         ]
 
     # Exchange.

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeVar
 
+from teamslam.team.config import MAP
 from teamslam.team.door import MOST_COUNT, MOST_LIVES
 from teamslam.team.peers.members import Member, about
 from teamslam.team.store import Stream
@@ -23,6 +24,8 @@ MOST_STATEMENTS = 2 * MOST_STREAMS + 8
 """Most orders and `Done` messages about one robot."""
 MOST_VERDICTS = 4096
 """Most verdicts on landmarks of one robot, and withdrawals of verdicts."""
+MOST_MAPS = 16
+"""Most saved maps of earlier days."""
 SHARE = 256 * 2**20
 """Most bytes about one robot: 8 h of a submap of 4 kB every half second."""
 MOST_INTERVALS = 64
@@ -123,6 +126,9 @@ class Replica:
         """Add a member; raises RefusedError for another team's or beyond a bound."""
         message = member.message
         robot = about(message)
+        if robot.startswith(MAP) and len(self.statements) < len(self.robots) + MOST_MAPS:
+            self._bytes.setdefault(robot, 0)
+            self.statements.setdefault(robot, {})
         if robot not in self._bytes:
             raise RefusedError(f"of {robot or 'nobody'}, not in this team")
         if self._bytes[robot] + member.size > self._share:
@@ -246,8 +252,8 @@ class Replica:
                 yield from (factors[look] for look in sorted(factors))
                 if sequence in share.submaps:
                     yield share.submaps[sequence]
-        for robot in self.robots:
-            yield from (self.statements[robot][name] for name in sorted(self.statements[robot]))
+        for _, statements in sorted(self.statements.items()):
+            yield from (statements[name] for name in sorted(statements))
 
     # Summaries.
 
@@ -337,6 +343,8 @@ def _stated(message: m.Message) -> tuple[str, int]:
     match message:
         case m.Done():
             return "done", message.incarnation
+        case m.SavedMap():
+            return "map", 0
         case m.Withdrawal():
             return "withdrawal", 0
         case m.GivenUp():

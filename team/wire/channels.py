@@ -5,7 +5,7 @@ owns the prefix of its key: a robot's process `robot/{robot}/…`, its driver `s
 operator `operator/…`, the others that of their name. A certificate for a prefix therefore
 authenticates a sender. The world is the source of every robot; the truth belongs to the world, too.
 
-`{robot}` stands for a robot's name, `{node}` for `world`, `central`, `recorder`, `viewer`,
+`{robot}` stands for a robot's name (or a saved map, as `map-<name>`), `{node}` for `world`, `central`, `recorder`, `viewer`,
 `robot/<name>` or `source/<name>`, `{view}` for a view (`teamslam.team.wire.views`). In the rates an
 incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one instant of
 observation.
@@ -30,7 +30,11 @@ all: a late joiner, and a receiver after a cut link, receives every message.
 
 _PLACE = re.compile(r"\{(robot|node|view)\}")
 _NAME = "[a-z][a-z0-9_]{0,31}"
-_PATTERNS = {"robot": _NAME, "node": f"{_NAME}(?:/{_NAME})?", "view": f"{_NAME}(?:/{_NAME})?"}
+_PATTERNS = {
+    "robot": f"(?:map-)?{_NAME}",
+    "node": f"{_NAME}(?:/{_NAME})?",
+    "view": f"{_NAME}(?:/{_NAME})?",
+}
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,8 @@ TEAM_END = Channel(name="team_end", template="central/end", message=m.TeamEnd, r
                    meaning="the order to end, repeated for late joiners")  # fmt: skip
 FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recorded=True, recomputable=True,
                     meaning="the final map with its joint covariance")  # fmt: skip
+SAVED_MAP = Channel(name="saved_map", template="central/saved_map/{robot}", message=m.SavedMap, rate="once", delivery="all", recorded=True,
+                    recomputable=False, meaning="a map of an earlier day; a member of the set")  # fmt: skip
 TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation",
                      delivery="all", recorded=True, recomputable=True, meaning="smoothed ends of the submaps, or all keyframes")  # fmt: skip
 CENTRAL_POSE = Channel(name="central_pose", template="central/pose/{robot}", message=m.PoseEstimate, rate="one per keyframe or broadcast",

@@ -70,7 +70,7 @@ class MapResult:
     cost_per_dof: χ² of the join. covariance_scale: factor by which the submap covariances should be
     multiplied; None: unknown. withdrawn: robots left out. lost: incomplete robots. gospa: of all
     landmarks after truth_from_map. matching: how unnamed landmarks got true positions; None: by
-    identity or label.
+    identity or label. changes: states of the landmarks against saved maps.
     """
 
     rule: str
@@ -92,6 +92,7 @@ class MapResult:
     lost: tuple[str, ...] = ()
     gospa: Gospa | None = None
     matching: Matching | None = None
+    changes: tuple[m.LandmarkChange, ...] = ()
 
 
 USUAL = ("hybrid", "join")
@@ -392,6 +393,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "warnings": list(evaluation.warnings),
         "joined": [] if fused is None else list(fused.joined),
         "withdrawn": [] if fused is None else list(fused.withdrawn),
+        "changes": [] if fused is None else [change_json(each) for each in fused.changes],
         "robot_states": {name: of._asdict() for name, of in evaluation.states.items()},
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
         "peers": {name: peer_json(peer) for name, peer in evaluation.peers.items()},
@@ -414,6 +416,19 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "faults": evaluation.faults,
     }
     return figures | dict(extra or {})
+
+
+def change_json(change: m.LandmarkChange) -> dict[str, Any]:
+    """A landmark's state against the saved maps; `expected`: observations of one that is gone."""
+    return {
+        "landmark": change.landmark,
+        "state": change.state,
+        "dx_m": change.dx,
+        "dy_m": change.dy,
+        "sigma_m": change.sigma,
+        "chi2": change.chi2,
+        "expected": change.expected,
+    }
 
 
 def _robot_json(robot: RobotResult) -> dict[str, Any]:
@@ -540,6 +555,7 @@ def _map_result(
         lost=message.lost,
         gospa=_gospa(means, errors, positions),
         matching=matching,
+        changes=message.changes,
     )
 
 

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 
 from teamslam.central.desk.evaluation.log import Collected
 from teamslam.central.desk.names import in_order, not_joined
+from teamslam.team.config import MAP
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 
@@ -14,6 +15,8 @@ since it contradicts the rest. lost: its stream is incomplete in the map. alone:
 fuse.
 """
 UNNAMED_REASON = "the log does not contain the reason"
+SAVED_MAP = "the saved map "
+"""Before the name of a saved map in a map's reasons."""
 NO_MEMBER = "nothing of it is in the map"
 
 
@@ -27,14 +30,18 @@ class RobotState(NamedTuple):
 def robot_states(
     log: Collected, fused: m.FusedMap | None, robots: Collection[str]
 ) -> dict[str, RobotState]:
-    """State of every robot; empty without a final map."""
+    """State of every robot, and of every saved map as `map-<name>`; empty without a final map."""
     if fused is None:
         return {}
     members = {member.robot for member in fused.members}
     team = {*robots, *log.robots, *fused.withdrawn, *fused.lost, *members}
     if not members and fused.rule != "join":
         return {name: RobotState("alone") for name in in_order(team)}
-    apart = {name: why for who, why in not_joined(fused.reasons) for name in who.split(", ")}
+    apart = {
+        name.replace(SAVED_MAP, MAP): why
+        for who, why in not_joined(fused.reasons)
+        for name in who.split(", ")
+    }
     because = dict(_withdrawals(log))
 
     def state_of(name: str) -> RobotState:
@@ -70,9 +77,9 @@ def _reason_in(fused: m.FusedMap, name: str) -> str:
 
 
 def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
-    """Robots not or incompletely in the map, with state, as text."""
+    """Robots not or incompletely in the map, with state, as text; saved maps need not be in it."""
     return tuple(
         f"{name} {of.state}{': ' if of.why else ''}{of.why}"
         for name, of in states.items()
-        if of.state not in {"joined", "alone"}
+        if of.state not in {"joined", "alone"} and not name.startswith(MAP)
     )

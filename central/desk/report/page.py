@@ -20,6 +20,7 @@ from teamslam.central.desk.report.identities import decision_sheet, score_sheet
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import (
     Sheet,
+    change_sheet,
     disposition_sheet,
     format_figure,
     is_unfused,
@@ -154,6 +155,9 @@ def _page(
 def _identities(run: Run) -> list[str]:
     evaluation = run.evaluation
     parts = [] if evaluation.association is None else _sheet(score_sheet(evaluation.association))
+    changes = () if evaluation.map is None else evaluation.map.changes
+    if any(each.state != "unchanged" for each in changes):
+        parts += _sheet(change_sheet(changes))
     return parts + (_sheet(decision_sheet(evaluation.decisions)) if evaluation.decisions else [])
 
 

@@ -12,6 +12,8 @@ from rich.text import Text
 from teamslam.central.desk.evaluation.errors import MapErrors
 from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult
 from teamslam.central.desk.names import OUTSIDE, not_joined, short
+from teamslam.team.config import MAP
+from teamslam.team.wire import messages as m
 
 ABSURD_NEES = 1000
 """NEES per degree of freedom above which words replace it."""
@@ -129,6 +131,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f", "")))
     rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)
+    rows += [("changes", change_words(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("note", words) for words in evaluation.clocks]
@@ -153,7 +156,9 @@ def _without_truth(evaluation: Evaluation) -> str:
 def state_rows(evaluation: Evaluation) -> Rows:
     """State of every robot in the final map; joined robots share a row."""
     states = evaluation.states
-    joined = [name for name, of in states.items() if of.state == "joined"]
+    joined = [
+        name for name, of in states.items() if of.state == "joined" and not name.startswith(MAP)
+    ]
     rows = [("robots in the map", ", ".join(joined) or "none")] if states else []
     if any(of.state == "alone" for of in states.values()):
         rows = [("robots, each by itself", ", ".join(states))]
@@ -162,6 +167,52 @@ def state_rows(evaluation: Evaluation) -> Rows:
         for name, of in states.items()
         if of.state not in {"joined", "alone"}
     ]
+
+
+CHANGES = ("moved", "gone", "new", "unchanged")
+"""The states of landmarks against saved maps, as listed."""
+LISTED = 5
+"""Most landmarks of one state in a line of text."""
+
+
+def change_words(changes: Sequence[m.LandmarkChange]) -> str:
+    """Summarise what has changed since the saved maps: `1 moved (7: +0.50, -0.25 ± 0.02 m)`."""
+    parts = []
+    for state in CHANGES:
+        found = [each for each in changes if each.state == state]
+        if not found:
+            continue
+        words = [
+            f"{each.landmark}: {each.dx:+.3f}, {each.dy:+.3f} ± {each.sigma:.3f} m"
+            if state == "moved"
+            else str(each.landmark)
+            for each in found[:LISTED]
+        ]
+        more = ", …" * (len(found) > LISTED)
+        listed = "" if state == "unchanged" else f" ({'; '.join(words)}{more})"
+        parts.append(f"{len(found)} {state}{listed}")
+    return ", ".join(parts)
+
+
+def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
+    """Table of the landmarks that have changed since the saved maps."""
+    rows = [
+        (str(each.landmark), each.state)
+        + (
+            (f"{each.dx:+.3f}", f"{each.dy:+.3f}", f"{each.sigma:.3f}", f"{each.chi2:.1f}", "")
+            if each.state == "moved"
+            else ("", "", "", "", f"{each.expected:.1f}" if each.state == "gone" else "")
+        )
+        for state in CHANGES[:-1]
+        for each in changes
+        if each.state == state
+    ]
+    note = (
+        "moved: a landmark that has not moved is listed with a probability of 0.001 (χ² of two "
+        "degrees of freedom). gone: it would have been missed by chance with less than that."
+    )
+    headings = ("landmark", "state", "dx [m]", "dy [m]", "σ [m]", "χ²", "expected sightings")
+    return Sheet(headings, rows, note)
 
 
 def in_words(errors: MapErrors, *, joint: bool) -> str:

@@ -10,7 +10,12 @@ from typing import Any
 
 import msgspec
 
-from teamslam.central.desk.verification.recorded import Identity, Recorded, identity
+from teamslam.central.desk.verification.recorded import (
+    Identity,
+    Recorded,
+    RerunError,
+    identity,
+)
 from teamslam.central.join_messages import Tail
 from teamslam.central.node import node_class
 from teamslam.central.submap_fold import RecordedFields, SubmapFold
@@ -106,6 +111,25 @@ def _extends(
     )
 
 
+def recorded_map(log: Recorded, name: str) -> m.SavedMap:
+    """Make a saved map of a log's final map, solved again from the set that it names.
+
+    Raises RerunError without a final map, NothingToSaveError.
+    """
+    found = [f for of in (ch.FINAL_MAP, ch.TEAM_FINAL) for f in log.of(of)]
+    finals = [each for each in found if isinstance(each, m.FusedMap) and each.rule == "join"]
+    if not finals:
+        raise RerunError("the log has no final map of the rule join")
+    config, digest = log.central_config()
+    recorded, fold = _RecordedSet(log), SubmapFold(config, digest, convicts=False)
+    chains = recorded.chains(finals[-1])
+    if chains is None:
+        raise RerunError("the log lacks submaps of its final map")
+    recorded.copy(fold.store, chains, finals[-1])
+    fold.make_map("final", recorded=recorded.fields(finals[-1]))
+    return fold.save_map(name)
+
+
 class _RecordedSet:
     """Set of a log, and the parts named by its maps."""
 
@@ -121,6 +145,9 @@ class _RecordedSet:
             start = measurements.get(0)
             if isinstance(start, m.InitialPose):
                 self._store.add_start(start)
+        for saved in log.saved_maps.values():
+            self._store.add(saved)
+        self._maps = log.saved_maps
         self._priors_of: dict[bytes, set[Stream]] = {}
         for prior in (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR)):
             if isinstance(prior, m.Prior):
@@ -142,6 +169,9 @@ class _RecordedSet:
     ) -> None:
         """Copy members of a map's set that a store lacks."""
         for stream, chain in chains.items():
+            if (saved := self._maps.get(stream[0])) is not None:
+                store.add(saved)
+                continue
             store.add_start(self._store.start(stream))
             for submap in chain[len(store.chain(stream)) :]:
                 for member in (*self._store.sightings(submap), submap):

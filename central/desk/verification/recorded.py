@@ -44,8 +44,8 @@ class Recorded:
     measurements: by (robot, incarnation) and counter. configured: last announcement of each node.
     outputs: recomputable messages in log order. reported: measurements consumed by the robot's
     report. published: measurements announced by the source. known_map: prior map of
-    localisation-only robots. withdrawals: first order on each withdrawn robot. unsound: number of
-    invalid samples.
+    localisation-only robots. saved_maps: maps of earlier days, by author. withdrawals: first order
+    on each withdrawn robot. unsound: number of invalid samples.
     """
 
     measurements: dict[Stream, RecordedMeasurements] = field(default_factory=dict)
@@ -54,6 +54,7 @@ class Recorded:
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
     known_map: m.KnownMap | None = None
+    saved_maps: dict[str, m.SavedMap] = field(default_factory=dict)
     withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
     _indexed: int = 0
@@ -87,6 +88,8 @@ class Recorded:
                 )
             case m.KnownMap():
                 self.known_map = message
+            case m.SavedMap():
+                self.saved_maps.setdefault(message.author, message)
             case m.Withdrawal():
                 self.withdrawals.setdefault(message.robot, message)
             case m.StreamHead():
@@ -177,7 +180,7 @@ def _parsed(text: str, kind: type[T], subject: str) -> T:
 
 
 _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,
-         ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
+         ch.END, ch.SAVED_MAP, ch.HEAD, ch.ROBOT_HEAD, ch.ORDER, ch.WITHDRAWAL)  # fmt: skip
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_CONFIGURING))
 
 

@@ -108,14 +108,16 @@ void bind_graph(nb::module_& m) {
                      "A submap as a factor between its start pose, its other poses, its landmarks and its biases.\n\n"
                      "mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).\n"
                      "sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with\n"
-                     "which the bias moves it, 0 or 1; -1 for none. A state is additive; `at` has the index in it of the\n"
-                     "first number of each member.")
+                     "which the bias moves it, 0 or 1; -1 for none. is_measured: False for a saved map, whose errors belong\n"
+                     "to no range. A state is additive; `at` has the index in it of the first number of each member.")
       .def("__init__",
            [](Submap* self, const Numbers& mean, const Table& information, const Table& landmarks, const Table& sensitivity,
-              const IndexArray& range_power) {
+              const IndexArray& range_power, bool is_measured) {
              new (self) Submap(made_submap(mean, information, landmarks, sensitivity, range_power));
+             self->is_measured = is_measured;
            },
-           "mean"_a, "information"_a, "landmarks"_a, "sensitivity"_a, nb::arg("range_power").noconvert())
+           "mean"_a, "information"_a, "landmarks"_a, "sensitivity"_a, nb::arg("range_power").noconvert(),
+           "is_measured"_a = true)
       .def("with_errors",
            [](const Submap& self, const Table& sensitivity, const IndexArray& range_power) {
              Submap made = self;

@@ -179,6 +179,7 @@ void Submap::landmark_chi2(Values state, Indices at, double factor, std::span<do
 
 Submap Submap::at_joined_ranges(Values state, Indices at) const {
   Submap moved = *this;
+  if (!is_measured) return moved;
   const std::size_t n = size(), start = at[0];
   const double viewpoints = double(poses() + 1);
   double x = 0.0, y = 0.0;

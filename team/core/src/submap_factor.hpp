@@ -59,6 +59,7 @@ struct Submap {
   std::vector<se2::Spread<double>> landmarks;  // each one's own covariance
   dense::Matrix sensitivity;                   // a row per bias
   std::vector<Index> range_power;              // of each row, the power of a landmark's range, 0, 1 or NO_POWER
+  bool is_measured = true;                     // false: a saved map, whose errors belong to no range
 
   std::size_t size() const { return mean.size(); }
   std::size_t biases() const { return range_power.size(); }

@@ -35,7 +35,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     settled,
 )
-from teamslam.team.estimation.map_joining.joining import Fold, merged_islands
+from teamslam.team.estimation.map_joining.joining import Fold, merged_islands, precedence
 from teamslam.team.estimation.map_joining.merging import Merge, placed
 from teamslam.team.estimation.map_joining.minima import minimum
 from teamslam.team.estimation.map_joining.submap_graph import tied
@@ -247,7 +247,7 @@ def _merge_islands(
 ) -> Fold:
     """Merge two islands; search the streams that change their frame for closures.
 
-    The frame is the team's if one island has it, else that of the smallest stream. The fold is
+    The frame is that of the first one by `precedence`. The fold is
     unchanged where the merged island has no solution.
     """
     landmarks, becomes = merge_sets(fold.landmarks, ties)
@@ -256,7 +256,7 @@ def _merge_islands(
         island = fold.islands[key]
         graph, state = tied(island.graph, island.state, becomes)
         renamed[key] = replace(island, graph=graph, state=state)
-    stays, goes = sorted(keys, key=lambda at: (at != fold.main_key, min(renamed[at].graph.streams)))
+    stays, goes = sorted(keys, key=lambda at: precedence(fold, at))
     if renamed[goes].graph.condensed is not None:
         return fold  # its condensed factor is linearised in its own frame
     place = second_from_first if stays == keys[1] else inverse(second_from_first)

@@ -25,6 +25,7 @@ from teamslam.team import core
 from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.least_squares import (
     HALVINGS,
@@ -40,6 +41,8 @@ STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
 tenth of the shift by condensing (docs/decisions/25).
 """
+PLAIN = 1e9
+"""Robust scale at which Cauchy's loss is χ² to the last bit."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -110,8 +113,12 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """Robust scale c of each submap at its age."""
-        return self._scale_at(self.age)
+        """Robust scale c of each submap at its age; PLAIN for a saved map (see `saved_maps`)."""
+        scale = self._scale_at(self.age)
+        if self.settings.robust_c is not None:
+            saved = [is_map(each.contribution.stream) for each in self.graph.submaps]
+            scale[np.flatnonzero(saved)] = PLAIN
+        return scale
 
     @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
@@ -304,7 +311,9 @@ def settled(island: Island) -> tuple[Island, int, float]:
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
-        narrow = settings.robust_c is None or bool((scales == settings.robust_c).all())
+        narrow = settings.robust_c is None or bool(
+            ((scales == settings.robust_c) | (scales == PLAIN)).all()
+        )
         island, (damping, change) = _iteration(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):

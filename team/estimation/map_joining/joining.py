@@ -27,6 +27,7 @@ from teamslam.team.estimation.contribution import (
     InitialPoseFactor,
     Key,
     Stream,
+    is_map,
     moment,
     named,
 )
@@ -50,6 +51,15 @@ from teamslam.team.estimation.map_joining.minima import (
     widened,
 )
 from teamslam.team.estimation.map_joining.resting import woken
+from teamslam.team.estimation.map_joining.saved_maps import (
+    FALSE_ALARM,
+    SEQUENTIAL,
+    maps_of,
+    next_change,
+    returned,
+    reunite,
+    separate,
+)
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 
 __all__ = [
@@ -68,6 +78,7 @@ __all__ = [
     "converged",
     "folded",
     "merged_islands",
+    "precedence",
     "started",
 ]
 
@@ -186,11 +197,14 @@ class Fold:
 
     @property
     def main_key(self) -> Stream | None:
-        """Key of the island with the known initial poses, else of the one with the smallest
-        stream.
+        """Key of the island with the known initial poses, else of one with a saved map and a robot,
+        else of the one with the smallest stream, of a robot if there is any.
         """
         started = sorted(stream for stream in self.home if stream in self.starts)
-        streams = started or sorted(self.home)
+        robots = sorted(stream for stream in self.home if not is_map(stream))
+        placed = {self.home[robot] for robot in robots}
+        maps = sorted(s for s in self.home if is_map(s) and self.home[s] in placed)
+        streams = started or maps or robots or sorted(self.home)
         return self.home[streams[0]] if streams else None
 
     @property
@@ -204,13 +218,13 @@ class Fold:
     def frame(self) -> Stream | None:
         """The stream whose start fixes the main island's frame; None before any submap.
 
-        It is the smallest one with a known initial pose, else the smallest one of the island. All
-        known initial poses are given in one frame.
+        It is the smallest one with a known initial pose, else a saved map of the island, else the
+        smallest one of the island. All known initial poses are given in one frame.
         """
         if self.main_key is None:
             return None
         started = [stream for stream in self.home if stream in self.starts]
-        return min(started or self.main.graph.streams)
+        return min(started) if started else _frame_of(self.main)
 
     def island(self, robot: str, incarnation: int) -> Island:
         """Return the island of a stream. Raises KeyError for a stream without submaps."""
@@ -284,7 +298,7 @@ def folded(
         waiting=waiting,
         landmarks=landmarks,
     )
-    return _with_merges(_with_searches(grown))
+    return separated(_with_merges(_with_searches(grown)), SEQUENTIAL)
 
 
 def compacted(fold: Fold) -> Fold:
@@ -325,7 +339,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         iterations=main.best.iterations,
         change=main.best.change,
     )
-    merged = _with_merges(solved, at_last=True)
+    merged = _with_changes(_with_merges(solved, at_last=True))
     last = main if merged.main is main.best.island else _search(merged.main)
     wider = None
     with suppress(*UNSOLVABLE):
@@ -334,11 +348,39 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         last = wider
     return replace(
         merged,
-        islands={**merged.islands, main_key: last.best.island},
+        islands={**merged.islands, merged.main_key or main_key: last.best.island},
         iterations=last.best.iterations,
         change=last.best.change,
         warnings=(*warnings(last), *warn_of_unmarked(last.best.island)),
     )
+
+
+def separated(fold: Fold, chance: float) -> Fold:
+    """Separate the landmarks that have moved since a saved map from their former places.
+
+    The worst one first; each island is solved again before its next one is tested.
+    """
+    islands = dict(fold.islands)
+    for key, island in fold.islands.items():
+        if len(island.graph.streams) == sum(map(is_map, island.graph.streams)) or not maps_of(
+            island.graph
+        ):
+            continue
+        with suppress(*UNSOLVABLE):
+            while (found := next_change(islands[key], chance)) is not None:
+                apart = separate(islands[key], found[0], [found[1].landmark])
+                islands[key] = iterated(apart)
+    return replace(fold, islands=islands)
+
+
+def _with_changes(fold: Fold) -> Fold:
+    """Test the landmarks of saved maps anew, in a full solution: those apart, then the others."""
+    islands = dict(fold.islands)
+    for key, island in fold.islands.items():
+        with suppress(*UNSOLVABLE):
+            for stream, id_ in returned(island, FALSE_ALARM):
+                islands[key] = iterated(reunite(islands[key], stream, id_))
+    return separated(replace(fold, islands=islands), FALSE_ALARM)
 
 
 def _search(island: Island) -> Search:
@@ -368,9 +410,7 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
     """
     main_key = fold.main_key
-    keys = sorted(
-        fold.islands, key=lambda key: (key != main_key, min(fold.islands[key].graph.streams))
-    )
+    keys = sorted(fold.islands, key=lambda key: precedence(fold, key))
     reasons: dict[Stream, str] = {}
     judged = dict(fold.judged)
     for key, other_key in combinations(keys, 2):
@@ -388,10 +428,24 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
                 judged[key, other_key] = (size, why)
         else:
             why = before[1]
-        if key == main_key:
-            frame = min(other.graph.streams)
+        if main_key in (key, other_key):
+            frame = min((other if key == main_key else main).graph.streams)
             reasons[frame] = f"{named(frame)} not joined: {why}"
     return replace(fold, reasons=reasons, judged=judged)
+
+
+def precedence(fold: Fold, key: Stream) -> tuple[bool, bool, bool, Stream]:
+    """Order of the islands by whose frame stays in a merge: one with known initial poses, one with
+    a saved map, the main one, the smallest.
+    """
+    streams = fold.islands[key].graph.streams
+    started, saved = any(s in fold.starts for s in streams), any(map(is_map, streams))
+    return not started, not saved, key != fold.main_key, _frame_of(fold.islands[key])
+
+
+def _frame_of(island: Island) -> Stream:
+    streams = island.graph.streams
+    return min(filter(is_map, streams), default=min(streams))
 
 
 def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:

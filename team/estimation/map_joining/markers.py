@@ -13,6 +13,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.submap_graph import CommonError, Joined, Prior
 
@@ -68,7 +69,8 @@ def _find_unmarked(island: Island) -> dict[int, int]:
 
 
 def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
-    if "range_scale" not in submap.contribution.local.biases:
+    of = submap.contribution
+    if "range_scale" not in of.local.biases or is_map(of.stream):
         return []
     return [number[node] for node in submap.landmarks.tolist() if node in number]
 

@@ -31,6 +31,7 @@ from teamslam.team.estimation.map_joining.island_ties import (
     ties,
 )
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
+from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
 from teamslam.team.shapes import Float, Int64
 
@@ -88,6 +89,10 @@ def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> M
 
 
 def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
+    apart = _without_moved(main, other)
+    if isinstance(apart, Waits):
+        return apart
+    main, other = apart
     tied = ties(main.graph, other.graph, waiting)
     seen = sum(tie.seen is not None for tie in tied)
     shared = SharedPoints(len(tied) - seen, seen)
@@ -108,6 +113,23 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     if not is_solvable(search.best.island):
         return Waits(f"{shared}, with which the map has no solution", after_search=True)
     return Merge(search.best, left, _words(other, shared, search, rise))
+
+
+def _without_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:
+    """Separate the landmarks that have moved since a saved map from those of the other island."""
+    island = main if maps_of(main.graph) else other
+    saved = maps_of(island.graph)
+    ids = sorted(main.graph.landmarks.keys() & other.graph.landmarks.keys())
+    if not saved or len(ids) <= alignment.NEEDED:
+        return main, other
+    moved = disagreeing(main, other, ids, main.settings.alignment_confidence)
+    if isinstance(moved, str):
+        return Waits(moved, after_search=True)
+    after = island
+    for each in saved:
+        own = {*each.landmarks.tolist()}
+        after = separate(after, each, [m for m in moved if island.graph.landmarks[m] in own])
+    return (after, other) if island is main else (main, after)
 
 
 def placed(

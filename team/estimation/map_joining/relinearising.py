@@ -24,6 +24,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
 from teamslam.team.estimation.map_joining.merging import ages, sighted
+from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.shapes import Float
@@ -169,4 +170,8 @@ def _raw(
     for node, own in pairs:
         put(node, value(own))
     age = np.full(len(full.submaps), FULL_AGE)
-    return Island(replace(full, fixed=fixed), state, age, ages(0), settings)
+    raw = Island(replace(full, fixed=fixed), state, age, ages(0), settings)
+    for saved in maps_of(full):
+        of = saved.contribution.stream
+        raw = separate(raw, saved, (id_ for stream, id_ in graph.former if stream == of))
+    return raw

@@ -22,6 +22,7 @@ from teamslam.team.estimation.contribution import (
     InitialPoseFactor,
     Key,
     Stream,
+    is_map,
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
@@ -73,17 +74,21 @@ class Joined(NamedTuple):
 
     @classmethod
     def of(
-        cls, contribution: Contribution, nodes: Indices, common: tuple[CommonError, ...]
+        cls,
+        contribution: Contribution,
+        nodes: Indices,
+        own: tuple[Bias, ...],
+        common: tuple[CommonError, ...],
     ) -> "Joined":
         """Make a submap whose `common` errors have a node of the whole team."""
-        biases = (*contribution.local.biases, *common)
+        biases = (*own, *common)
         return cls(contribution, nodes, biases, _sensitivity(contribution.local, biases))
 
     @property
     def factor(self) -> core.SubmapFactor:
         """The factor over the submap's nodes. Raises NotACovarianceError that names the submap."""
         factor = self.contribution.factor
-        if len(self.biases) == len(self.contribution.local.biases):
+        if self.biases == self.contribution.local.biases:
             return factor
         powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
         return factor.with_errors(self.sensitivity, np.array(powers, np.int64))
@@ -97,7 +102,7 @@ class Joined(NamedTuple):
 
 
 def _sensitivity(local: LocalMap, biases: Sequence[CommonError]) -> Float[np.ndarray, "B _"]:
-    if len(biases) == len(local.biases):
+    if tuple(biases) == local.biases:
         return local.sensitivity
     rows = local.sensitivity[[local.biases.index(_scaling(error)) for error in biases]]
     first = len(local.mean) - 2 * len(local.ids)
@@ -131,8 +136,9 @@ class Graph:
     last entry is the state's length. fixed: nodes that are constants (exactly known initial poses,
     the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
     replaces older submaps, if any (`condensing`). gone: number of a stream's submaps in
-    `condensed`; `streams` begins after them. memory: observations of the condensed submaps for data
-    association, where landmarks have no names.
+    `condensed`; `streams` begins after them. former: the node of a moved landmark's old place, by
+    (saved map, id); the id is that of its present place. memory: observations of the condensed
+    submaps for data association, where landmarks have no names.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -147,6 +153,7 @@ class Graph:
     common: Mapping[CommonError, int] = field(default_factory=dict)
     condensed: Condensed | None = None
     gone: Mapping[Stream, int] = field(default_factory=dict)
+    former: Mapping[tuple[Stream, int], int] = field(default_factory=dict)
     memory: Memory = NOTHING
 
     @cached_property
@@ -237,6 +244,9 @@ class Graph:
         for error, at in self.common.items():
             if node == at:
                 return f"the {'marker' if isinstance(error, int) else 'bias'} {error} of the team"
+        for (stream, id_), at in self.former.items():
+            if node == at:
+                return f"the place of landmark {id_} in {named(stream)}"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}"
 
@@ -326,21 +336,24 @@ def extended(
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
         seen = [growth.landmarks[id_] for id_ in ids]
-        for bias in local.biases:
+        common = _in_common(contribution, common_bias_sigma)
+        own = local.biases  # the errors of single sensors are part of a saved map's covariance
+        if is_map(stream):
+            own = tuple(bias for bias in own if bias not in common)
+        for bias in own:
             if (stream, bias) not in growth.biases:
                 growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
                 certainty = np.array([[1.0 / core.squared(bias_sigma[bias])]])
                 priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
-        common = _in_common(local, common_bias_sigma)
         for error, sigma in common.items():
             if error not in growth.common:
                 growth.common[error] = growth.add(np.zeros(1), fixed=False)
                 certainty = np.array([[1.0 / core.squared(sigma)]])
                 priors.append(Prior(growth.common[error], np.zeros(1), certainty))
-        errors = [growth.biases[stream, bias] for bias in local.biases]
+        errors = [growth.biases[stream, bias] for bias in own]
         errors += [growth.common[error] for error in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
-        submaps.append(Joined.of(contribution, nodes, tuple(common)))
+        submaps.append(Joined.of(contribution, nodes, own, tuple(common)))
     grown = Graph(
         streams=growth.streams,
         landmarks=growth.landmarks,
@@ -354,23 +367,27 @@ def extended(
         common=growth.common,
         condensed=graph.condensed,
         gone=graph.gone,
+        former=graph.former,
         memory=graph.memory,
     )
     return grown, np.concatenate([state, *growth.values])
 
 
 def _in_common(
-    local: LocalMap, common_bias_sigma: Mapping[CommonBias, float]
+    contribution: Contribution, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
     """Return the common errors of a submap with their sigmas, in order.
 
-    The markers of unnamed landmarks are states of the full solution alone (`markers`).
+    The markers of unnamed landmarks are states of the full solution alone (`markers`); those of an
+    earlier day are part of a saved map's covariance.
     """
+    local = contribution.local
     found: dict[CommonError, float] = {
         bias: common_bias_sigma[bias] for bias in local.biases if bias in common_bias_sigma
     }
     of_marker = common_bias_sigma.get("marker")
-    if of_marker is not None and "range_scale" in local.biases:
+    has_markers = "range_scale" in local.biases and not is_map(contribution.stream)
+    if of_marker is not None and has_markers:
         found |= dict.fromkeys((id_ for id_ in local.ids.tolist() if id_ < UNNAMED), of_marker)
     return found
 
@@ -398,6 +415,7 @@ def without_nodes(
         streams=streams,
         landmarks={id_: node for id_, node in graph.landmarks.items() if not eliminated[node]},
         poses={at: node for at, node in graph.poses.items() if not eliminated[node]},
+        former={at: node for at, node in graph.former.items() if not eliminated[node]},
         submaps=tuple(compress(graph.submaps, submaps)),
         sightings=tuple(compress(graph.sightings, sightings)),
         priors=tuple(compress(graph.priors, priors)),
@@ -418,6 +436,7 @@ def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -
         streams={s: tuple(node_of[list(nodes)].tolist()) for s, nodes in graph.streams.items()},
         landmarks={number: int(node_of[node]) for number, node in graph.landmarks.items()},
         poses={key: int(node_of[node]) for key, node in graph.poses.items()},
+        former={key: int(node_of[node]) for key, node in graph.former.items()},
         biases={key: int(node_of[node]) for key, node in graph.biases.items()},
         common={bias: int(node_of[node]) for bias, node in graph.common.items()},
         offset=_starts(np.diff(graph.offset)[stays].tolist()),
@@ -443,6 +462,36 @@ def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
         fixed=np.concatenate([graph.fixed, np.zeros(len(ids), np.bool_)]),
     )
     return grown, np.arange(first, first + len(ids))
+
+
+def with_former(
+    graph: Graph, state: Values, stream: Stream, id_: int, value: Values, *, shared: bool
+) -> tuple[Graph, Values]:
+    """Separate a landmark's place in a saved map from its present one.
+
+    The map's factor gets a node of its own at `value`; with no other observation (`shared`) it
+    keeps the node, which is no landmark of today any more.
+    """
+    node = graph.landmarks[id_]
+    if not shared:
+        landmarks = {each: at for each, at in graph.landmarks.items() if each != id_}
+        former = {**graph.former, (stream, id_): node}
+        return replace(graph, landmarks=landmarks, former=former), state
+    new = len(graph.fixed)
+    submaps = tuple(
+        each._replace(nodes=np.where(each.nodes == node, new, each.nodes))
+        if each.contribution.stream == stream
+        else each
+        for each in graph.submaps
+    )
+    grown = replace(
+        graph,
+        submaps=submaps,
+        former={**graph.former, (stream, id_): new},
+        offset=_continued(graph.offset, [2]),
+        fixed=np.concatenate([graph.fixed, [False]]),
+    )
+    return grown, np.concatenate([state, value])
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
@@ -511,6 +560,7 @@ def merged(
         common={**moved.common, **main.common},
         condensed=main.condensed,
         gone={**main.gone, **other.gone},
+        former={**main.former, **moved.former},
         memory=main.memory,
     )
     return graph, np.concatenate([state, *values])

@@ -10,6 +10,7 @@ Every message has `stamp_ns`, its team time: the time of the measurement that it
 raises `ValueError` with the reason where the numbers do not fit the message.
 """
 
+from teamslam.team.wire.messages.base import Author as Author
 from teamslam.team.wire.messages.base import Bias as Bias
 from teamslam.team.wire.messages.base import Count as Count
 from teamslam.team.wire.messages.base import Digest as Digest
@@ -29,11 +30,14 @@ from teamslam.team.wire.messages.estimates import MapEstimate as MapEstimate
 from teamslam.team.wire.messages.estimates import ParticleCloud as ParticleCloud
 from teamslam.team.wire.messages.estimates import PoseEstimate as PoseEstimate
 from teamslam.team.wire.messages.estimates import Rendezvous as Rendezvous
+from teamslam.team.wire.messages.maps import MOST_SAVED as MOST_SAVED
 from teamslam.team.wire.messages.maps import AssociationDecision as AssociationDecision
 from teamslam.team.wire.messages.maps import BiasEstimate as BiasEstimate
 from teamslam.team.wire.messages.maps import FusedMap as FusedMap
+from teamslam.team.wire.messages.maps import LandmarkChange as LandmarkChange
 from teamslam.team.wire.messages.maps import Membership as Membership
 from teamslam.team.wire.messages.maps import Prior as Prior
+from teamslam.team.wire.messages.maps import SavedMap as SavedMap
 from teamslam.team.wire.messages.maps import Trajectory as Trajectory
 from teamslam.team.wire.messages.maps import VersionEntry as VersionEntry
 from teamslam.team.wire.messages.measurements import AnyOdometry as AnyOdometry

@@ -9,6 +9,8 @@ from teamslam.team.core import check_ascending, check_blocks, check_finite, chec
 from teamslam.team.wire.arrays import ids
 
 Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
+Author = Annotated[str, Meta(pattern="^(map-)?[a-z][a-z0-9_]{0,31}$")]
+"""The author of a member of the set: a robot, or a saved map as `map-<name>`."""
 Text = Annotated[str, Meta(max_length=20_000)]
 Document = Annotated[str, Meta(max_length=1_000_000)]
 """A configuration; the world's has 1,500 characters for each robot."""

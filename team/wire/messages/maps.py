@@ -1,11 +1,12 @@
 """The team's map, priors and trajectories, with the parts of these messages."""
 
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
+from teamslam.team.config import MAP
 from teamslam.team.core import (
     check_ascending,
     check_finite,
@@ -14,6 +15,7 @@ from teamslam.team.core import (
 )
 from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
 from teamslam.team.wire.messages.base import (
+    Author,
     Bias,
     Count,
     Digest,
@@ -26,6 +28,12 @@ from teamslam.team.wire.messages.base import (
 )
 from teamslam.team.wire.messages.orders import Judgement
 
+ChangeState = Literal["unchanged", "moved", "gone", "new"]
+MOST_SAVED = 2000
+"""Most landmarks of a saved map, whose joint covariance has 64 MB."""
+MOST_SETS = 10_000
+"""Most sets in a saved map: one a day for 27 years."""
+
 
 class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """One entry of a version vector: it contains the submaps of a stream up to `sequence`.
@@ -34,7 +42,7 @@ class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     their counter.
     """
 
-    robot: Name
+    robot: Author
     incarnation: Count
     sequence: int
 
@@ -42,7 +50,7 @@ class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """Estimate of an error that all submaps of (robot, incarnation) share, with its sigma."""
 
-    robot: Name
+    robot: Author
     incarnation: Count
     bias: Bias
     value: Real
@@ -58,7 +66,7 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     of the best rival, standard deviation of the difference [m].
     """
 
-    robot: Name
+    robot: Author
     incarnation: Count
     sequences: Ids
     locals: Ids
@@ -90,6 +98,24 @@ class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=
     absent: Count = 0
 
 
+class LandmarkChange(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """The state of a landmark against the saved maps of earlier days.
+
+    dx, dy [m]: its displacement since then, in the frame of the map; sigma [m]: standard deviation
+    of one coordinate of it; chi2: of two degrees of freedom that it has not moved; all 0 for a
+    landmark that is gone or new. expected: how often it should have been observed, of one that is
+    gone.
+    """
+
+    landmark: Count
+    state: ChangeState
+    dx: Real = 0.0
+    dy: Real = 0.0
+    sigma: Real = 0.0
+    chi2: Real = 0.0
+    expected: Real = 0.0
+
+
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
@@ -107,7 +133,8 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     received; the newer of two maps has more, or as many and more members. memberships: by robot and
     incarnation, if landmarks have no names; a landmark of one submap is tentative, and a running
     map names the first and last few members of each. decisions: the newest closures and merges of
-    robots, then the waiting ones. verdicts: the operators' verdicts in the map.
+    robots, then the waiting ones. verdicts: the operators' verdicts in the map. changes: in a final
+    map with a saved one, the state of each landmark, by number.
     """
 
     rule: Text
@@ -127,13 +154,14 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     reasons: tuple[Text, ...] = ()
     biases: tuple[BiasEstimate, ...] = ()
     joined: tuple[Text, ...] = ()
-    withdrawn: tuple[Name, ...] = ()
+    withdrawn: tuple[Author, ...] = ()
     covariance_scale: Annotated[float, Meta(ge=0.0, le=1e300)] = 0.0
     lost: tuple[Name, ...] = ()
     heard: Count = 0
     memberships: tuple[Membership, ...] = ()
     decisions: tuple[AssociationDecision, ...] = ()
     verdicts: tuple[Judgement, ...] = ()
+    changes: tuple[LandmarkChange, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         for each in self.memberships:
@@ -216,3 +244,50 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
         check_finite(self.covariances, "covariances", 9 * k)
         for i in range(k):
             check_pose_covariance(self.covariances[72 * i : 72 * (i + 1)], "covariances")
+
+
+class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
+    """The final map of a team as one Gaussian, for a file and for the set of a later team.
+
+    stamp_ns: the end of its last submap. name: of the map; its landmarks are a member `map-<name>`
+    of the set. ids: L, ascending; from 2³¹ on landmarks without identity. means: 2L floats [m].
+    covariance: packed upper triangle of their joint covariance, positive definite, with the errors
+    `biases` taken as zero. biases: errors that all sensors share on every day, ascending;
+    sensitivity: B × 2L floats: given these errors b the means are means + bᵀ sensitivity. Errors of
+    single robots are part of the covariance. counts: number of submaps of each landmark, those of
+    earlier days included. frame: as in FusedMap. sets: digests of the final maps in it, of each
+    day, ascending: two maps with a set in common cannot be joined. software, core: version of the
+    program, digest of the native core.
+    """
+
+    name: Name
+    ids: Ids
+    means: Floats
+    covariance: Floats
+    biases: tuple[Bias, ...]
+    sensitivity: Floats
+    counts: Ids
+    frame: Text
+    sets: Annotated[tuple[Digest, ...], Meta(max_length=MOST_SETS)]
+    software: Text
+    core: Text
+
+    @property
+    def author(self) -> str:
+        """The name of its member of the set."""
+        return MAP + self.name
+
+    def check(self) -> None:  # noqa: D102
+        n = len(ids(self.ids, "ids"))
+        if not 2 <= n <= MOST_SAVED:
+            raise ValueError(f"out of bounds: {n} landmarks, 2 to {MOST_SAVED} are possible")
+        check_landmarks(self.ids, self.means, self.covariance, joint=True)
+        check_finite(self.sensitivity, "sensitivity", 2 * n * len(self.biases))
+        counts = ids(self.counts, "counts")
+        if len(counts) != n or not counts.min():
+            raise ValueError(f"wrong length: counts are not {n} positive numbers")
+        for name, each in (("biases", self.biases), ("sets", self.sets)):
+            if any(a >= b for a, b in pairwise(each)):
+                raise ValueError(f"not ascending: {name}")
+        if not self.sets:
+            raise ValueError("out of bounds: a map of no set")

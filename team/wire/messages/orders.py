@@ -5,17 +5,17 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from teamslam.team.wire.messages.base import Count, Message, Name, Text
+from teamslam.team.wire.messages.base import Author, Count, Message, Name, Text
 
 
 class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
-    """Withdrawal of a robot, for good; a member of the set.
+    """Withdrawal of a robot or of a saved map, for good; a member of the set.
 
     The map is that of the set without the robot's submaps and inter-robot factors. by: its author,
     "operator" or "central". reason: text.
     """
 
-    robot: Name
+    robot: Author
     by: Text
     reason: Text
 
@@ -35,7 +35,7 @@ class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/
 class LocalLandmark(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """An unnamed landmark of submap (robot, incarnation, sequence): its number is 2³¹ + `local`."""
 
-    robot: Name
+    robot: Author
     incarnation: Count
     sequence: Count
     local: Annotated[int, Meta(ge=0, lt=2**31)]
@@ -56,7 +56,7 @@ class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
     reason: text. withdrawn: this judgement is taken back, for good.
     """
 
-    robot: Name
+    robot: Author
     judgement: Judgement
     by: Text
     reason: Text

@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from teamslam.team.wire.messages.base import Count, Digest, Message, Name, StampNs, Text
+from teamslam.team.wire.messages.base import Author, Count, Digest, Message, Name, StampNs, Text
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
@@ -27,7 +27,7 @@ class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class Statements(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """Number of orders and ends about a robot that a node has, and their digest."""
 
-    robot: Name
+    robot: Author
     count: Count
     digest: Digest
 
@@ -77,7 +77,7 @@ class MembersRequest(Message, frozen=True, kw_only=True, tag="members_wanted/1")
 
     node: Text
     requested: tuple[Requested, ...]
-    statements: tuple[Name, ...] = ()
+    statements: tuple[Author, ...] = ()
 
 
 class Members(Message, frozen=True, kw_only=True, tag="members/1"):

@@ -1,0 +1,118 @@
+"""Saved maps and the fold: save its final map, and list what has changed since earlier days."""
+
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+
+import numpy as np
+
+from teamslam.team import core, translate
+from teamslam.team.config import BIASES, UNNAMED
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import is_map
+from teamslam.team.estimation.gaussian import information
+from teamslam.team.estimation.map_joining.absence import absences
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import joint, points_of
+from teamslam.team.estimation.map_joining.saved_maps import FALSE_ALARM, displacements, maps_of
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, ids
+
+NO_ROBOT = "no robot has observed a landmark"
+
+
+class NothingToSaveError(ValueError):
+    """A map that cannot be saved; the text gives the reason and the remedy."""
+
+
+def save_map(
+    fold: Fold, fused: m.FusedMap, name: str, before: Mapping[str, m.SavedMap]
+) -> m.SavedMap:
+    """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
+
+    With the biases c that all sensors share, the landmarks x are N(x̄ + S (c − c̄), P − S C Sᵀ) given
+    c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out.
+    """
+    gone = {each.landmark for each in fused.changes if each.state == "gone"}
+    chosen = [id_ for id_ in ids(fused.ids, "ids").tolist() if id_ not in gone]
+    if not 2 <= len(chosen) <= m.MOST_SAVED:
+        raise NothingToSaveError(
+            f"the final map has {len(chosen)} landmarks; a saved map has 2 to {m.MOST_SAVED}"
+        )
+    island = fold.main
+    biases = tuple(bias for bias in sorted(BIASES) if bias in island.graph.common)
+    mean, P = joint(island, [island.graph.common[bias] for bias in biases], chosen)
+    k = len(biases)
+    rows = dense.product(information(P[:k, :k], "the common biases"), P[:k, k:])
+    means = mean[k:] - dense.product(mean[:k], rows)
+    given = P[k:, k:] - dense.product(P[k:, :k], rows)
+    frame = fold.frame
+    earlier = [before[robot] for robot, _ in fold.home if robot in before]
+    unnamed = [id_ for id_ in chosen if id_ >= UNNAMED]
+    numbers = [id_ for id_ in chosen if id_ < UNNAMED]
+    return m.SavedMap(
+        stamp_ns=max([fused.stamp_ns, *(each.stamp_ns for each in earlier)]),
+        name=name,
+        ids=from_ids([*numbers, *range(UNNAMED, UNNAMED + len(unnamed))]),
+        means=from_floats(means),
+        covariance=translate.joint_bytes(0.5 * (given + given.T)),
+        biases=biases,
+        sensitivity=from_floats(rows),
+        counts=from_ids(_counts(island, chosen, before)),
+        frame="" if frame is None else translate.frame_name(*frame),
+        sets=tuple(sorted({fused.digest, *(one for each in earlier for one in each.sets)})),
+        software=metadata.version("teamslam"),
+        core=core.digest[:16],
+    )
+
+
+def _counts(
+    island: Island, chosen: Sequence[int], before: Mapping[str, m.SavedMap]
+) -> Sequence[int]:
+    """Count the submaps of each landmark, those of earlier days included."""
+    count = np.zeros(len(island.graph.fixed), np.int64)
+    for submap in island.graph.submaps:
+        saved = before.get(submap.contribution.robot)
+        count[submap.landmarks] += 1 if saved is None else ids(saved.counts, "counts")
+    node_of = island.graph.landmarks
+    return [max(1, int(count[node_of[id_]])) if id_ in node_of else 1 for id_ in chosen]
+
+
+def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange, ...]:
+    """List the state of each landmark against the saved maps in the main island, by number.
+
+    One that several maps have counts as the one that changed most.
+    """
+    if fold.main_key is None or not maps_of(fold.main.graph):
+        return ()
+    island, found = fold.main, dict[int, m.LandmarkChange]()
+    limit = chi2_limit(2, FALSE_ALARM)
+    id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
+    own = {
+        node
+        for each in island.graph.submaps
+        if not is_map(each.contribution.stream)
+        for node in each.landmarks.tolist()
+    }
+    old: set[int] = {id_ for _, id_ in island.graph.former}
+    for saved in maps_of(island.graph):
+        old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
+        for each in displacements(island, saved):
+            before = found.get(each.landmark)
+            if before is None or before.chi2 < each.chi2:
+                found[each.landmark] = m.LandmarkChange(
+                    landmark=each.landmark,
+                    state="moved" if each.is_apart or each.chi2 > limit else "unchanged",
+                    dx=float(each.by[0]),
+                    dy=float(each.by[1]),
+                    sigma=each.sigma_m,
+                    chi2=max(each.chi2, 0.0),
+                )
+    unseen = sorted(id_ for id_ in old & {*shown} if island.graph.landmarks.get(id_) not in own)
+    for id_, absence in zip(unseen, absences(island, points_of(island, unseen)), strict=True):
+        if absence.chance < FALSE_ALARM:
+            found[id_] = m.LandmarkChange(landmark=id_, state="gone", expected=absence.expected)
+    for id_ in {*shown} - old:
+        found[id_] = m.LandmarkChange(landmark=id_, state="new")
+    return tuple(found[id_] for id_ in sorted(found))

@@ -1,0 +1,119 @@
+"""Commands about maps: save the final map of a run, show a saved one, request that of a peer."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.options import (
+    FAILED,
+    LOOPBACK,
+    WRONG_USE,
+    Connect,
+    JsonFile,
+    Keys,
+    LogArgument,
+    TeamOption,
+    connect_bus,
+    fail,
+    saved_maps,
+    write_json,
+)
+from teamslam.team.wire.arrays import ids
+
+app = typer.Typer(
+    name="map",
+    cls=Group,
+    help="Save the final map of a run, show a saved map, or request a peer's.",
+    no_args_is_help=True,
+)
+
+
+@app.command(cls=Command, epilog="teamslam map save runs/first -o site.map")
+def save(
+    log: LogArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The file to write.", metavar="FILE")
+    ],
+    name: Annotated[
+        str | None,
+        typer.Option(help="Name of the map, as site; default: that of the file.", metavar="NAME"),
+    ] = None,
+) -> None:
+    """Save the final map of a run as one Gaussian, for the teams of later days.
+
+    The map is solved again from the recorded submaps. If the run has loaded a
+    saved map, the new one contains it. A later team loads the file with --map.
+    """
+    from teamslam.central.desk.verification.centre import recorded_map
+    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.saved_maps import NothingToSaveError
+    from teamslam.team.recording.reader import open_log
+    from teamslam.team.saved_map import SavedMapError, map_name, write_map
+
+    try:
+        saved = recorded_map(recorded(open_log(log)), map_name(name or output.stem))
+        write_map(output, saved)
+    except SavedMapError as error:
+        fail(str(error), WRONG_USE)
+    except (RerunError, NothingToSaveError) as error:
+        fail(f"{log}: {error}", FAILED)
+    count, days = len(ids(saved.ids, "ids")), len(saved.sets)
+    size = output.stat().st_size / 1e3
+    typer.echo(
+        f"wrote {output}: the map {saved.name} of {count} landmarks, {days} set"
+        f"{'' if days == 1 else 's'}, {size:,.0f} kB"
+    )
+
+
+@app.command(cls=Command, epilog="teamslam map show site.map")
+def show(
+    file: Annotated[Path, typer.Argument(help="A saved map.")], json_file: JsonFile = None
+) -> None:
+    """Show a saved map: where it comes from, and its landmarks as CSV."""
+    from teamslam.team.saved_map import map_figures
+
+    saved = saved_maps([file])[0]
+    figures = map_figures(saved)
+    write_json(json_file, figures)
+    landmarks = figures.pop("landmarks")
+    for key, value in figures.items():
+        typer.echo(f"# {key}: {value}")
+    typer.echo("landmark,x,y,sigma_x,sigma_y,submaps")
+    for each in landmarks:
+        typer.echo(
+            f"{each['landmark']},{each['x_m']:.4f},{each['y_m']:.4f},"
+            f"{each['sigma_x_m']:.4f},{each['sigma_y_m']:.4f},{each['submaps']}"
+        )
+
+
+@app.command(cls=Command, epilog="teamslam map peer r3 --team waypoints")
+def peer(
+    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
+    team: TeamOption,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
+    ] = 60.0,
+) -> None:
+    """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
+    from teamslam.team.wire.arrays import floats
+    from teamslam.team.wire.bus import BusError
+    from teamslam.team.wire.channels import FOLD
+    from teamslam.team.wire.codec import decoded
+    from teamslam.team.wire.messages import FoldRequest, FusedMap
+
+    with connect_bus(team, connect, keys, "operator") as bus:
+        try:
+            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
+        except BusError as error:
+            fail(str(error), FAILED)
+    if not replies:
+        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
+    fused = decoded(replies[-1], FusedMap)
+    typer.echo("landmark,x,y")
+    means = floats(fused.means, "means").reshape(-1, 2)
+    for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
+        typer.echo(f"{landmark},{x:.4f},{y:.4f}")

@@ -1,0 +1,355 @@
+"""Saved maps of earlier days in an island: tests of their landmarks, and landmarks that moved.
+
+A saved map is a Gaussian over its landmarks in a free frame. Landmark i of it may be elsewhere
+today. Adding a displacement e of it to the map's measured place z_i lowers the joint cost by
+
+    χ²_i = g_iᵀ M_ii⁻¹ g_i,   g = W r,   M = W − W J Σ Jᵀ W,
+
+with the map's residual r, its information W, its Jacobian J and the island's covariance Σ; e is
+then M_ii⁻¹ g_i with covariance M_ii⁻¹ (Baarda 1968). If the landmark is where it was, χ²_i has two
+degrees of freedom. A landmark beyond the limit gets a second node, its former place, which the map
+alone has; the others are tested again without it, the worst first.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from teamslam.team import core
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import Stream, is_map, named
+from teamslam.team.estimation.gaussian import NotACovarianceError, deviation, information
+from teamslam.team.estimation.map_joining.alignment import aligned
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.submap_graph import Graph, Joined, tied, with_former
+from teamslam.team.estimation.se2 import transformed
+
+FALSE_ALARM = 1e-3
+"""Probability that a landmark which has not moved is taken for moved, in the final map."""
+SEQUENTIAL = 1e-6
+"""The same of one test in a running map, which repeats it with every tick."""
+NEGLIGIBLE = 1e-9
+"""Share of a landmark's information that the rest of a map must test for a test to count."""
+LEAST_AGREEING = 3
+"""Fewest landmarks that must agree where others disagree."""
+MOST_PAIRS = 2000
+"""Most pairs of shared landmarks from which a frame is proposed."""
+
+
+class Displacement(NamedTuple):
+    """The displacement [m] of a landmark since a saved map, in the island's frame.
+
+    chi2: of two degrees of freedom, that it is where it was. is_apart: its former place has a node.
+    """
+
+    landmark: int
+    by: Float[np.ndarray, "2"]
+    covariance: Float[np.ndarray, "2 2"]
+    chi2: float
+    is_apart: bool = False
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation [m] of one coordinate, both directions' mean."""
+        return deviation(0.5 * float(np.trace(self.covariance)))
+
+
+def maps_of(graph: Graph) -> list[Joined]:
+    """List the saved maps of an island, by name."""
+    found = (each for each in graph.submaps if is_map(each.contribution.stream))
+    return sorted(found, key=lambda each: each.contribution.stream)
+
+
+def displacements(island: Island, saved: Joined) -> list[Displacement]:
+    """Estimate the displacement of each landmark of a saved map that others observed, by id.
+
+    Landmarks of which the rest of the map gives no test are left out.
+    """
+    id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
+    nodes = saved.landmarks.tolist()
+    by_others = _observed_by_others(island.graph, saved)
+    tested = [k for k, node in enumerate(nodes) if node in by_others and node in id_of]
+    found = [
+        Displacement(id_of[nodes[k]], *each)
+        for k, each in zip(tested, _tests(island, saved, tested), strict=True)
+        if each is not None
+    ]
+    stream = saved.contribution.stream
+    for (of, id_), former in island.graph.former.items():
+        if of == stream and id_ in island.graph.landmarks:
+            found.append(_apart(island, id_, former, island.graph.landmarks[id_]))
+    return sorted(found, key=lambda each: each.landmark)
+
+
+def _observed_by_others(graph: Graph, saved: Joined) -> set[int]:
+    others = {n for each in graph.submaps if each is not saved for n in each.landmarks.tolist()}
+    return others if graph.condensed is None else others | {*graph.condensed.nodes.tolist()}
+
+
+def _tests(
+    island: Island, saved: Joined, tested: Sequence[int]
+) -> list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float] | None]:
+    """Compute (displacement, covariance, χ²) of landmarks, by their indices in the saved map; None
+    where the rest of the map does not determine it.
+    """
+    if not tested:
+        return []
+    graph, state = island.graph, island.state
+    factor = island.settings.covariance_factor
+    W = saved.contribution.information[3:, 3:] / factor
+    start = int(graph.offset[saved.nodes[0]])
+    s, c = core.sin_and_cos(state[start + 2])
+    rotation = np.array([[c, -s], [s, c]])
+    at = graph.offset[saved.landmarks]
+    points = np.column_stack([state[at], state[at + 1]])
+    inside = dense.product(points - state[start : start + 2], rotation)
+    bias_at = graph.offset[saved.nodes[len(saved.nodes) - len(saved.biases) :]]
+    shifts = saved.sensitivity[:, 3:] if len(saved.biases) else np.zeros((0, len(W)))
+    z = saved.contribution.local.landmarks.ravel()
+    residual = z + dense.product(state[bias_at], shifts) - inside.ravel()
+    g = dense.product(W, residual)
+    columns = np.array([n for k in tested for n in (2 * k, 2 * k + 1)])
+    own = W[:, columns]
+    # Jᵀ W e: h = Rᵀ(x − t) − bᵀ S of each landmark, by landmark, start pose and biases.
+    right = np.zeros((len(state), len(columns)))
+    x, y = own[0::2], own[1::2]
+    along = np.stack([c * x - s * y, s * x + c * y])
+    np.add.at(right, at, along[0])
+    np.add.at(right, at + 1, along[1])
+    right[start : start + 2] -= along.sum(axis=1)
+    right[start + 2] += (inside[:, 1, None] * x - inside[:, 0, None] * y).sum(axis=0)
+    right[bias_at] -= dense.product(shifts, own)
+    right[np.repeat(graph.fixed, np.diff(graph.offset))] = 0.0
+    M = own[columns] - dense.product(right.T, island.posterior.solve(right))
+    found: list[tuple[Float[np.ndarray, 2], Float[np.ndarray, "2 2"], float] | None] = []
+    for k, first in zip(tested, range(0, len(columns), 2), strict=True):
+        block = M[first : first + 2, first : first + 2]
+        block = 0.5 * (block + block.T)
+        if not _is_tested(block, own[2 * k : 2 * k + 2, first : first + 2]):
+            found.append(None)
+            continue
+        P = information(block, "a displacement")
+        e = dense.product(P, g[2 * k : 2 * k + 2])
+        chi2 = float(dense.product(e, g[2 * k : 2 * k + 2]))
+        turned = dense.product(dense.product(rotation, P), rotation.T)
+        found.append((-dense.product(rotation, e), turned, chi2))
+    return found
+
+
+def _is_tested(block: Float[np.ndarray, "2 2"], own: Float[np.ndarray, "2 2"]) -> bool:
+    scale = NEGLIGIBLE * float(np.trace(own))
+    determinant = float(block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0])
+    return bool(block[0, 0] > scale and block[1, 1] > scale) and determinant > scale * scale
+
+
+def _apart(island: Island, id_: int, former: int, present: int) -> Displacement:
+    mean, P = joint_marginal(island, [former, present])
+    by = mean[2:] - mean[:2]
+    covariance = P[:2, :2] + P[2:, 2:] - P[:2, 2:] - P[2:, :2]
+    metric = information(covariance, f"the displacement of landmark {id_}")
+    chi2 = float(dense.product(dense.product(by, metric), by))
+    return Displacement(id_, by, covariance, chi2, is_apart=True)
+
+
+def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
+    """Give landmarks of a saved map a node of their former place, apart from today's."""
+    graph, state = island.graph, island.state
+    stream = saved.contribution.stream
+    nodes = {node: k for k, node in enumerate(saved.landmarks.tolist())}
+    by_others = _observed_by_others(graph, saved)
+    start = int(graph.offset[saved.nodes[0]])
+    for id_ in sorted(ids):
+        node = graph.landmarks[id_]
+        local = saved.contribution.local.landmarks[nodes[node]]
+        value = transformed(state[start : start + 3], local)
+        graph, state = with_former(graph, state, stream, id_, value, shared=node in by_others)
+    return replace(island, graph=graph, state=state)
+
+
+def reunite(island: Island, stream: Stream, id_: int) -> Island:
+    """Make a landmark's former place in a saved map and its present one the same again."""
+    graph = island.graph
+    former = {at: node for at, node in graph.former.items() if at != (stream, id_)}
+    node = graph.former[stream, id_]
+    aside = max([*graph.landmarks, 0]) + 1
+    landmarks = {**graph.landmarks, aside: node}
+    graph = replace(graph, former=former, landmarks=landmarks)
+    graph, state = tied(graph, island.state, {aside: id_})
+    return replace(island, graph=graph, state=state)
+
+
+def next_change(island: Island, chance: float) -> tuple[Joined, Displacement] | None:
+    """Find the landmark that disagrees most with its place in a saved map, beyond chance."""
+    limit = chi2_limit(2, chance)
+    found = [
+        (each.chi2, saved, each)
+        for saved in maps_of(island.graph)
+        for each in displacements(island, saved)
+        if not each.is_apart and each.chi2 > limit
+    ]
+    if not found:
+        return None
+    _, saved, worst = max(found, key=lambda each: each[0])
+    return saved, worst
+
+
+def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
+    """List the landmarks apart from their former places although both are one within chance."""
+    limit = chi2_limit(2, chance)
+    return [
+        (saved.contribution.stream, each.landmark)
+        for saved in maps_of(island.graph)
+        for each in displacements(island, saved)
+        if each.is_apart and each.chi2 <= limit
+    ]
+
+
+def contradiction(island: Island) -> tuple[Stream, str] | None:
+    """Find a saved map of which most of the landmarks seen today are elsewhere, with the reason."""
+    for saved in maps_of(island.graph):
+        stream = saved.contribution.stream
+        moved = sum(of == stream for of, _ in island.graph.former)
+        nodes = {*saved.landmarks.tolist()} & {*island.graph.landmarks.values()}
+        same = len(nodes & _observed_by_others(island.graph, saved))
+        if moved >= LEAST_AGREEING and moved >= same:
+            return stream, (
+                f"{moved} of its {moved + same} landmarks that were seen today are elsewhere: it "
+                "is the map of another place, or half of the place has changed"
+            )
+    return None
+
+
+def disagreeing(
+    main: Island, other: Island, ids: Sequence[int], confidence: float
+) -> list[int] | str:
+    """Find the landmarks of two islands, one with a saved map, that moved between them.
+
+    The largest set of landmarks that one rigid motion places within `confidence` is taken from all
+    pairs; then those that disagree with the rest are removed, the worst first, and those that agree
+    are added again. Returns the reason if fewer than half of the landmarks agree.
+    """
+    n = len(ids)
+    in_main = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
+    in_other = joint_marginal(other, [other.graph.landmarks[id_] for id_ in ids])
+    a, A = in_main[0].reshape(-1, 2), in_main[1]
+    b, B = in_other[0].reshape(-1, 2), in_other[1]
+    limit = chi2_limit(2, 1.0 - confidence)
+    agree = _largest_agreement(a, A, b, B, limit)
+    for _ in range(n):
+        chi2 = _leave_one_out(a, A, b, B, agree)
+        worst = int(np.argmax(np.where(agree, chi2, -np.inf)))
+        if chi2[worst] > limit and agree.sum() > LEAST_AGREEING:
+            agree[worst] = False
+            continue
+        best = int(np.argmin(np.where(agree, np.inf, chi2)))
+        if agree[best] or chi2[best] > limit:
+            break
+        agree[best] = True
+    count = int(agree.sum())
+    if count < LEAST_AGREEING or 2 * count <= n:
+        of = next(each for island in (main, other) for each in maps_of(island.graph))
+        return (
+            f"{n} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
+            f"{count} are at one place; it is the map of another site, or half of the site has "
+            "changed"
+        )
+    return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
+
+
+def _largest_agreement(
+    a: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "m m"],
+    b: Float[np.ndarray, "n 2"],
+    B: Float[np.ndarray, "m m"],
+    limit: float,
+) -> Bool[np.ndarray, " n"]:
+    """Mark the most landmarks that the rigid motion of one pair places within the limit.
+
+    The motion from landmarks i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps the middle to the middle. A
+    landmark's difference has the covariance of both its places, less what they have in common with
+    those of the pair.
+    """
+    n = len(a)
+    best = np.zeros(n, np.bool_)
+    pairs = list(combinations(range(n), 2))
+    for i, j in pairs[:: -(-len(pairs) // MOST_PAIRS)]:
+        to, of = a[j] - a[i], b[j] - b[i]
+        turn = core.atan2(to[1], to[0]) - core.atan2(of[1], of[0])
+        s, c = core.sin_and_cos(turn)
+        R = np.array([[c, -s], [s, c]])
+        d = a - 0.5 * (a[i] + a[j]) - dense.product(b - 0.5 * (b[i] + b[j]), R.T)
+        P = _relative(A, i, j) + _turned(_relative(B, i, j), s, c)
+        # The direction of the pair is uncertain across it; far from the pair by as much more.
+        far = core.hypot(*(a - 0.5 * (a[i] + a[j])).T) / max(core.hypot(*to), 1e-12)
+        spread = P[i] + P[j]
+        P = P + core.squared(far)[:, None, None] * spread
+        determinant = P[:, 0, 0] * P[:, 1, 1] - P[:, 0, 1] * P[:, 1, 0]
+        chi2 = (
+            P[:, 1, 1] * d[:, 0] * d[:, 0]
+            - 2.0 * P[:, 0, 1] * d[:, 0] * d[:, 1]
+            + P[:, 0, 0] * d[:, 1] * d[:, 1]
+        ) / determinant
+        agree = chi2 <= limit
+        if agree.sum() > best.sum():
+            best = agree
+    return best
+
+
+def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, "n 2 2"]:
+    """Covariance of each landmark relative to the middle of landmarks i and j."""
+    n = len(P) // 2
+    grid = P.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
+    own = grid[np.arange(n), np.arange(n)]
+    middle = 0.25 * (grid[i, i] + grid[i, j] + grid[j, i] + grid[j, j])
+    cross = 0.5 * (grid[:, i] + grid[:, j])
+    found: Float[np.ndarray, "n 2 2"] = own + middle - cross - cross.transpose(0, 2, 1)
+    return found
+
+
+def _turned(P: Float[np.ndarray, "n 2 2"], s: float, c: float) -> Float[np.ndarray, "n 2 2"]:
+    """R P Rᵀ with the rotation of sine s and cosine c."""
+    xx, xy, yy = P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]
+    across = 2.0 * c * s * xy
+    x, y = c * c * xx - across + s * s * yy, s * s * xx + across + c * c * yy
+    between = c * s * (xx - yy) + (c * c - s * s) * xy
+    found: Float[np.ndarray, "n 2 2"] = np.stack([x, between, between, y], axis=1).reshape(-1, 2, 2)
+    return found
+
+
+def _leave_one_out(
+    a: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "m m"],
+    b: Float[np.ndarray, "n 2"],
+    B: Float[np.ndarray, "m m"],
+    agree: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """χ² of two degrees of freedom of each landmark against the others that agree."""
+    found = np.full(len(a), np.inf)
+    for k in range(len(a)):
+        others = agree.copy()
+        others[k] = False
+        with_k = others.copy()
+        with_k[k] = True
+        try:
+            costs = [_cost(a, A, b, B, each) for each in (with_k, others)]
+        except NotACovarianceError:
+            continue
+        found[k] = costs[0] - costs[1]
+    return found
+
+
+def _cost(
+    a: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "m m"],
+    b: Float[np.ndarray, "n 2"],
+    B: Float[np.ndarray, "m m"],
+    which: Bool[np.ndarray, " n"],
+) -> float:
+    rows = np.repeat(which, 2)
+    both = np.ix_(rows, rows)
+    return aligned(a[which], A[both], b[which], B[both]).chi2

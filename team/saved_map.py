@@ -1,0 +1,123 @@
+"""A saved map as a file, and as a submap of the team's set.
+
+The file is one message (`teamslam.team.wire.messages.SavedMap`), checked when it is read as on the
+wire.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.gaussian import packed, unpacked
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
+from teamslam.team.wire.codec import WireError, decoded, encoded
+
+LEAF_SIGMA = 1e-3
+"""Standard deviation [m, rad] of the end pose of a saved map's submap, which nothing depends on."""
+
+
+class SavedMapError(ValueError):
+    """An unusable file; the text names it, the reason and the remedy."""
+
+
+def read_map(path: Path) -> m.SavedMap:
+    """Read and check the file of a saved map; raises SavedMapError."""
+    try:
+        return decoded(path.read_bytes(), m.SavedMap)
+    except OSError as error:
+        raise SavedMapError(f"{path}: cannot be read: {error.strerror}") from None
+    except WireError as error:
+        remedy = {
+            "wrong tag": "it is no saved map: `teamslam map save RUN -o site.map` writes one",
+            "wrong version": "another version of teamslam has written it: save it again with this",
+            "truncated": "it is cut off: copy or save it again",
+        }.get(error.reason, "it is damaged or no saved map: save it again")
+        raise SavedMapError(f"{path}: {remedy} ({error})") from None
+
+
+def write_map(path: Path, saved: m.SavedMap) -> None:
+    """Write the file of a saved map; raises SavedMapError."""
+    try:
+        path.write_bytes(encoded(saved))
+    except OSError as error:
+        raise SavedMapError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def submap_of(saved: m.SavedMap) -> m.Submap:
+    """Make the submap of a saved map: landmarks only, before the team's time.
+
+    Its end pose lies at its start, with a small covariance of its own, which no landmark and no
+    other submap depends on. All its unnamed landmarks count as seen at once: no two are one.
+    """
+    numbers = ids(saved.ids, "ids")
+    n = 2 * len(numbers)
+    covariance = np.zeros((3 + n, 3 + n))
+    covariance[:3, :3] = LEAF_SIGMA**2 * np.eye(3)
+    covariance[3:, 3:] = unpacked(floats(saved.covariance, "covariance"), n)
+    rows = floats(saved.sensitivity, "sensitivity").reshape(len(saved.biases), n)
+    counts = ids(saved.counts, "counts")[numbers >= UNNAMED]
+    return m.Submap(
+        stamp_ns=0,
+        robot=saved.author,
+        incarnation=0,
+        sequence=0,
+        first_measurement=0,
+        last_measurement=0,
+        start_ns=0,
+        config=saved.sets[-1],
+        ids=saved.ids,
+        mean=from_floats(np.concatenate([np.zeros(3), floats(saved.means, "means")])),
+        covariance=from_floats(packed(covariance)),
+        biases=saved.biases,
+        sensitivity=from_floats(np.hstack([np.zeros((len(rows), 3)), rows])) if len(rows) else b"",
+        counts=from_ids(counts),
+        seen=b"\1" * len(counts),
+        keyframes=min(1, len(counts)),
+    )
+
+
+def map_name(text: str) -> str:
+    """Check the name of a map; raises SavedMapError."""
+    if re.fullmatch("[a-z][a-z0-9_]{0,31}", text) is None:
+        raise SavedMapError(
+            f"{text!r} is no name of a map: up to 32 small letters, digits and _, a letter first; "
+            "give one by --name"
+        )
+    return text
+
+
+def map_figures(saved: m.SavedMap) -> dict[str, Any]:
+    """Figures of a saved map for people and JSON: provenance, and each landmark with its own
+    standard deviations, the shared errors taken as zero.
+    """
+    numbers = ids(saved.ids, "ids").tolist()
+    points = floats(saved.means, "means").reshape(-1, 2).tolist()
+    covariance = unpacked(floats(saved.covariance, "covariance"), 2 * len(numbers))
+    sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 2).tolist()
+    counts = ids(saved.counts, "counts").tolist()
+    return {
+        "name": saved.name,
+        "frame": saved.frame,
+        "stamp_s": saved.stamp_ns * 1e-9,
+        "sets": [each.hex() for each in saved.sets],
+        "biases": list(saved.biases),
+        "software": saved.software,
+        "core": saved.core,
+        "landmarks": [
+            {
+                "landmark": number,
+                "x_m": x,
+                "y_m": y,
+                "sigma_x_m": sigma_x,
+                "sigma_y_m": sigma_y,
+                "submaps": count,
+            }
+            for number, (x, y), (sigma_x, sigma_y), count in zip(
+                numbers, points, sigmas, counts, strict=True
+            )
+        ],
+    }

@@ -1,0 +1,327 @@
+"""A saved map of an earlier day joins that of a later one, shows what moved, and may be wrong."""
+
+import dataclasses
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from teamslam.central.desk.verification.centre import recomputed_centre, recorded_map
+from teamslam.central.desk.verification.recorded import Recorded, identity
+from teamslam.central.node import CentralNode, make_centre
+from teamslam.sim.in_memory.air import Air
+from teamslam.sim.in_memory.peers import PeerTeam, peer_world
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.estimation.gaussian import unpacked
+from teamslam.team.estimation.map_joining.alignment import aligned, procrustes
+from teamslam.team.saved_map import SavedMapError, map_figures, read_map, submap_of, write_map
+from teamslam.team.store import SubmapStore
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats, ids
+from teamslam.team.wire.codec import WireError, decoded, encoded
+from tests.bits import SETS
+from tests.support import example
+
+ALL = ("*",)
+
+
+def day(seed, maps=(), *, moved=(), unknown=(), scenario="thesis-b", streams=None):
+    """The samples, the centre and the truth of one day; moved: landmarks by number."""
+    day_of = msgspec.structs.replace(load(scenario), seed=seed) if streams is None else scenario
+    if streams is None:
+        places = [list(each) for each in day_of.world.landmarks]
+        for number, (dx, dy) in dict(moved).items():
+            places[number - 1] = [places[number - 1][0] + dx, places[number - 1][1] + dy]
+        world = msgspec.structs.replace(
+            day_of.world, landmarks=tuple(map(tuple, places)), unknown_starts=unknown
+        )
+        day_of = msgspec.structs.replace(day_of, world=world)
+        streams = streams_of(day_of)
+    centres = []
+
+    def central(config, names) -> CentralNode:
+        centres.append(make_centre(config, names, maps=maps))
+        return centres[-1]
+
+    return list(run_team(day_of, streams, central=central)), centres[0], streams
+
+
+@cache
+def first_day():
+    samples, centre, _ = day(1)
+    return samples, centre.maps.fold.save_map("site")
+
+
+@cache
+def second_day(loaded=True, moved=(), unknown=()):
+    maps = [first_day()[1]] if loaded else []
+    return day(1001, maps, moved=moved, unknown=unknown)
+
+
+def errors(fused: m.FusedMap, streams: WorldStreams):
+    """RMSE [m] after alignment, and NEES per degree of freedom of the map's shape."""
+    found = ids(fused.ids, "ids")
+    truth = streams.landmarks[np.searchsorted(streams.landmark_ids, found)]
+    n = 2 * len(found)
+    P = unpacked(floats(fused.covariance, "covariance"), n)
+    means = floats(fused.means, "means").reshape(-1, 2)
+    fit = aligned(truth, 1e-12 * np.eye(n), means, P)
+    x, y, turn = procrustes(truth, means, np.ones(len(found)))
+    s, c = np.sin(turn), np.cos(turn)
+    off = truth - means @ np.array([[c, s], [-s, c]]) - [x, y]
+    return float(np.sqrt((off**2).sum(axis=1).mean())), fit.chi2 / fit.dof
+
+
+def changed(fused: m.FusedMap):
+    return {each.landmark: each for each in fused.changes if each.state != "unchanged"}
+
+
+def numbers(fused: m.FusedMap):
+    return fused.ids, fused.means, fused.covariance
+
+
+def test_a_second_day_joins_the_saved_map_and_is_more_accurate():
+    samples, _, streams = second_day()
+    alone = final_map(second_day(loaded=False)[0])
+    fused = final_map(samples)
+    assert {each.robot for each in fused.members} == {"map-site", "r1", "r2"}
+    assert [each.state for each in fused.changes] == ["unchanged"] * 18
+    assert errors(fused, streams)[0] < errors(alone, streams)[0]
+    assert fused.frame == alone.frame == "r1/1"
+    assert not [s for s in samples if s.key == ch.TRAJECTORY.key("map-site")]
+
+
+def test_without_a_known_start_the_teams_frame_is_that_of_the_saved_map():
+    samples, _, _ = second_day(unknown=ALL)
+    fused = final_map(samples)
+    assert fused.frame == "map-site/0"
+    means = floats(fused.means, "means") - floats(first_day()[1].means, "means")
+    assert np.abs(means).max() < 0.3
+
+
+@pytest.mark.parametrize("moved", [((15, (0.5, 0.0)),), tuple((k, (3.0, 2.0)) for k in (2, 8, 11))])
+def test_what_has_moved_is_found_and_nothing_else(moved):
+    """It is separated: both days stay right, and the map is as accurate as without the old one."""
+    samples, _, streams = second_day(moved=moved)
+    fused = final_map(samples)
+    found = changed(fused)
+    assert list(found) == [number for number, _ in moved]
+    for number, by in moved:
+        assert found[number].state == "moved"
+        off = np.array([found[number].dx, found[number].dy]) - by
+        assert (np.abs(off) < 4.0 * found[number].sigma).all()
+    rmse, nees = errors(fused, streams)
+    assert rmse < 0.1
+    assert nees < 2.0
+
+
+def test_a_landmark_that_is_not_seen_again_is_gone_and_is_not_saved_again():
+    samples, centre, _ = second_day(moved=((15, (-900.0, -900.0)),))
+    gone = changed(final_map(samples))
+    assert {number: each.state for number, each in gone.items()} == {15: "gone"}
+    assert gone[15].expected > 7.0
+    saved = centre.maps.fold.save_map("later")
+    assert 15 not in ids(saved.ids, "ids")
+
+
+def with_means(change):
+    saved = first_day()[1]
+    points = floats(saved.means, "means").reshape(-1, 2)
+    return msgspec.structs.replace(saved, means=from_floats(change(points)))
+
+
+def elsewhere(points):
+    return np.random.default_rng(1).uniform(0.0, 100.0, points.shape)
+
+
+@pytest.mark.parametrize("change", [lambda points: points * [1.0, -1.0], elsewhere])
+def test_a_mirrored_map_or_one_of_another_site_is_refused_and_changes_nothing(change):
+    samples, _, _ = day(1001, [with_means(change)])
+    fused = final_map(samples)
+    assert numbers(fused) == numbers(final_map(second_day(loaded=False)[0]))
+    assert any("the saved map site not joined" in each for each in fused.reasons)
+
+
+def test_a_map_of_which_half_the_landmarks_have_moved_is_withdrawn_and_changes_nothing():
+    moved = tuple((k, (3.0 + k, 5.0 - k)) for k in range(1, 10))
+    samples, centre, _ = second_day(moved=moved)
+    fused = final_map(samples)
+    assert numbers(fused) == numbers(final_map(second_day(loaded=False, moved=moved)[0]))
+    words = " ".join((*centre.warnings, *fused.reasons))
+    assert "elsewhere" in words or "disagree" in words
+
+
+def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
+    samples, _, _ = second_day()
+    _, centre, _ = second_day(loaded=False)
+    fold = type(centre.maps.fold)(centre.config, centre.config_digest)
+    recorded = Recorded()
+    recorded.take_all(samples)
+    for messages in recorded.measurements.values():
+        fold.store.add(messages[0])
+    for submaps in recorded.submaps().values():
+        for sequence in sorted(submaps):
+            fold.store.add(submaps[sequence])
+    fold.store.add(first_day()[1])
+    joined = fold.make_map("final")[-1].message
+    assert numbers(joined) == numbers(final_map(samples))
+    order = m.Withdrawal(stamp_ns=0, robot="map-site", by="operator", reason="old")
+    fold.store.add(order)
+    without = fold.make_map("final")[-1].message
+    assert numbers(without) == numbers(final_map(second_day(loaded=False)[0]))
+    assert without.withdrawn == ("map-site",)
+
+
+def test_every_map_is_computed_again_from_the_log_and_the_saved_one_is_the_centres():
+    samples, centre, _ = second_day()
+    recorded = Recorded()
+    recorded.take_all(samples)
+    computed = recomputed_centre(recorded)
+    maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
+    for each in maps:
+        again = computed[identity(each.sample.key, each.message)]
+        assert encoded(again) == each.sample.payload
+    final_map(samples)
+    assert recorded_map(recorded, "both") == centre.maps.fold.save_map("both")
+
+
+def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
+    """Each day's map contains the earlier ones: fewer errors, a covariance that fits them."""
+    figures, sizes = [], []
+    for seed in (1, 2):
+        maps = []
+        for each in range(4):
+            samples, centre, streams = day(seed + 1000 * each, maps, unknown=ALL if maps else ())
+            maps = [centre.maps.fold.save_map(f"day{each}")]
+            figures.append((each, *errors(final_map(samples), streams)))
+            sizes.append(len(maps[0].covariance))
+        assert len(maps[0].sets) == 4
+    assert len(set(sizes)) == 1
+    first = np.mean([rmse for each, rmse, _ in figures if each == 0])
+    last = np.mean([rmse for each, rmse, _ in figures if each == 3])
+    assert last < 0.7 * first
+    assert 0.6 < np.mean([nees for each, _, nees in figures if each]) < 1.4
+
+
+def test_peers_spread_a_saved_map_that_one_of_them_has_loaded():
+    scenario = load("thesis-b")
+    scenario = msgspec.structs.replace(
+        scenario, seed=7, world=msgspec.structs.replace(scenario.world, steps=60)
+    )
+    team = PeerTeam(scenario, Air())
+    team.seats["r2"].node.load_maps([first_day()[1]])
+    list(team.run(peer_world(scenario, streams_of(scenario))))
+    finals = [encoded(seat.node.final) for seat in team.seats.values()]
+    assert finals[0] == finals[1]
+    assert "map-site" in {each.robot for each in decoded(finals[0], m.FusedMap).members}
+
+
+def test_the_file_is_read_as_written_and_a_wrong_one_is_named_with_the_remedy(tmp_path):
+    saved, path = first_day()[1], tmp_path / "site.map"
+    write_map(path, saved)
+    assert read_map(path) == saved
+    figures = map_figures(saved)
+    assert [each["landmark"] for each in figures["landmarks"]] == list(range(1, 19))
+    payload = path.read_bytes()
+    for content, words in (
+        (b"", "cut off"),
+        (b"landmark,x,y\n", "no saved map"),
+        (encoded(final_map(first_day()[0])), "no saved map"),
+        (payload.replace(b"saved_map/1", b"saved_map/9"), "another version"),
+        (payload[:-200], "cut off"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(SavedMapError, match=words) as caught:
+            read_map(path)
+        assert str(path) in str(caught.value)
+    with pytest.raises(SavedMapError, match="cannot be read"):
+        read_map(tmp_path / "none.map")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        (
+            {"covariance": from_floats([1.0, 0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0])},
+            "positive",
+        ),
+        ({"means": from_floats([1.0, np.nan, 0.0, 0.0])}, "finite"),
+        ({"sensitivity": b""}, "length"),
+        ({"counts": bytes(8)}, "length"),
+        ({"sets": ()}, "bounds"),
+        ({"name": "A map"}, "wrong field"),
+    ],
+)
+def test_the_door_refuses_an_unsound_map(fields, words):
+    with pytest.raises(WireError, match=words):
+        decoded(encoded(example(m.SavedMap, **fields)), m.SavedMap)
+
+
+def test_two_maps_with_a_day_in_common_would_count_it_twice():
+    saved = first_day()[1]
+    later = msgspec.structs.replace(
+        saved, name="later", sets=tuple(sorted((*saved.sets, b"8 bytes!")))
+    )
+    store = SubmapStore()
+    assert store.add(saved) is None
+    assert store.add(saved) is None
+    assert "in common" in str(store.add(later))
+    other = msgspec.structs.replace(saved, means=from_floats(floats(saved.means, "means") + 1.0))
+    assert "differs" in str(store.add(other))
+    assert store.arrived == 1
+
+
+def test_the_submap_of_a_map_has_landmarks_and_no_motion():
+    submap = decoded(encoded(msgspec.structs.replace(submap_of(first_day()[1]), robot="r1")))
+    assert isinstance(submap, m.Submap)
+    assert not floats(submap.mean, "mean")[:3].any()
+
+
+def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> WorldStreams:
+    """The measurements of a time; `begins`: with the known starts."""
+    streams = []
+    for each in world.streams:
+        of = each.intervals
+        inside = (of.end_ns - of.duration_ns >= first_ns) & (of.end_ns <= last_ns)
+        rows = {
+            field.name: getattr(of, field.name)[inside]
+            for field in dataclasses.fields(of)
+            if isinstance(getattr(of, field.name), np.ndarray)
+        }
+        start_ns = each.start_ns if begins else int((of.end_ns - of.duration_ns)[inside][0])
+        seen = [
+            found.only(*np.searchsorted(found.stamps_ns, [start_ns, last_ns]).tolist())
+            for found in (each.landmark_detections, each.teammate_detections)
+        ]
+        streams.append(
+            dataclasses.replace(
+                each,
+                start_ns=start_ns,
+                start=each.start if begins else None,
+                intervals=dataclasses.replace(of, **rows),
+                landmark_detections=seen[0],
+                teammate_detections=seen[1],
+            )
+        )
+    return dataclasses.replace(world, streams=tuple(streams))
+
+
+@pytest.mark.skipif(not (SETS / "MRCLAM_Dataset1.zip").is_file(), reason="the data are not here")
+def test_two_halves_of_a_real_session_give_the_map_of_one_session():
+    scenario = with_options(load("utias"), dataset=SETS / "MRCLAM_Dataset1.zip", robots=3)
+    world = streams_of(scenario)
+    first_ns = min(first for first, _ in world.spans_ns.values())
+    at = [first_ns + each * 250_000_000_000 for each in range(3)]
+    halves = part(world, at[0], at[1], begins=True), part(world, at[1], at[2], begins=False)
+    _, centre, _ = day(1, scenario=scenario, streams=halves[0])
+    saved = centre.maps.fold.save_map("first")
+    samples, _, _ = day(1, [saved], scenario=scenario, streams=halves[1])
+    whole, _, _ = day(1, scenario=scenario, streams=part(world, at[0], at[2], begins=True))
+    assert not changed(final_map(samples))
+    assert final_map(samples).frame == "map-first/0"
+    assert errors(final_map(samples), world)[0] < 1.05 * errors(final_map(whole), world)[0]
