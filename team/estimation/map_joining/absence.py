@@ -11,13 +11,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
 from teamslam.team.estimation.association.visibility import OVERLOOKED
 from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.submap_graph import Joined
+from teamslam.team.shapes import Float
 
 BINS = 8
 """Number of distances at which the probability of an observation is learnt."""

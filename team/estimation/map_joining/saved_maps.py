@@ -17,7 +17,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -28,6 +27,7 @@ from teamslam.team.estimation.map_joining.alignment import aligned
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import Graph, Joined, tied, with_former
 from teamslam.team.estimation.se2 import transformed
+from teamslam.team.shapes import Bool, Float
 
 FALSE_ALARM = 1e-3
 """Probability that a landmark which has not moved is taken for moved, in the final map."""
