@@ -16,7 +16,7 @@ import typer
 from teamslam.sim.cli.help import NETWORK, RARE
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, load, loads
-from teamslam.sim.world.config import UnlabelledWorld
+from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import Estimator, FusionRule
 from teamslam.team.wire.text import lines, one_line
 
@@ -128,7 +128,8 @@ FusionOption = Annotated[
 Dataset = Annotated[
     Path | None,
     typer.Option(
-        help="A data set: a folder of CSV tables, a ROS 2 bag, or a UTIAS set.", metavar="SET"
+        help="A data set: a folder of CSV tables, a ROS 2 bag, a UTIAS set, or a graph (isam, "
+        "g2o, pyfg).", metavar="SET"
     ),
 ]
 SpeedText = Annotated[
@@ -141,7 +142,7 @@ SpeedText = Annotated[
 
 def check_pieces(scenario: Scenario) -> None:
     """Check that only a one-robot data set's log is cut."""
-    if not isinstance(scenario.world, UnlabelledWorld):
+    if not isinstance(scenario.world, UnlabelledWorld | GraphWorld):
         fail(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
             "--dataset, or --robots for other worlds",

@@ -3,15 +3,17 @@
 from pathlib import Path
 from typing import Literal
 
-from teamslam.sim.datasets import folder_files, tables, unlabelled
+from teamslam.sim.datasets import folder_files, graph, tables, unlabelled
 from teamslam.sim.datasets.tables import DatasetError
 
-Kind = Literal["utias", "folder", "unlabelled"]
+Kind = Literal["utias", "folder", "unlabelled", "graph"]
 UTIAS_MARKER = "Barcodes.dat"
 
 
 def kind_of(path: str | Path) -> Kind:
-    """UTIAS files, CSV tables by robot, or detections; raises DatasetError for others."""
+    """UTIAS files, CSV tables by robot, detections, or a graph; raises DatasetError for others."""
+    if graph.is_graph(path):
+        return "graph"
     if unlabelled.is_unlabelled(path):
         return "unlabelled"
     if folder_files.has_tables(path):

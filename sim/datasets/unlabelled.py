@@ -297,10 +297,8 @@ def _piece(
     # A scan at an interval's end belongs to it; one at the first start to the first.
     first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
     mine = seen.only(int(first), int(last))
-    gps_ns, gps = whole.positions_ns, whole.positions
-    if gps_ns is not None and gps is not None:
-        inside = (gps_ns >= begin_ns) & (gps_ns <= end_ns)
-        gps_ns, gps = gps_ns[inside] - back, gps[inside]
+    truth_ns, truth = _within(whole.truth_ns, whole.truth, begin_ns, end_ns, back)
+    gps_ns, gps = _within(whole.positions_ns, whole.positions, begin_ns, end_ns, back)
     return RobotStream(
         robot=names[index],
         start_ns=zero_ns,
@@ -309,7 +307,23 @@ def _piece(
         landmark_detections=replace(mine, stamps_ns=mine.stamps_ns - back),
         teammate_detections=_nothing(),
         teammates=names,
+        truth_ns=truth_ns,
+        truth=truth,
         notes=(*whole.notes, f"it begins {back * 1e-9:.2f} s into the log"),
         positions_ns=gps_ns,
         positions=gps,
     )
+
+
+def _within(
+    stamps_ns: Int64[np.ndarray, " G"] | None,
+    values: Float[np.ndarray, "G n"] | None,
+    begin_ns: int,
+    end_ns: int,
+    back_ns: int,
+) -> tuple[Int64[np.ndarray, " K"] | None, Float[np.ndarray, "K n"] | None]:
+    """Values of a time, with their stamps moved back."""
+    if stamps_ns is None or values is None:
+        return None, None
+    inside = (stamps_ns >= begin_ns) & (stamps_ns <= end_ns)
+    return stamps_ns[inside] - back_ns, values[inside]

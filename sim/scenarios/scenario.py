@@ -119,9 +119,13 @@ def with_options(
         from teamslam.sim.datasets.folder_files import robots_of
 
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
+    if world["kind"] == "graph" and dataset is not None and robots is None:
+        from teamslam.sim.datasets.graph import robot_count
+
+        robots = robot_count(world["path"])
     if robots is not None:
         fields["robots"] = _counted(fields["robots"], robots)
-    if world["kind"] == "unlabelled":  # its log is cut into r1, r2, …
+    if world["kind"] in ("unlabelled", "graph"):  # its log is cut into r1, r2, …
         numbered = enumerate(fields["robots"], start=1)
         fields["robots"] = [robot | {"id": f"r{number}"} for number, robot in numbered]
     return _converted(fields)

@@ -8,6 +8,7 @@ import msgspec
 
 from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_files import robots_of, scenario_in
+from teamslam.sim.datasets.graph import graph_world
 from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
 from teamslam.sim.datasets.tables import open_data_set
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
@@ -15,7 +16,13 @@ from teamslam.sim.datasets.utias import utias
 from teamslam.sim.datasets.utias_log import present_robots
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.config import FolderWorld, LiveWorld, SimulatedWorld, UnlabelledWorld
+from teamslam.sim.world.config import (
+    FolderWorld,
+    GraphWorld,
+    LiveWorld,
+    SimulatedWorld,
+    UnlabelledWorld,
+)
 from teamslam.sim.world.identities import Hiding, with_hidden_identities
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
@@ -43,6 +50,8 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     if isinstance(scenario.world, UnlabelledWorld):
         return unlabelled(scenario.world, len(scenario.robots))
+    if isinstance(scenario.world, GraphWorld):
+        return graph_world(scenario.world, len(scenario.robots))
     if isinstance(scenario.world, FolderWorld):
         return folder(scenario.world, scenario.robots)
     if isinstance(scenario.world, LiveWorld):
@@ -56,6 +65,8 @@ def _with_identities(scenario: Scenario) -> WorldStreams:
 def scenario_beside(path: str | Path) -> str:
     """Scenario of a data set, or the built-in one for its kind."""
     kind = kind_of(path)
+    if kind == "graph":
+        return "graph"
     own = scenario_in(path)
     if own is not None:
         return str(own)
@@ -70,7 +81,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
     """
     world = scenario.world
-    if isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld) or not world.path:
+    if isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld | GraphWorld) or not world.path:
         return scenario, None
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))

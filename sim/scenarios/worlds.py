@@ -4,6 +4,7 @@ from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, ty
 from teamslam.sim.scenarios.document import Fields, builtin_names
 from teamslam.sim.world.config import (
     FolderWorld,
+    GraphWorld,
     LiveWorld,
     SimulatedWorld,
     UnlabelledWorld,
@@ -17,6 +18,7 @@ WORLDS: dict[str, type[World]] = {
     "folder": FolderWorld,
     "live": LiveWorld,
     "unlabelled": UnlabelledWorld,
+    "graph": GraphWorld,
 }
 
 

@@ -169,7 +169,23 @@ class UnlabelledWorld(
     identities: Identities = "hidden"
 
 
-World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld
+class GraphWorld(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="graph"
+):
+    """Landmark graph in a text file of isam, TORO, g2o or PyFactorGraph.
+
+    path: file. More robots than the file's one each drive a piece of it, of which the first starts
+    where the file does and the others do not know where. unknown_starts: as in a simulated world.
+    duration_s: limit from the first measurement.
+    """
+
+    path: str = ""
+    unknown_starts: tuple[str, ...] = ()
+    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
+    identities: Identities = "known"
+
+
+World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld | GraphWorld
 
 
 def starts_unknown(world: World, robot: str) -> bool:

@@ -1,0 +1,184 @@
+"""A planar landmark graph: poses of robots, odometry between them, and points measured from them.
+
+The readers of its text formats (`graph_lines`, `pyfg`) make it, the writers (`graph_writer`) write it,
+and `streams_of_graph` turns it into measurements: odometry edge k of a robot is an increment, the
+points from pose k are one scan at that pose's time.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
+from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.se2 import Point, Pose, compose
+
+STEP_NS = 1_000_000_000
+"""Time between two poses [ns] of a graph without times."""
+Key = tuple[str, int]
+"""Robot and number of a pose."""
+
+
+@dataclass(frozen=True)
+class PoseEdge:
+    """Pose `end` in the frame of pose `start`; covariance of an error in the frame of the end."""
+
+    start: Key
+    end: Key
+    motion: Pose
+    covariance: Matrix
+
+
+@dataclass(frozen=True)
+class PointEdge:
+    """Landmark seen from a pose, as a point in its frame."""
+
+    pose: Key
+    landmark: int
+    point: Point
+    covariance: Matrix
+
+
+@dataclass
+class FactorGraph:
+    """Edges in the order of the file, and vertices where they are given.
+
+    poses, landmarks: initial values, or with are_true true ones. priors: initial poses with their
+    covariance, None: exact. stamps_ns: times of the poses, if the format has them. unused: number of
+    lines of each keyword that no measurement here is.
+    """
+
+    name: str
+    pose_edges: list[PoseEdge] = field(default_factory=list)
+    point_edges: list[PointEdge] = field(default_factory=list)
+    poses: dict[Key, Pose] = field(default_factory=dict)
+    landmarks: dict[int, Point] = field(default_factory=dict)
+    priors: dict[Key, tuple[Pose, Matrix | None]] = field(default_factory=dict)
+    stamps_ns: dict[Key, int] = field(default_factory=dict)
+    unused: dict[str, int] = field(default_factory=dict)
+    are_true: bool = False
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Robots that have poses."""
+        return tuple(sorted({edge.start[0] for edge in self.pose_edges}))
+
+    def chain(self, robot: str) -> tuple[list[Key], list[PoseEdge]]:
+        """A robot's poses by number, and the odometry edges between neighbours.
+
+        Raises DatasetError for neighbours without an edge.
+        """
+        keys = {key for e in self.pose_edges for key in (e.start, e.end) if key[0] == robot}
+        keys |= {edge.pose for edge in self.point_edges if edge.pose[0] == robot}
+        ordered = sorted(keys)
+        links: dict[tuple[Key, Key], PoseEdge] = {}
+        for edge in self.pose_edges:
+            links.setdefault((edge.start, edge.end), edge)
+        for before, after in pairwise(ordered):
+            if (before, after) not in links:
+                raise DatasetError(
+                    f"{self.name}: no edge from pose {_shown(before)} to pose {_shown(after)}: a "
+                    "robot's odometry links each pose to the next; number the poses in order, or "
+                    "cut the file there"
+                )
+        return ordered, [links[pair] for pair in pairwise(ordered)]
+
+
+def _shown(key: Key) -> str:
+    return f"{key[0]}{key[1]}"
+
+
+def dead_reckoned(graph: FactorGraph) -> None:
+    """Place poses without a vertex by odometry, and landmarks without one by their first edge."""
+    for robot in graph.robots:
+        keys, edges = graph.chain(robot)
+        pose = graph.poses.setdefault(keys[0], np.zeros(3))
+        for edge in edges:
+            pose = graph.poses.setdefault(edge.end, compose(pose, edge.motion))
+    for seen in graph.point_edges:
+        at = np.array([*seen.point, 0.0])
+        graph.landmarks.setdefault(seen.landmark, compose(graph.poses[seen.pose], at)[:2])
+
+
+def streams_of_graph(graph: FactorGraph) -> WorldStreams:
+    """Measurements of the robots, named r1, r2, … in their order; raises DatasetError.
+
+    The first robot starts at its prior, at its first vertex, or at the origin; the others at their
+    priors, if any.
+    """
+    if not graph.point_edges:
+        raise DatasetError(
+            f"{graph.name}: no landmark is measured in it (LANDMARK, EDGE_SE2_XY), and loop closures "
+            "between poses are not used: give a graph with landmarks"
+        )
+    robots = graph.robots
+    names = tuple(f"r{number}" for number in range(1, len(robots) + 1))
+    found = [_stream(graph, robot, name, names) for robot, name in zip(robots, names, strict=True)]
+    placed = graph.landmarks if graph.are_true else {}
+    ids = sorted({edge.landmark for edge in graph.point_edges} & set(placed))
+    closures = len(graph.pose_edges) - sum(len(each.intervals.end_ns) for each in found)
+    notes = [
+        count_note(closures, "edge", "between poses not used: no odometry"),
+        *(f"{keyword}: {count_note(n, 'line', 'not used')}" for keyword, n in graph.unused.items()),
+    ]
+    if robots != ("",):
+        pairs = zip(names, robots, strict=True)
+        notes.append(", ".join(f"{name} is {robot} of the file" for name, robot in pairs))
+    return WorldStreams(
+        streams=tuple(found),
+        landmark_ids=np.array(ids, dtype=np.uint32),
+        landmarks=np.array([placed[i] for i in ids]) if ids else None,
+        source=f"data set {graph.name}",
+        notes=tuple(note for note in notes if note),
+    )
+
+
+def _stream(graph: FactorGraph, robot: str, name: str, names: tuple[str, ...]) -> RobotStream:
+    keys, edges = graph.chain(robot)
+    stamps = np.arange(len(keys), dtype=np.int64) * STEP_NS
+    if all(key in graph.stamps_ns for key in keys):
+        stated = np.array([graph.stamps_ns[key] for key in keys])
+        stamps = stated if (np.diff(stated) > 0).all() else stamps
+    at = dict(zip(keys, stamps.tolist(), strict=True))
+    scans, dropped = _scans([edge for edge in graph.point_edges if edge.pose[0] == robot], at)
+    true = [graph.poses[key] for key in keys if graph.are_true and key in graph.poses]
+    has_truth = len(true) == len(keys)
+    start = graph.priors.get(keys[0])
+    if start is None and name == names[0]:
+        start = graph.poses.get(keys[0], np.zeros(3)), None
+    motions = np.array([edge.motion for edge in edges])
+    covariances = np.array([edge.covariance for edge in edges])
+    return RobotStream(
+        robot=name,
+        start_ns=int(stamps[0]),
+        start=None if start is None else StartPose(*start),
+        intervals=moved(stamps[1:], np.diff(stamps), motions, covariances),
+        landmark_detections=scans.grouped(),
+        teammate_detections=_scans([], at)[0].grouped(),
+        teammates=names,
+        truth_ns=stamps if has_truth else None,
+        truth=np.array(true) if has_truth else None,
+        notes=(dropped,) if dropped else (),
+    )
+
+
+def _scans(edges: Sequence[PointEdge], at: Mapping[Key, int]) -> tuple[Scans, str]:
+    """Points by time, each landmark once per pose, and a note on others."""
+    edges = sorted(edges, key=lambda edge: at[edge.pose])
+    points = np.array([edge.point for edge in edges]).reshape(-1, 2)
+    scans = Scans(
+        stamps_ns=np.array([at[edge.pose] for edge in edges], dtype=np.int64),
+        ids=np.array([edge.landmark for edge in edges], dtype=np.uint32),
+        ranges=np.hypot(*points.T),
+        bearings=on_circle(np.arctan2(points[:, 1], points[:, 0])),
+        points=points,
+        covariances=np.array([e.covariance[np.triu_indices(2)] for e in edges]).reshape(-1, 3),
+    )
+    single = first_of_each(scans.stamps_ns, scans.ids, scans.ranges > 0.0)
+    lost = count_note(int((~single).sum()), "point", "dropped: repeated, or at the pose itself")
+    return scans.where(single), lost
