@@ -56,6 +56,9 @@ class Format(StrEnum):
     TUM = "tum"
     UTIAS = "utias"
     ROSBAG2 = "rosbag2"
+    G2O = "g2o"
+    ISAM = "isam"
+    PYFG = "pyfg"
 
 
 @app.command(cls=Command, epilog="teamslam log info runs/first")
@@ -179,16 +182,15 @@ def export(
         typer.Option(
             "--format",
             help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias), "
-            "a ROS 2 bag of poses, paths and maps (rosbag2).",
+            "a ROS 2 bag of poses, paths and maps (rosbag2), a landmark graph (g2o, isam, pyfg).",
         ),
     ] = Format.CSV,
     channels: ChannelNames = None,
 ) -> None:
-    """Write a log as tables, its paths for evo, or its measurements and truth as a UTIAS data
-    set.
-    """
+    """Write a log as tables, its paths for evo, or its measurements as a data set or graph."""
     from teamslam.central.desk.export.rosbag2 import export_rosbag2
     from teamslam.central.desk.export.tum import export_tum
+    from teamslam.sim.recorded.graph_files import FORMATS, export_graph
     from teamslam.sim.recorded.utias_set import export_utias
     from teamslam.team.recording.reader import open_log
 
@@ -197,11 +199,14 @@ def export(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
     warn_of_holes(opened)
-    if form in (Format.UTIAS, Format.TUM, Format.ROSBAG2):
+    if form in (Format.UTIAS, Format.TUM, Format.ROSBAG2, *FORMATS):
         if channels is not None:
             fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)
-        if form is Format.TUM:
-            for path in export_tum(opened, output):
+        if form is Format.TUM or form in FORMATS:
+            is_tum = form is Format.TUM
+            for path in (
+                export_tum(opened, output) if is_tum else export_graph(opened, output, form)
+            ):
                 typer.echo(path)
             return
         if form is Format.ROSBAG2:

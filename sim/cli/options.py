@@ -129,7 +129,8 @@ Dataset = Annotated[
     Path | None,
     typer.Option(
         help="A data set: a folder of CSV tables, a ROS 2 bag, a UTIAS set, or a graph (isam, "
-        "g2o, pyfg).", metavar="SET"
+        "g2o, pyfg).",
+        metavar="SET",
     ),
 ]
 SpeedText = Annotated[

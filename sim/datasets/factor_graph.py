@@ -1,12 +1,11 @@
 """A planar landmark graph: poses of robots, odometry between them, and points measured from them.
 
-The readers of its text formats (`graph_lines`, `pyfg`) make it, the writers (`graph_writer`) write it,
-and `streams_of_graph` turns it into measurements: odometry edge k of a robot is an increment, the
-points from pose k are one scan at that pose's time.
+`graph_lines` and `pyfg` read it from text, `graph_writer` writes it, and `streams_of_graph` turns
+it into measurements: an odometry edge is an increment, the points from a pose are one scan.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,11 +14,12 @@ from jaxtyping import Float
 from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
-from teamslam.team.estimation.gaussian import Matrix
-from teamslam.team.estimation.se2 import Point, Pose, compose
 
 STEP_NS = 1_000_000_000
 """Time between two poses [ns] of a graph without times."""
+Pose = Float[np.ndarray, "3"]
+Point = Float[np.ndarray, "2"]
+Matrix = Float[np.ndarray, "n n"]
 Key = tuple[str, int]
 """Robot and number of a pose."""
 
@@ -49,8 +49,8 @@ class FactorGraph:
     """Edges in the order of the file, and vertices where they are given.
 
     poses, landmarks: initial values, or with are_true true ones. priors: initial poses with their
-    covariance, None: exact. stamps_ns: times of the poses, if the format has them. unused: number of
-    lines of each keyword that no measurement here is.
+    covariance, None: exact. stamps_ns: times of the poses, if the format has them. unused: numbers
+    of lines by keyword that are not read.
     """
 
     name: str
@@ -93,16 +93,41 @@ def _shown(key: Key) -> str:
     return f"{key[0]}{key[1]}"
 
 
+def split_at_gaps(graph: FactorGraph) -> FactorGraph:
+    """Name robots of a graph whose poses have numbers alone: one ends where no edge leads on."""
+    links = {(edge.start, edge.end) for edge in graph.pose_edges}
+    keys = sorted({key for link in links for key in link} | {e.pose for e in graph.point_edges})
+    ends = [after for before, after in pairwise(keys) if (before, after) not in links]
+    if not ends:
+        return graph
+    robots = np.searchsorted([number for _, number in ends], [k for _, k in keys], side="right")
+    new = {key: (f"{robot + 1}:", key[1]) for key, robot in zip(keys, robots, strict=True)}
+    return replace(
+        graph,
+        pose_edges=[replace(e, start=new[e.start], end=new[e.end]) for e in graph.pose_edges],
+        point_edges=[replace(e, pose=new[e.pose]) for e in graph.point_edges],
+        poses={new[key]: pose for key, pose in graph.poses.items() if key in new},
+        priors={new[key]: prior for key, prior in graph.priors.items() if key in new},
+    )
+
+
 def dead_reckoned(graph: FactorGraph) -> None:
     """Place poses without a vertex by odometry, and landmarks without one by their first edge."""
     for robot in graph.robots:
         keys, edges = graph.chain(robot)
         pose = graph.poses.setdefault(keys[0], np.zeros(3))
         for edge in edges:
-            pose = graph.poses.setdefault(edge.end, compose(pose, edge.motion))
+            heading = on_circle(pose[2:] + edge.motion[2:])
+            end = np.concatenate((_placed(pose, edge.motion[:2]), heading))
+            pose = graph.poses.setdefault(edge.end, end)
     for seen in graph.point_edges:
-        at = np.array([*seen.point, 0.0])
-        graph.landmarks.setdefault(seen.landmark, compose(graph.poses[seen.pose], at)[:2])
+        graph.landmarks.setdefault(seen.landmark, _placed(graph.poses[seen.pose], seen.point))
+
+
+def _placed(pose: Pose, point: Point) -> Point:
+    """Point in the frame of a pose."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.asarray(pose[:2] + np.array([[c, -s], [s, c]]) @ point)
 
 
 def streams_of_graph(graph: FactorGraph) -> WorldStreams:
@@ -113,8 +138,8 @@ def streams_of_graph(graph: FactorGraph) -> WorldStreams:
     """
     if not graph.point_edges:
         raise DatasetError(
-            f"{graph.name}: no landmark is measured in it (LANDMARK, EDGE_SE2_XY), and loop closures "
-            "between poses are not used: give a graph with landmarks"
+            f"{graph.name}: no landmark is measured in it (LANDMARK, EDGE_SE2_XY), and "
+            "loop closures between poses are not used: give a graph with landmarks"
         )
     robots = graph.robots
     names = tuple(f"r{number}" for number in range(1, len(robots) + 1))

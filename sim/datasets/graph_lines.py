@@ -8,8 +8,8 @@ g2o       VERTEX_SE2 i x y theta; VERTEX_XY landmark x y; FIX i
           EDGE_SE2 i j x y theta  I_xx I_xy I_xt I_yy I_yt I_tt
           EDGE_SE2_XY i landmark x y  I_xx I_xy I_yy
 
-A file with VERTEX2 is TORO's. isam and TORO state errors in the axes of the first pose, g2o in those
-of the measured second one. Weights may be left out: then they are 1.
+A file with VERTEX2 is TORO's. isam and TORO state errors in the axes of the first pose, g2o in
+those of the measured second one. Weights may be left out: then they are 1.
 https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 """
 
@@ -20,10 +20,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from teamslam.sim.datasets.factor_graph import FactorGraph, PointEdge, PoseEdge, dead_reckoned
+from teamslam.sim.datasets.factor_graph import (
+    FactorGraph,
+    Key,
+    Matrix,
+    PointEdge,
+    PoseEdge,
+    dead_reckoned,
+    split_at_gaps,
+)
 from teamslam.sim.datasets.tables import LARGEST, DatasetError
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.gaussian import Matrix
 
 POSES = ("VERTEX_SE2", "VERTEX2")
 POSE_EDGES = ("EDGE_SE2", "EDGE2", "ODOMETRY")
@@ -67,7 +74,7 @@ class Line(NamedTuple):
         shown = " ".join([self.keyword, *self.words])[:80]
         return DatasetError(f"{self.name}, line {self.number}: {defect}: `{shown}`")
 
-    def index(self, k: int) -> int:
+    def identity(self, k: int) -> int:
         """Word k as an identity."""
         word = self.words[k]
         if not (word.isascii() and word.isdigit() and int(word) < UNNAMED):
@@ -122,6 +129,7 @@ def read_graph(path: Path) -> FactorGraph:
 def _read(path: Path) -> FactorGraph:
     graph = FactorGraph(path.stem)
     found = list(lines_of(path))
+    fixed: list[Key] = []
     is_toro = any(line.keyword == "VERTEX2" for line in found)
     for line in found:
         if line.keyword not in COUNTS:
@@ -133,21 +141,24 @@ def _read(path: Path) -> FactorGraph:
                 f"{len(line.words)} words after {line.keyword}, {indices + count} expected "
                 f"({FORMS[line.keyword]}): complete the line, or take it out"
             )
-        first, values = ("", line.index(0)), line.values(indices)
+        first, values = ("", line.identity(0)), line.values(indices)
         if line.keyword in POSES:
             graph.poses[first] = values
+        elif line.keyword == "FIX":
+            fixed.append(first)
         elif line.keyword == "VERTEX_XY":
             graph.landmarks[first[1]] = values
         elif line.keyword in POSE_EDGES:
             covariance = _covariance(line, values[3:], 3, is_toro=is_toro)
             if line.keyword != "EDGE_SE2":
                 covariance = turned(covariance, values[2])
-            edge = PoseEdge(first, ("", line.index(1)), values[:3], covariance)
+            edge = PoseEdge(first, ("", line.identity(1)), values[:3], covariance)
             graph.pose_edges.append(edge)
         elif line.keyword in POINT_EDGES:
             covariance = _covariance(line, values[2:], 2, is_toro=is_toro)
-            graph.point_edges.append(PointEdge(first, line.index(1), values[:2], covariance))
-    return graph
+            graph.point_edges.append(PointEdge(first, line.identity(1), values[:2], covariance))
+    graph.priors = {key: (graph.poses[key], None) for key in fixed if key in graph.poses}
+    return split_at_gaps(graph)
 
 
 def _leave_out(line: Line, graph: FactorGraph) -> None:

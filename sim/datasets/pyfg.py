@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from teamslam.sim.datasets.factor_graph import FactorGraph, Key, PointEdge, PoseEdge
+from teamslam.sim.datasets.factor_graph import FactorGraph, Key, Matrix, PointEdge, PoseEdge
 from teamslam.sim.datasets.graph_lines import SPATIAL, Line, lines_of
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.gaussian import Matrix
 
 FORMS = {
     "VERTEX_SE2": (2, 3, "time pose x y theta"),
@@ -69,9 +68,7 @@ def _take(line: Line, values: Float[np.ndarray, " n"], graph: FactorGraph) -> No
             graph.priors[_key(line, 1)] = values[:3], _matrix(line, values[3:], 3)
         case "EDGE_SE2":
             start, end = _key(line, 1), _key(line, 2)
-            graph.pose_edges.append(
-                PoseEdge(start, end, values[:3], _matrix(line, values[3:], 3))
-            )
+            graph.pose_edges.append(PoseEdge(start, end, values[:3], _matrix(line, values[3:], 3)))
         case _:
             pose, landmark = _key(line, 1), _key(line, 2)[1]
             graph.point_edges.append(

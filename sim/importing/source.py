@@ -11,6 +11,7 @@ import tomli_w
 from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
 from teamslam.sim.datasets.folder_tables import POSES
 from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.bag import import_bag
@@ -70,7 +71,7 @@ def import_data(request: Request, folder: Path) -> Report:
     bags = [path for path in request.sources if is_bag(path) and not is_own_log(path)]
     if bags:
         return _bags(request, folder)
-    if source.is_file() and source.suffix in (".csv", ".txt", ".tsv"):
+    if source.is_file() and source.suffix in (".csv", ".txt", ".tsv") and not is_graph(source):
         return _csv({request.robot or ONE_ROBOT: list(request.sources)}, request, folder)
     if source.is_dir() and (request.columns or len(request.sources) > 1 or _is_foreign(source)):
         return _csv(_files_by_robot(request), request, folder)

@@ -81,7 +81,10 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
     """
     world = scenario.world
-    if isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld | GraphWorld) or not world.path:
+    if (
+        isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld | GraphWorld)
+        or not world.path
+    ):
         return scenario, None
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))

@@ -26,18 +26,11 @@ def batch_reference(
     log: Source,
     noise: Noise = "white",
     json_file: JsonFile = None,
-    g2o: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the problem to this file for other optimisers, without solving it."
-        ),
-    ] = None,
 ) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from teamslam.sim.cli.importing import readable
+    from teamslam.sim.recorded.chains import BatchReferenceError
     from teamslam.sim.recorded.data_set import log_or_run
-    from teamslam.sim.studies.batch_reference.g2o import g2o_lines
-    from teamslam.sim.studies.batch_reference.measurements import BatchReferenceError
     from teamslam.sim.studies.batch_reference.reference import batch_map
     from teamslam.team.recording.reader import Log
 
@@ -45,14 +38,6 @@ def batch_reference(
         run = log_or_run(source)
     if isinstance(run, Log):
         warn_of_holes(run)
-    if g2o is not None:
-        try:
-            lines = list(g2o_lines(run.samples()))
-        except BatchReferenceError as error:
-            fail(str(error), FAILED)
-        g2o.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
-        typer.echo(f"wrote {g2o}: {len(lines)} lines")
-        return
     try:
         result = batch_map(run.samples(), noise)
     except BatchReferenceError as error:

@@ -8,9 +8,9 @@ import pytest
 
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.recorded.chains import Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.batch_reference.measurements import Scan, chains_of
 from teamslam.sim.studies.batch_reference.reference import NoiseKind, batch_map
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise, Sensor

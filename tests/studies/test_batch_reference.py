@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from teamslam.central.desk.evaluation.errors import Path
-from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
-from teamslam.sim.studies.batch_reference.measurements import (
+from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
     Scan,
     anchored,
     chains_of,
 )
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
 from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
 from teamslam.team.estimation.models import increment_of

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from teamslam.central.config import BiasSigmas
+from teamslam.sim.recorded.chains import Chain, Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.batch_reference.errors import (
     add_errors,
@@ -17,7 +18,6 @@ from teamslam.sim.studies.batch_reference.errors import (
     profile_graph,
 )
 from teamslam.sim.studies.batch_reference.graph import pose_key, values_of
-from teamslam.sim.studies.batch_reference.measurements import Chain, Scan, chains_of
 from teamslam.sim.studies.batch_reference.reference import batch_map
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting

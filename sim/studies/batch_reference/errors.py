@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from teamslam.central.config import BiasSigmas
+from teamslam.sim.recorded.chains import Chain
 from teamslam.sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
-from teamslam.sim.studies.batch_reference.measurements import Chain
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import NEAREST_M, predicted
 from teamslam.team.estimation.se2 import Point, wrapped

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from teamslam.central.desk.evaluation.evaluation import MapResult
-from teamslam.sim.studies.batch_reference.measurements import Chain
+from teamslam.sim.recorded.chains import Chain
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.models import located, predicted
 from teamslam.team.estimation.se2 import Point, Pose, tangent

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from teamslam.sim.recorded.chains import Scan
 from teamslam.sim.studies.batch_reference.graph import (
     FLOOR_SIGMAS,
     load_gtsam,
@@ -21,7 +22,6 @@ from teamslam.sim.studies.batch_reference.graph import (
     start_factor,
     under_loss,
 )
-from teamslam.sim.studies.batch_reference.measurements import Scan
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.models import located, predicted

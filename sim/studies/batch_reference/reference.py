@@ -26,6 +26,13 @@ from teamslam.central.desk.evaluation.errors import (
     pose_errors,
 )
 from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.sim.recorded.chains import (
+    BatchReferenceError,
+    Chain,
+    anchored,
+    chains_of,
+    placed,
+)
 from teamslam.sim.studies.batch_reference.errors import (
     add_errors,
     bias_key,
@@ -39,12 +46,6 @@ from teamslam.sim.studies.batch_reference.graph import (
     newton_step,
     pose_key,
     values_of,
-)
-from teamslam.sim.studies.batch_reference.measurements import (
-    BatchReferenceError,
-    Chain,
-    anchored,
-    chains_of,
 )
 from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
 from teamslam.team.estimation.mount import moved_by
@@ -220,27 +221,6 @@ def _gtsam() -> Any:
         return load_gtsam()
     except NotInstalledError as error:
         raise BatchReferenceError(str(error)) from None
-
-
-def placed(
-    chains: Sequence[Chain], run: Evaluation
-) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
-    """Chains with a known place in the team's frame, and the joined poses that determine it."""
-    known, anchors, left_out = [], [], []
-    for chain in chains:
-        robot = chain.config.id
-        path = run.robots[robot].smoothed_path
-        own = (path.stamps_ns > chain.stamps_ns[0]) & (path.stamps_ns <= chain.stamps_ns[-1])
-        if not own.any():
-            left_out.append(f"{robot}: it is not in the joined map")
-            continue
-        stamps, poses = path.stamps_ns[own], chain.of_sensor(path.poses[own])
-        if chain.start is not None:
-            stamps = np.concatenate((chain.stamps_ns[:1], stamps))
-            poses = np.concatenate((chain.start[np.newaxis], poses))
-        known.append(chain)
-        anchors.append(Path(stamps, poses))
-    return known, anchors, tuple(left_out)
 
 
 def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:

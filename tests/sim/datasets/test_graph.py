@@ -1,0 +1,230 @@
+"""Landmark graphs in the field's text formats: their numbers, their pieces, and what is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.sim.cli.main import _advice, app
+from teamslam.sim.datasets.graph import graph_world
+from teamslam.sim.datasets.graph_lines import read_graph
+from teamslam.sim.datasets.graph_writer import g2o_lines, isam_lines, pyfg_lines
+from teamslam.sim.datasets.kinds import kind_of
+from teamslam.sim.datasets.pyfg import read_pyfg
+from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.sim.world.config import GraphWorld
+from teamslam.team.estimation.se2 import between, compose
+
+CITY = Path(__file__).parents[4] / "shared" / "benchmarks" / "citytrees" / "cityTrees10000.txt"
+ISAM = """# three poses, one landmark
+ODOMETRY 0 1 2 0 1.5707963267948966 50 0 0 20 0 100
+LANDMARK 1 7 3 1 10 0 5
+EDGE2 1 2 1 0 0 50 0 0 20 0 100
+LANDMARK 2 7 2 1
+EDGE2 2 0 1 1 0 1 0 0 1 0 1
+"""
+G2O = """VERTEX_SE2 0 5 1 0
+FIX 0
+VERTEX_SE2 1 7 1 1.5707963267948966
+VERTEX_XY 7 6 4
+EDGE_SE2 0 1 2 0 1.5707963267948966 4 1 0 9 0 16
+EDGE_SE2_XY 1 7 3 1 4 0 1
+PARAMS_SE2OFFSET 0 0 0 0
+"""
+TORO = """VERTEX2 0 0 0 0
+VERTEX2 1 2 0 1.5707963267948966
+EDGE2 0 1 2 0 1.5707963267948966 4 1 9 16 0 0
+LANDMARK 1 7 3 1 4 0 1
+"""
+PYFG = """VERTEX_SE2 0.0 A0 0 0 0
+VERTEX_SE2 0.5 A1 1 0 0
+VERTEX_SE2 0.0 B0 0 1 0
+VERTEX_SE2 0.5 B1 1 1 0
+VERTEX_XY L3 2 2
+VERTEX_SE2:PRIOR 0.0 B0 0.1 1 0 0.04 0 0 0.04 0 0.01
+EDGE_SE2 0.5 A0 A1 1.02 0 0 0.01 0 0 0.01 0 0.001
+EDGE_SE2 0.5 B0 B1 0.97 0 0 0.01 0 0 0.01 0 0.001
+EDGE_SE2 0.5 A1 B1 0 1 0 0.01 0 0 0.01 0 0.001
+EDGE_SE2_XY 0.5 A1 L3 1 2 0.01 0.001 0.02
+EDGE_RANGE 0.5 A1 B1 1.0 0.01
+"""
+
+
+def written(folder: Path, text: str, name: str = "graph.txt") -> Path:
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def streams(path: Path, robots: int = 1, **fields: object):
+    return graph_world(GraphWorld(path=str(path), **fields), robots)
+
+
+def test_isams_weights_are_roots_in_the_axes_of_the_first_pose(tmp_path: Path) -> None:
+    path = written(tmp_path, ISAM)
+    world = streams(path)
+    (stream,) = world.streams
+    assert (kind_of(path), scenario_beside(path)) == ("graph", "graph")
+    assert stream.intervals.increments.tolist() == [[2.0, 0.0, np.pi / 2.0], [1.0, 0.0, 0.0]]
+    ahead_and_left = np.diag(stream.intervals.covariances[0])
+    assert np.allclose(ahead_and_left, [1.0 / 20.0**2, 1.0 / 50.0**2, 1e-4])
+    seen = stream.landmark_detections
+    assert seen.points.tolist() == [[3.0, 1.0], [2.0, 1.0]]
+    assert np.allclose(seen.covariances, [[0.01, 0.0, 0.04], [1.0, 0.0, 1.0]])
+    assert seen.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
+    assert world.landmarks is None
+    assert any("1 edge between poses not used" in note for note in world.notes)
+
+
+@pytest.mark.parametrize("text", [G2O, TORO])
+def test_g2o_and_toro_state_the_information(tmp_path: Path, text: str) -> None:
+    (stream,) = streams(written(tmp_path, text)).streams
+    stated = np.linalg.inv(np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 16.0]]))
+    if text is TORO:  # in the axes of the first pose, a quarter turn back
+        R = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        stated = R @ stated @ R.T
+    assert np.allclose(stream.intervals.covariances[0], stated)
+    assert np.allclose(stream.landmark_detections.covariances, [[0.25, 0.0, 1.0]])
+    assert stream.start.pose.tolist() == ([5.0, 1.0, 0.0] if text is G2O else [0.0, 0.0, 0.0])
+
+
+def test_an_errorless_twin_is_the_truth(tmp_path: Path) -> None:
+    path = written(tmp_path, ISAM)
+    written(tmp_path, ISAM.replace(" 2 0 1.5", " 2.5 0 1.5"), "graph_groundtruth.txt")
+    world = streams(path)
+    assert np.allclose(world.landmarks, [[1.5, 3.0]])
+    assert np.allclose(world.streams[0].truth[:, :2], [[0.0, 0.0], [2.5, 0.0], [2.5, 1.0]])
+
+
+def test_pyfg_has_robots_times_priors_and_the_truth(tmp_path: Path) -> None:
+    world = streams(written(tmp_path, PYFG), robots=2)
+    first, second = world.streams
+    assert first.start.covariance is None
+    assert np.allclose(second.start.covariance, np.diag([0.04, 0.04, 0.01]))
+    assert second.start.pose.tolist() == [0.1, 1.0, 0.0]
+    assert second.truth.tolist() == [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
+    assert first.intervals.duration_ns.tolist() == [500_000_000]
+    assert first.landmark_detections.covariances.tolist() == [[0.01, 0.001, 0.02]]
+    assert (world.landmark_ids.tolist(), world.landmarks.tolist()) == ([3], [[2.0, 2.0]])
+    assert any("EDGE_RANGE: 1 line not used" in note for note in world.notes)
+    with pytest.raises(DatasetError, match="2 robots are in it, 1 asked for"):
+        streams(tmp_path / "graph.txt")
+
+
+def drive(poses: int = 60, landmarks: int = 12, noise: float = 1.0) -> str:
+    """A graph of a circle, with noise of the odometry, in isam's format."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-12.0, 12.0, (landmarks, 2))
+    step, pose, lines = np.array([1.0, 0.0, 0.15]), np.zeros(3), []
+    for k in range(poses):
+        for i, place in enumerate(places):
+            seen = between(pose, np.array([*place, 0.0]))[:2]
+            if np.hypot(*seen) < 9.0:
+                lines.append(f"LANDMARK {k} {i} {seen[0]:.9f} {seen[1]:.9f} 10 0 10")
+        noisy = step + noise * rng.normal(0.0, [0.02, 0.02, 0.005])
+        lines.append(f"ODOMETRY {k} {k + 1} {' '.join(map(str, noisy))} 50 0 0 50 0 200")
+        pose = compose(pose, step)
+    return "\n".join(lines)
+
+
+def test_pieces_know_the_first_start_alone_and_keep_every_measurement(tmp_path: Path) -> None:
+    path = written(tmp_path, drive())
+    (whole,) = streams(path).streams
+    parts = streams(path, 3).streams
+    assert [part.start is None for part in parts] == [False, True, True]
+    assert sum(len(p.landmark_detections.ids) for p in parts) == len(whole.landmark_detections.ids)
+    assert [part.start is None for part in streams(path, 3, unknown_starts=("*",)).streams] == [
+        True,
+        True,
+        True,
+    ]
+    assert len(streams(path, duration_s=20.0).streams[0].intervals.end_ns) == 20
+    with pytest.raises(DatasetError, match="60 odometry edges can not be cut into 61"):
+        streams(path, 61)
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+def test_a_team_maps_a_graph(tmp_path: Path, robots: int) -> None:
+    path = written(tmp_path, drive())
+    written(tmp_path, drive(noise=0.0), "graph_groundtruth.txt")
+    scenario = with_options(load("graph"), dataset=path, robots=robots)
+    joined = evaluate(run_team(scenario, streams_of(scenario))).map
+    assert len(joined.ids) == len(read_graph(path).landmarks)
+    assert joined.errors.rmse_m < 0.2
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    graph = read_graph(written(tmp_path, drive()))
+    from teamslam.sim.datasets.factor_graph import dead_reckoned
+
+    dead_reckoned(graph)
+    graph.stamps_ns = {key: key[1] * 10**9 for key in graph.poses}
+    texts = {"a.txt": isam_lines(graph, ""), "a.g2o": g2o_lines(graph), "a.pyfg": pyfg_lines(graph)}
+    for name, lines in texts.items():
+        path = written(tmp_path, "\n".join(lines), name)
+        again = (read_pyfg if name == "a.pyfg" else read_graph)(path)
+        for new, old in zip(again.pose_edges, graph.pose_edges, strict=True):
+            assert np.allclose(new.motion, old.motion)
+            assert np.allclose(new.covariance, old.covariance)
+        for seen, old_seen in zip(again.point_edges, graph.point_edges, strict=True):
+            assert seen.landmark == old_seen.landmark
+            assert np.allclose(seen.point, old_seen.point)
+            assert np.allclose(seen.covariance, old_seen.covariance)
+
+
+def test_robots_of_numbered_poses_end_where_no_edge_leads_on(tmp_path: Path) -> None:
+    two = ISAM.replace("EDGE2 1 2", "EDGE2 4 5").replace("LANDMARK 2", "LANDMARK 5")
+    world = streams(written(tmp_path, two.replace("EDGE2 2 0", "EDGE2 5 0")), robots=2)
+    assert [len(stream.intervals.end_ns) for stream in world.streams] == [1, 1]
+    assert [stream.start is None for stream in world.streams] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("line", "defect"),
+    [
+        ("EDGE2 1 2 1 0 0 50 0 0 20 0", "10 words after EDGE2, 11 expected"),
+        ("EDGE2 1 2 one 0 0 50 0 0 20 0 100", "not a number in it"),
+        ("EDGE2 1 2 nan 0 0 50 0 0 20 0 100", "not finite"),
+        ("EDGE2 1 x 1 0 0 50 0 0 20 0 100", "'x' is no number of a vertex"),
+        ("EDGE2 1 2 1 0 0 50 0 0 0 0 100", "not positive definite"),
+        ("EDGE3 1 2 1 0 0 0 0 0", "three dimensions"),
+        ("some words", "no keyword 'some'"),
+    ],
+)
+def test_a_malformed_line_is_named_with_its_remedy(tmp_path: Path, line: str, defect: str) -> None:
+    path = written(tmp_path, ISAM.replace("EDGE2 1 2 1 0 0 50 0 0 20 0 100", line))
+    done = CliRunner().invoke(app, ["launch", "--dataset", str(path), "-o", str(tmp_path / "run")])
+    status, text = _advice(done.exception)
+    assert status == 2
+    assert "graph.txt, line 4" in text
+    assert defect in text
+
+
+def test_a_graph_without_landmarks_is_refused(tmp_path: Path) -> None:
+    poses = "".join(f"{line}\n" for line in ISAM.splitlines() if not line.startswith("LANDMARK"))
+    with pytest.raises(DatasetError, match="give a graph with landmarks"):
+        streams(written(tmp_path, poses))
+
+
+def test_import_writes_tables_of_a_graph(tmp_path: Path) -> None:
+    path = written(tmp_path, drive())
+    out = tmp_path / "set"
+    done = CliRunner().invoke(app, ["import", str(path), "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    scenario = with_options(load(scenario_beside(out)), dataset=out)
+    (again,), (whole,) = streams_of(scenario).streams, streams(path).streams
+    assert np.array_equal(again.landmark_detections.points, whole.landmark_detections.points)
+    assert np.allclose(again.intervals.covariances, whole.intervals.covariances)
+
+
+@pytest.mark.skipif(not CITY.is_file(), reason="no cityTrees10000 here")
+@pytest.mark.parametrize(("robots", "batch_m"), [(1, 0.0504), (5, 0.0510)])
+def test_city_trees_is_mapped_as_well_as_by_the_batch(robots: int, batch_m: float) -> None:
+    scenario = with_options(load("graph"), dataset=CITY, robots=robots)
+    run = evaluate(run_team(scenario, streams_of(scenario)))
+    assert run.map.errors.aligned_rmse_m < 1.03 * batch_m
+    assert 0.9 < run.map.cost_per_dof < 1.1
