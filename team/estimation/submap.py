@@ -21,11 +21,13 @@ class Unnamed:
     """Observations of a window's U unnamed landmarks, by ascending number.
 
     counts: number of measurements of each, at least 1. seen: the window's keyframes with detections
-    that observed it; two landmarks that one keyframe observed are distinct.
+    that observed it; two landmarks that one keyframe observed are distinct. classes: ln P(its
+    reported classes | class) of each, up to a constant; without columns where none is reported.
     """
 
     counts: UInt32[np.ndarray, " U"]
     seen: Bool[np.ndarray, "U keyframes"]
+    classes: Float[np.ndarray, "_ _"] = field(default_factory=NO_COLUMNS.copy)
 
     @cached_property
     def views(self) -> tuple[Int64[np.ndarray, " _"], ...]:

@@ -19,6 +19,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.classes import stack_classes
 from teamslam.team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
 from teamslam.team.estimation.association.island_view import (
     IslandView,
@@ -68,6 +69,10 @@ SEEDS = 3
 """Number of tried pairs of seeds for each."""
 PART = 15
 """Number of neighbouring landmarks in a part of the patch that votes by itself."""
+LARGE = 150
+"""Number of landmarks from which a patch is halved into parts, as a map of many windows in one
+submap is.
+"""
 TOLERANCE, REACH = 0.4, 30.0
 """Largest distance of matched points in a proposal, and of two points that vote together, in radii
 of one object.
@@ -289,7 +294,13 @@ def combine_maps(
     covariance[2 * n :, 2 * n :] = target.covariance
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
-    both = Joint(np.concatenate([placed, target.mean]), covariance, apart, target.density)
+    both = Joint(
+        np.concatenate([placed, target.mean]),
+        covariance,
+        apart,
+        target.density,
+        classes=stack_classes([(n, patch.classes), (m, target.classes)]),
+    )
     return both, Side(n + np.arange(m), side.points, side.ids[nearby], nearby, side.views)
 
 
@@ -448,7 +459,12 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
     n = len(view.ids)
     own = view.joint.covariance.reshape(n, 2, n, 2)[at, :, at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
-    points = PointSet(view.joint.mean[at], np.minimum(sd, view.profile.tight))
+    classes = view.joint.classes
+    points = PointSet(
+        view.joint.mean[at],
+        np.minimum(sd, view.profile.tight),
+        None if classes is None else classes[at],
+    )
     place = np.full(n, -1)
     place[at] = np.arange(len(at))
     seen = pad_views(each for k in submaps for each in view.submaps[k].views)
@@ -457,7 +473,7 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
 
 def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
     """Make the side of a patch, with parts of at least PART landmarks where possible: those of its
-    submaps from the last one backwards.
+    submaps from the last one backwards, and the halves of halves of a large patch.
     """
     parts = []
     for first in range(len(submaps)):
@@ -467,7 +483,19 @@ def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Sid
             if len(part) >= PART:
                 parts.append(np.searchsorted(patch, part))
                 break
+    if len(patch) >= LARGE:
+        parts += _halve(view.joint.mean[patch], np.arange(len(patch)))
     return _make_side(view, patch, submaps)._replace(parts=tuple(parts))
+
+
+def _halve(points: Float[np.ndarray, "n 2"], part: Indices) -> list[Indices]:
+    """Halve a part across its longer side until the halves have fewer than 2 PART points."""
+    if len(part) < 2 * PART:
+        return [part]
+    own = points[part]
+    order = part[np.argsort(own[:, int(np.argmax(np.ptp(own, axis=0)))], kind="stable")]
+    middle = len(order) // 2
+    return _halve(points, np.sort(order[:middle])) + _halve(points, np.sort(order[middle:]))
 
 
 def _is_identity(found: Placement, patch: Indices) -> bool:

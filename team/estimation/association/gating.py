@@ -6,7 +6,9 @@ A pair of landmarks of a joint Gaussian also has a log-likelihood ratio of "one 
 "two". With S the joint covariance of their difference plus the slack s₀², and λ expected landmarks
 per square metre,
 
-    LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ.
+    LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ,
+
+plus the evidence of their classes (`classes`), if any.
 """
 
 from typing import NamedTuple
@@ -16,6 +18,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation.association.classes import CONTRADICTED, Classes, compare_classes
 from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.scans import UNASSIGNED
 from teamslam.team.shapes import Bool, Float, Int64
@@ -90,7 +93,8 @@ class Joint(NamedTuple):
     operator. density: their local density; None: that of the profile. unseen: for the landmarks of
     one map, the probability that all windows that saw each of them missed another one beside it;
     the density of the profile is then an upper bound of the map's own. apart_in_window: pairs that
-    one submap has as two landmarks, symmetric; None: not recorded.
+    one submap has as two landmarks, symmetric; None: not recorded. classes: evidence of their
+    classes (`classes`); None: none.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -99,6 +103,7 @@ class Joint(NamedTuple):
     density: LandmarkDensity | None = None
     unseen: Float[np.ndarray, " n"] | None = None
     apart_in_window: Bool[np.ndarray, "n n"] | None = None
+    classes: Classes | None = None
 
     def select(self, chosen: Indices) -> "Joint":
         """Return the marginal of some landmarks, in this order."""
@@ -112,7 +117,14 @@ class Joint(NamedTuple):
             density=self.density,
             unseen=None if self.unseen is None else self.unseen[chosen],
             apart_in_window=None if self.apart_in_window is None else self.apart_in_window[square],
+            classes=None if self.classes is None else self.classes[chosen],
         )
+
+    def compare_classes(self, first: Indices, second: Indices) -> Float[np.ndarray, " k"]:
+        """Log-likelihood ratio of each pair by its classes; zero without classes."""
+        if self.classes is None:
+            return np.zeros(len(first))
+        return compare_classes(self.classes[first], self.classes[second])
 
 
 class Pair(NamedTuple):
@@ -164,6 +176,8 @@ def evaluate_pairs(
             density = np.minimum(density, joint.density.of_map(radius))
         density = np.maximum(density, observed)
     llr = -0.5 * chi2 - 0.5 * core.log(determinant) - core.log(2.0 * np.pi * density)
+    if joint.classes is not None:
+        llr = llr + joint.compare_classes(first, second)
     return Likelihoods(chi2, llr, np.sqrt(np.maximum(half + spread, 0.0)))
 
 
@@ -175,10 +189,11 @@ def gate_pairs(
     most_sd: float = np.inf,
 ) -> tuple[Indices, Indices, Float[np.ndarray, " k"]]:
     """Select the pairs that can be one landmark: within the gate, with a standard deviation of the
-    difference of at most `most_sd` [m], and not apart; return them with it.
+    difference of at most `most_sd` [m], not apart, and of compatible classes; return them with it.
     """
     at = evaluate_pairs(joint, first, second, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
+    open_ &= joint.compare_classes(first, second) > -CONTRADICTED
     return first[open_], second[open_], at.sd[open_]
 
 

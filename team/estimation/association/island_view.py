@@ -18,6 +18,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.classes import Classes, stack_classes
 from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.gating import (
     Indices,
@@ -63,16 +64,21 @@ class ViewedSubmap(NamedTuple):
         return self.landmarks[self.landmarks >= 0]
 
     @property
+    def unnamed_rows(self) -> Indices:
+        """Index of each of its unnamed landmarks, in its order; −1 for a dropped one."""
+        return self.landmarks[self.observation.ids >= UNNAMED]
+
+    @property
     def unnamed(self) -> Indices:
         """Indices of its unnamed landmarks, ascending."""
-        found = self.landmarks[self.observation.ids >= UNNAMED]
+        found = self.unnamed_rows
         places: Indices = np.unique(found[found >= 0])
         return places
 
     @property
     def views(self) -> list[Indices]:
         """Indices of the unnamed landmarks that each of its keyframes observed together."""
-        found = self.landmarks[self.observation.ids >= UNNAMED]
+        found = self.unnamed_rows
         views = (found[each] for each in self.observation.unnamed.views)
         return [view[view >= 0] for view in views]
 
@@ -126,7 +132,19 @@ class IslandView:
             density,
             miss_probabilities(mean, self.seen_by, self.profile.same),
             self._mark_apart_in_window(pairs),
+            self._sum_classes(),
         )
+
+    def _sum_classes(self) -> Classes | None:
+        """Sum the evidence of the submaps on each landmark's class; None where there is none."""
+        rows = [(len(s.unnamed_rows), s.observation.unnamed.classes) for s in self.submaps]
+        stacked = stack_classes(rows)
+        if stacked is None:
+            return None
+        at = np.concatenate([each.unnamed_rows for each in self.submaps])
+        classes = np.zeros((len(self.ids), stacked.shape[1]))
+        np.add.at(classes, at[at >= 0], stacked[at >= 0])
+        return classes
 
     def _mark_apart(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
         """Mark pairs of landmarks that cannot be one: observed by one keyframe, named differently,

@@ -71,12 +71,16 @@ def condition_on_pair(joint: Joint, first: int, second: int, profile: Associatio
     weighted = dense.solve(S, gain.T)
     difference = joint.mean[first] - joint.mean[second]
     mean = joint.mean - (dense.product(weighted.T, difference)).reshape(n, 2)
-    in_window = joint.apart_in_window
+    in_window, classes = joint.apart_in_window, joint.classes
+    if classes is not None:
+        classes = classes.copy()
+        classes[second] += classes[first]
     return joint._replace(
         mean=mean,
         covariance=P - dense.product(gain, weighted),
         apart=_inherit(joint.apart, first, second),
         apart_in_window=in_window if in_window is None else _inherit(in_window, first, second),
+        classes=classes,
     )
 
 

@@ -18,6 +18,10 @@ from teamslam.team.shapes import Float
 
 WIDE = 3.0
 """Radius around a closure's places that an audit considers, in spacings."""
+MOST_REPEATED = 40
+"""Largest number of landmarks that another place is expected to repeat (36 lamps of a corridor),
+which limits the context that tells a place from its repetitions.
+"""
 
 
 class Closure(NamedTuple):
@@ -75,8 +79,9 @@ def find_failed_test(closure: Closure, profile: AssociationProfile, tests: Closu
     if closure.share < profile.share:
         return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
     outside = tests.known - 2 * pairs
-    if tests.context and outside < tests.context * pairs:
-        return f"context {outside} < {tests.context * pairs:.0f} landmarks: nothing to tell it from"
+    least = tests.context * min(pairs, MOST_REPEATED)
+    if outside < least:
+        return f"context {outside} < {least:.0f} landmarks: nothing to tell it from"
     return ""
 
 

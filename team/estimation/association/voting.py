@@ -13,6 +13,12 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.shapes import Bool, Float, Int64
+from teamslam.team.estimation.association.classes import (
+    CONTRADICTED,
+    Classes,
+    compare_classes,
+    stack_classes,
+)
 
 MOST_BINS = 60
 """Number of refined motions, those with the most votes."""
@@ -31,10 +37,24 @@ MOST_DISTANCES = 2_000_000
 
 
 class PointSet(NamedTuple):
-    """Points of one side [m], and the standard deviation [m] of each relative to its neighbours."""
+    """Points of one side [m], and the standard deviation [m] of each relative to its neighbours.
+
+    classes: evidence of their classes; points of contradicting ones do not match.
+    """
 
     mean: Float[np.ndarray, "n 2"]
     sd: Float[np.ndarray, " n"]
+    classes: Classes | None = None
+
+    def select(self, part: Int64[np.ndarray, " k"]) -> "PointSet":
+        """Some of the points."""
+        return PointSet(
+            self.mean[part], self.sd[part], None if self.classes is None else self.classes[part]
+        )
+
+    def move(self, by: Float[np.ndarray, "2"]) -> "PointSet":
+        """The points, moved."""
+        return self._replace(mean=self.mean + by)
 
 
 class Vote(NamedTuple):
@@ -62,13 +82,13 @@ def propose_alignments(
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
     centre = a.mean.mean(axis=0)
-    motions = [_propose_motions(a.mean - centre, b.mean, tolerance, longest)]
+    motions = [_propose_motions(a.move(-centre), b, tolerance, longest)]
     for part in parts:
         if not 2 <= len(part) < len(a.mean):
             continue
-        own = PointSet(a.mean[part], a.sd[part])
+        own = a.select(part)
         middle = own.mean.mean(axis=0)
-        proposed = _propose_motions(own.mean - middle, b.mean, tolerance, longest)
+        proposed = _propose_motions(own.move(-middle), b, tolerance, longest)
         found = _keep_distinct(_refine(own, b, middle, proposed, tolerance), len(part))[
             :MOST_OF_PART
         ]
@@ -94,10 +114,24 @@ def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
     return distinct
 
 
+def _compatible(a: PointSet, b: PointSet) -> Bool[np.ndarray, "n m"] | None:
+    """Mark the pairs of points whose classes do not contradict each other; None: all."""
+    if a.classes is None or b.classes is None:
+        return None
+    n, m = len(a.mean), len(b.mean)
+    both = stack_classes([(n, a.classes), (m, b.classes)])
+    assert both is not None
+    one, two = np.repeat(both[:n], m, axis=0), np.tile(both[n:], (n, 1))
+    return np.asarray(compare_classes(one, two).reshape(n, m) > -CONTRADICTED)
+
+
 def _propose_motions(
-    a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"], tolerance: float, longest: float
+    one_side: PointSet, other_side: PointSet, tolerance: float, longest: float
 ) -> Float[np.ndarray, "_ 3"]:
-    """Propose the motions of a's origin, its centroid, in the bins with the most votes."""
+    """Propose the motions of the origin of one side, its centroid, in the bins with the most
+    votes.
+    """
+    a, b, fits = one_side.mean, other_side.mean, _compatible(one_side, other_side)
     shortest = 4.0 * tolerance
     i, j, length_a = _list_baselines(a, shortest, longest)
     k, last, length_b = _list_baselines(b, shortest - 2.0 * tolerance, longest + 2.0 * tolerance)
@@ -124,7 +158,10 @@ def _propose_motions(
         rotated = np.column_stack(
             [c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]]
         )
-        motions.append(np.column_stack([0.5 * (b[p] + b[q]) - rotated, turn]))
+        proposed = np.column_stack([0.5 * (b[p] + b[q]) - rotated, turn])
+        if fits is not None:
+            proposed = proposed[fits[i[of_a], p] & fits[j[of_a], q]]
+        motions.append(proposed)
     return np.array(_find_peaks(np.concatenate(motions), 3.0 * tolerance)).reshape(-1, 3)
 
 
@@ -187,14 +224,14 @@ def _refine(
     """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`; drop
     those that no two points confirm.
     """
-    local = a.mean - centre
+    local, fits = a.mean - centre, _compatible(a, b)
     size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     votes = []
     for k in range(0, len(motions), size):
         batch = motions[k : k + size]
         for step in range(REFINEMENTS):
             reach = tolerance * (1.5 if step < 2 else 1.0)
-            to, agree = _find_neighbours(batch, local, b.mean, reach)
+            to, agree = _find_neighbours(batch, local, b.mean, reach, fits)
             lasting = agree.sum(axis=1) >= 2
             batch, to, agree = batch[lasting], to[lasting], agree[lasting]
             if step < REFINEMENTS - 1 and len(batch):
@@ -214,12 +251,18 @@ def _find_neighbours(
     a: Float[np.ndarray, "n 2"],
     b: Float[np.ndarray, "m 2"],
     reach: float,
+    fits: Bool[np.ndarray, "n m"] | None,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find the nearest point of b for each point; mark those mutually nearest and within reach."""
+    """Find the nearest point of b for each point; mark those mutually nearest and within reach.
+
+    fits: the pairs of compatible classes; None: all.
+    """
     s, c = core.sin_and_cos(motions[:, 2:])
     x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
     y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
     away = core.squared(x[:, :, None] - b[:, 0]) + core.squared(y[:, :, None] - b[:, 1])
+    if fits is not None:
+        away = np.where(fits, away, np.inf)
     to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
     nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
     mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
