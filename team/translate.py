@@ -151,6 +151,7 @@ def submap_message(
         counts=from_ids(local.unnamed.counts),
         seen=np.packbits(local.unnamed.seen, axis=1, bitorder="little").tobytes(),
         keyframes=local.unnamed.seen.shape[1],
+        classes=from_floats(local.unnamed.classes),
     )
 
 
@@ -172,7 +173,13 @@ def _unnamed_of(message: m.Submap) -> Unnamed:
     counts = ids(message.counts, "counts").astype(np.uint32)
     rows = octets(message.seen, "seen").reshape(len(counts), -(-message.keyframes // 8))
     seen = np.unpackbits(rows, axis=1, count=message.keyframes, bitorder="little")
-    return Unnamed(counts, seen.astype(np.bool_))
+    return Unnamed(counts, seen.astype(np.bool_), classes_of(message, len(counts)))
+
+
+def classes_of(message: m.Submap | m.Detections, count: int) -> Float[np.ndarray, "n C"]:
+    """Read the evidence of the classes of `count` landmarks or detections."""
+    found = floats(message.classes, "classes").astype(np.float64)
+    return found.reshape(count, -1) if count and len(found) else np.empty((count, 0))
 
 
 def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:

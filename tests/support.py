@@ -254,6 +254,7 @@ def examples() -> Iterator[m.Message]:
         bearings=from_floats([0.5, -1]),
         covariances=blocks,
         signatures=from_floats([0.25, 0.5]),
+        classes=from_floats([-0.25, -1.5, -2.0, -0.125]),
     )
     yield build.sightings(
         stamp_ns=3_000,
@@ -301,6 +302,7 @@ def examples() -> Iterator[m.Message]:
         counts=from_ids([6]),
         seen=b"\x05\x01",
         keyframes=9,
+        classes=from_floats([-0.25, -1.5, -2.0, -0.125]),
     )
     yield m.Association(
         stamp_ns=9_000,

@@ -1,7 +1,7 @@
 """Detections without identities in a robot's folder of a data set.
 
 r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m in the scans that
-                    have them
+                    have them; class: reported class 0, 1, …, right with class_probability (0.95)
 r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for scoring (optional)
 """
 
@@ -20,7 +20,11 @@ from teamslam.sim.world.identities import in_order
 from teamslam.sim.world.streams import NO_LABEL, Detections
 from teamslam.team.shapes import Float, Int64, UInt32
 
-COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m")
+CLASS, RIGHT = "class", "class_probability"
+COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m", CLASS, RIGHT)
+USUAL_RIGHT = 0.95
+"""Probability that a class is right where the table states none."""
+MOST_CLASSES = 64
 LABELS = ("landmark",)
 FILES = ("detections.csv", "labels.csv")
 
@@ -45,6 +49,7 @@ def detections_of(place: File, robot: str) -> Detections | None:
         labels_of(_read(place, FILES[1], robot, LABELS), len(table)),
         covariances_of(table, POLAR_COVARIANCE) if table.has(*POLAR_COVARIANCE) else None,
         table.known_numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
+        _classes_of(table) if table.has(CLASS) else None,
     )
 
 
@@ -56,6 +61,7 @@ def scans_of(
     labels: UInt32[np.ndarray, " R"],
     covariances: Float[np.ndarray, "R 3"] | None,
     signatures: Float[np.ndarray, " R"] | None,
+    classes: Float[np.ndarray, "R C"] | None = None,
 ) -> Detections:
     """Scans without identities, one per stamp, rows in table order. Raises DatasetError."""
     if (np.diff(stamps_ns) < 0).any():
@@ -72,7 +78,23 @@ def scans_of(
         covariances=covariances,
         hidden=np.ones(len(first), np.bool_),
         signatures=signatures,
+        classes=classes,
     )
+
+
+def _classes_of(table: CsvTable) -> Float[np.ndarray, "R C"]:
+    """Compute ln P(reported | class): p for the reported class, (1 − p)/(C − 1) for others."""
+    reported = table.numbers(CLASS)[:, 0]
+    right = table.numbers(RIGHT)[:, 0] if table.has(RIGHT) else np.full(len(table), USUAL_RIGHT)
+    is_class = (reported >= 0) & (reported < MOST_CLASSES) & (reported == np.floor(reported))
+    for row in np.flatnonzero(~is_class)[:1].tolist():
+        raise table.error(row, CLASS, f"no class: give a whole number from 0 to {MOST_CLASSES - 1}")
+    for row in np.flatnonzero((right <= 0.0) | (right >= 1.0))[:1].tolist():
+        raise table.error(row, RIGHT, "not between 0 and 1")
+    count = max(2, int(reported.max()) + 1)
+    is_reported = reported[:, np.newaxis] == np.arange(count)
+    others = ((1.0 - right) / (count - 1))[:, np.newaxis]
+    return np.asarray(np.log(np.where(is_reported, right[:, np.newaxis], others)))
 
 
 def together(named: Detections, unnamed: Detections | None) -> Detections:
@@ -95,6 +117,10 @@ def rows_of(
     if seen.signatures is not None:
         numbers = np.column_stack((numbers, seen.signatures))
         columns.append("diameter_m")
+    if seen.classes is not None:
+        best = seen.classes.argmax(axis=1)
+        numbers = np.column_stack((numbers, best, np.exp(seen.classes.max(axis=1))))
+        columns += (CLASS, RIGHT)
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets)).tolist()
     labels = [-1 if label == NO_LABEL else label for label in seen.ids.tolist()]
     return columns, zip(stamps, cells_of(numbers), strict=True), labels
@@ -120,6 +146,7 @@ def _where(seen: Detections, chosen: np.ndarray) -> Detections:
         covariances=_any(seen.covariances, rows),
         hidden=None if seen.hidden is None else seen.hidden[chosen],
         signatures=_any(seen.signatures, rows),
+        classes=_any(seen.classes, rows),
     )
 
 

@@ -115,6 +115,7 @@ def _observations(
             bearings=from_floats(z.bearings),
             covariances=covariances,
             signatures=b"" if z.signatures is None else from_floats(z.signatures),
+            classes=b"" if z.classes is None else from_floats(z.classes.ravel()),
         )
     if z.points is not None:
         return m.Points(

@@ -87,11 +87,15 @@ def landmarks_of(
     found = _scans(unnamed, [s._replace(ids=i) for s, i in zip(scans, own, strict=True)])
     signatures = [floats(each.signatures, "signatures") for each in unnamed]
     whole = all(each.signatures for each in unnamed)
+    counts = [len(scan.ids) for scan in scans]
+    classes = [translate.classes_of(m_, n) for m_, n in zip(unnamed, counts, strict=True)]
+    alike = len({rows.shape[1] for rows in classes}) == 1 and classes[0].shape[1] > 0
     hidden = replace(
         found,
         points=None,
         hidden=np.ones(len(unnamed), np.bool_),
         signatures=np.concatenate(signatures) if whole else None,
+        classes=np.concatenate(classes) if alike else None,
     )
     return together(seen, hidden)
 

@@ -76,6 +76,7 @@ def _rows(
         covariances=_covariances(seen, chosen, hidden=hidden),
         hidden=np.full(count, hidden) if was is None else was | hidden,
         signatures=None if seen.signatures is None else seen.signatures[chosen],
+        classes=None if seen.classes is None else seen.classes[chosen],
     )
 
 
@@ -132,6 +133,7 @@ def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) ->
         bearings=np.concatenate((seen.bearings, bearings))[order],
         covariances=covariances,
         signatures=None,
+        classes=None,
     )
 
 
@@ -147,6 +149,7 @@ def in_order(parts: list[Detections]) -> Detections:
     pieces = [part.only(i, i + 1) for part in parts for i in range(len(part.stamps_ns))]
     chosen = [pieces[i] for i in order if len(pieces[i].ids)]
     counts = [len(piece.ids) for piece in chosen]
+    width = max((p.classes.shape[1] for p in chosen if p.classes is not None), default=0)
 
     def joined(values: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, "..."]:
         return np.concatenate(values)
@@ -173,4 +176,5 @@ def in_order(parts: list[Detections]) -> Detections:
         covariances=optional("covariances", 3),
         hidden=np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
         signatures=optional("signatures", 1),
+        classes=optional("classes", width),
     )

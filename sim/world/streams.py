@@ -85,7 +85,7 @@ class Detections:
     or (xx, xy, yy) of points. A NaN point was measured as range and bearing; a NaN covariance is
     absent; rows of a message are alike. hidden: messages published without identities (None: none),
     whose ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same
-    landmark, hidden ones only.
+    landmark, hidden ones only. classes: ln P(reported class | class) of each, hidden ones only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -97,6 +97,7 @@ class Detections:
     covariances: Float[np.ndarray, "R 3"] | None = None
     hidden: Bool[np.ndarray, " M"] | None = None
     signatures: Float[np.ndarray, " R"] | None = None
+    classes: Float[np.ndarray, "R C"] | None = None
 
     def rows(self, message: int) -> slice:
         """Rows of one message."""
@@ -115,6 +116,7 @@ class Detections:
             covariances=None if self.covariances is None else self.covariances[rows],
             hidden=None if self.hidden is None else self.hidden[first:last],
             signatures=None if self.signatures is None else self.signatures[rows],
+            classes=None if self.classes is None else self.classes[rows],
         )
 
 
@@ -133,7 +135,7 @@ class OdometryMeasurement(NamedTuple):
 class ObservationMeasurement(NamedTuple):
     """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
 
-    points, covariances, signatures: as in `Detections`. hidden: published without ids.
+    points, covariances, signatures, classes: as in `Detections`. hidden: published without ids.
     """
 
     stamp_ns: int
@@ -144,6 +146,7 @@ class ObservationMeasurement(NamedTuple):
     covariances: Float[np.ndarray, "R 3"] | None = None
     hidden: bool = False
     signatures: Float[np.ndarray, " R"] | None = None
+    classes: Float[np.ndarray, "R C"] | None = None
 
 
 class SightingMeasurement(NamedTuple):
@@ -245,6 +248,7 @@ class RobotStream:
             covariances=_alike(seen.covariances, at),
             hidden=seen.hidden is not None and bool(seen.hidden[row]),
             signatures=_alike(seen.signatures, at),
+            classes=_alike(seen.classes, at),
         )
 
     def sightings(self, counter: int) -> SightingMeasurement:

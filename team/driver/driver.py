@@ -252,10 +252,15 @@ class Driver:
         ranges: ArrayLike,
         bearings: ArrayLike,
         covariances: ArrayLike | None = None,
+        classes: ArrayLike | None = None,
     ) -> None:
-        """Add a scan of landmarks without identities at t: ranges [m] and bearings [rad]."""
+        """Add a scan of landmarks without identities at t: ranges [m] and bearings [rad].
+
+        classes: a row for each, the probability of its reported class given each class, which is
+        that column of the detector's confusion matrix.
+        """
         stamp_ns = measured.stamp_of(t, "detect")
-        seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances)
+        seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances, classes)
         self._see(j.OBSERVATIONS, seen)
 
     def sight(

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from teamslam.team import core
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import unsound
@@ -110,11 +111,21 @@ def points(
 
 
 def detections(
-    robot: str, stamp_ns: int, polar: tuple[ArrayLike, ArrayLike], covariances: ArrayLike | None
+    robot: str,
+    stamp_ns: int,
+    polar: tuple[ArrayLike, ArrayLike],
+    covariances: ArrayLike | None,
+    classes: ArrayLike | None = None,
 ) -> m.Detections:
-    """Build a scan without identities: (ranges [m], bearings [rad])."""
+    """Build a scan without identities: (ranges [m], bearings [rad]), P(reported | class) each."""
     what = f"detect at {1e-9 * stamp_ns:.3f} s"
     far, angles = _polar(polar, what, np.asarray(polar[0]).size)
+    likely = np.empty((len(far), 0)) if classes is None else np.asarray(classes, np.float64)
+    if likely.ndim != 2 or len(likely) != len(far) or not (likely > 0.0).all():
+        raise MeasurementError(
+            f"{what}: classes has the shape {likely.shape}; one row for each of {len(far)} seen, "
+            "with the probability above 0 of its reported class given each class of the team"
+        )
     return sound(
         m.Detections(
             stamp_ns=stamp_ns,
@@ -124,6 +135,7 @@ def detections(
             ranges=from_floats(far),
             bearings=from_floats(angles),
             covariances=_polar_blocks(covariances, len(far), what),
+            classes=from_floats(core.log(likely).ravel()),
         ),
         what,
     )

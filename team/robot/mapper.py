@@ -25,6 +25,7 @@ from teamslam.team.estimation.plausible import start_beyond
 from teamslam.team.estimation.scans import Scan, sensible
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import UNMEASURED, Rejection
+from teamslam.team.robot.classified import classify_landmarks
 from teamslam.team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
 from teamslam.team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses
@@ -256,6 +257,7 @@ class Mapper:
         measurement: which closed the window; None: the stream ended.
         """
         writer = self.writer
+        closed = classify_landmarks(closed, self._window)
         if self._replaced is not None:
             prior = self.poses.prior_of(writer.incarnation)
             closed = self._replaced(closed, prior, self.submaps)

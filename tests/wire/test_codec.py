@@ -62,7 +62,7 @@ def test_appended_fields_are_ignored(tag: str) -> None:
     [
         (build.done(robot="alpha", measurements=2, steps=1, submaps=1), 1),
         (msgspec.structs.replace(EXAMPLES["observations/1"], covariances=b""), 1),
-        *((submap(0), later) for later in (3, 4, 6, 8)),
+        *((submap(0), later) for later in (1, 4, 5, 7, 9)),
     ],
 )
 def test_a_message_from_before_its_later_fields_has_their_defaults(
@@ -246,7 +246,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", with_fields(SUBMAP, stamp_ns=2**62), None),
         ("wrong field", with_fields(EXAMPLES["status/1"], figures={"x": float("nan")}), None),
         ("wrong field", with_fields(EXAMPLES["odometry/1"], forward=float("nan")), None),
-        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-9]), None),
+        ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-10]), None),
     ],
 )
 def test_an_unsound_payload_is_refused_for_its_reason(

@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from teamslam.team import core
 
-Classes = Float[np.ndarray, "n C"]
+Classes = Float[np.ndarray, "_ _"]
+"""A row for each landmark, a column for each class."""
 CONTRADICTED = 3.0
 """Log-likelihood ratio (1 in 20) against one landmark from which a pair is not associated."""
 

@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Meta
 
 from teamslam.team.core import check_ascending, check_blocks, check_finite, check_packed_covariance
-from teamslam.team.wire.arrays import ids
+from teamslam.team.wire.arrays import floats, ids
 
 Name = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 Author = Annotated[str, Meta(pattern="^(map-)?[a-z][a-z0-9_]{0,31}$")]
@@ -47,6 +47,14 @@ def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
     counts = ids(count_bytes, "counts")
     if len(counts) != groups or int(counts.sum(dtype="int64")) != total:
         raise ValueError(f"wrong length: counts, {groups} groups of together {total} expected")
+
+
+def check_classes(class_bytes: bytes, count: int) -> None:
+    """Raise ValueError unless there are as many finite numbers for each of `count` things."""
+    numbers = len(floats(class_bytes, "classes"))
+    if numbers and (not count or numbers % count):
+        raise ValueError(f"wrong length: classes has {numbers} numbers for {count} landmarks")
+    check_finite(class_bytes, "classes", numbers)
 
 
 def tag_of(message: type[Message]) -> str:

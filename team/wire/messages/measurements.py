@@ -15,7 +15,14 @@ from teamslam.team.core import (
     check_ranges,
 )
 from teamslam.team.wire.arrays import Floats, Ids, check_semidefinite, floats, ids
-from teamslam.team.wire.messages.base import Count, Message, Name, Real, Text
+from teamslam.team.wire.messages.base import (
+    Count,
+    Message,
+    Name,
+    Real,
+    Text,
+    check_classes,
+)
 
 
 class Measurement(Message, frozen=True, kw_only=True):
@@ -139,13 +146,16 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
 
     Some may be clutter. Two of one scan are different landmarks. covariances: L × 3 floats, packed
     2 × 2 of (range, bearing), or empty: the sensor's noise. signatures: L floats that are similar
-    for one landmark, such as a trunk's diameter [m], or empty.
+    for one landmark, such as a trunk's diameter [m], or empty. classes: C floats of each, the
+    column ln P(its reported class | class c) of the detector's confusion matrix for the classes c
+    of the team, or empty.
     """
 
     ranges: Floats
     bearings: Floats
     covariances: Floats = b""
     signatures: Floats = b""
+    classes: Floats = b""
 
     def check(self) -> None:  # noqa: D102
         n = len(floats(self.ranges, "ranges"))
@@ -155,6 +165,7 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
             check_blocks(self.covariances, n, "covariances")
         if self.signatures:
             check_finite(self.signatures, "signatures", n)
+        check_classes(self.classes, n)
 
 
 class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):

@@ -14,6 +14,7 @@ from teamslam.team.wire.messages.base import (
     Name,
     Real,
     StampNs,
+    check_classes,
     check_counts,
 )
 
@@ -34,6 +35,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     number of measurements of each, ascending by id. keyframes: number of the window's keyframes
     with detections. seen: ⌈keyframes/8⌉ bytes of each unnamed landmark; bit k (the least of byte k
     // 8 first) is set if keyframe k contains it. Two landmarks in one keyframe are different.
+    classes: C floats of each, ln P(its detections' classes | class c) up to a constant, or empty.
     """
 
     robot: Name
@@ -54,6 +56,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     counts: Ids = b""
     seen: bytes = b""
     keyframes: Count = 0
+    classes: Floats = b""
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
@@ -80,6 +83,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
         rows = -(-self.keyframes // 8) * unnamed
         if len(self.seen) != rows:
             raise ValueError(f"wrong length: seen has {len(self.seen)} bytes, {rows} expected")
+        check_classes(self.classes, unnamed)
         if unnamed and not counts.min():
             raise ValueError("out of bounds: a landmark of no measurement, by counts")
 

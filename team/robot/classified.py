@@ -1,0 +1,36 @@
+"""Evidence of the classes of a window's landmarks, from the detections associated with them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from teamslam.team import translate
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.wire import messages as m
+
+
+def classify_landmarks(closed: ClosedWindow, measurements: Sequence[m.Measurement]) -> ClosedWindow:
+    """Sum ln P(reported class | class) of each unnamed landmark's detections, at a window's close.
+
+    Unchanged where no detection has a class. Detections of other numbers of classes are left out.
+    """
+    rows = {
+        each.stamp_ns: translate.classes_of(each, len(each.ranges) // 8)
+        for each in measurements
+        if isinstance(each, m.Detections) and each.classes
+    }
+    found = closed.became
+    if not rows or found is None:
+        return closed
+    most = max(row.shape[1] for row in rows.values())
+    classes = np.zeros((len(closed.local.unnamed.counts), most))
+    scans = np.repeat(found.stamps, found.counts).tolist()
+    each_one = zip(scans, found.rows.tolist(), found.landmarks.tolist(), strict=True)
+    for stamp_ns, row, landmark in each_one:
+        own = rows.get(stamp_ns)
+        if landmark >= UNNAMED and own is not None and own.shape[1] == most:
+            classes[landmark - UNNAMED] += own[row]
+    unnamed = replace(closed.local.unnamed, classes=classes)
+    return replace(closed, local=replace(closed.local, unnamed=unnamed))
