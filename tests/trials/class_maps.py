@@ -16,6 +16,7 @@ import numpy as np
 from teamslam.team.association import profile_for
 from teamslam.team.config import UNNAMED, Sensor
 from teamslam.team.estimation.association.closure import search_other_island
+from teamslam.team.estimation.association.island_view import IslandView
 from teamslam.team.estimation.association.verification import Closure
 from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.fold_association import view_island
@@ -61,8 +62,19 @@ def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[
             if one != two:
                 closure = search_other_island(views[one], views[two], maps[one].stream, 0)
                 if closure is not None:
-                    found[one, two] = closure
+                    motion = fit_motion(views[one], views[two], closure)
+                    found[one, two] = closure._replace(motion=motion)
     return found
+
+
+def fit_motion(one: IslandView, two: IslandView, closure: Closure) -> np.ndarray:
+    """Least-squares motion of the first map's paired landmarks onto the second's."""
+    a = one.joint.mean[[pair.first for pair in closure.pairs]]
+    b = two.joint.mean[[pair.second for pair in closure.pairs]]
+    p, q = a - a.mean(axis=0), b - b.mean(axis=0)
+    turn = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
+    rotated = compose(np.array([0.0, 0.0, turn]), np.array([*a.mean(axis=0), 0.0]))[:2]
+    return np.array([*(b.mean(axis=0) - rotated), turn])
 
 
 def loop_error(found: dict[tuple[int, int], Closure]) -> tuple[float, float]:
