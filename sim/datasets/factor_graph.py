@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
+from teamslam.team.shapes import Float
 
 STEP_NS = 1_000_000_000
 """Time between two poses [ns] of a graph without times."""

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.datasets.factor_graph import (
     FactorGraph,
@@ -31,6 +30,7 @@ from teamslam.sim.datasets.factor_graph import (
 )
 from teamslam.sim.datasets.tables import LARGEST, DatasetError
 from teamslam.team.config import UNNAMED
+from teamslam.team.shapes import Float
 
 POSES = ("VERTEX_SE2", "VERTEX2")
 POSE_EDGES = ("EDGE_SE2", "EDGE2", "ODOMETRY")

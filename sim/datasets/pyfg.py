@@ -14,11 +14,11 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.sim.datasets.factor_graph import FactorGraph, Key, Matrix, PointEdge, PoseEdge
 from teamslam.sim.datasets.graph_lines import SPATIAL, Line, lines_of
 from teamslam.team.config import UNNAMED
+from teamslam.team.shapes import Float
 
 FORMS = {
     "VERTEX_SE2": (2, 3, "time pose x y theta"),

@@ -10,9 +10,9 @@ classes that are equally frequent, the log-likelihood ratio of one landmark agai
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from teamslam.team import core
+from teamslam.team.shapes import Float
 
 Classes = Float[np.ndarray, "_ _"]
 """A row for each landmark, a column for each class."""

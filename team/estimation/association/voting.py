@@ -12,13 +12,13 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.estimation.association.classes import (
     CONTRADICTED,
     Classes,
     compare_classes,
     stack_classes,
 )
+from teamslam.team.shapes import Bool, Float, Int64
 
 MOST_BINS = 60
 """Number of refined motions, those with the most votes."""
