@@ -7,7 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.cli.main import _advice, app
+from teamslam.sim.cli.entry import _advice
+from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.graph import graph_world
 from teamslam.sim.datasets.graph_lines import read_graph
 from teamslam.sim.datasets.graph_writer import g2o_lines, isam_lines, pyfg_lines
