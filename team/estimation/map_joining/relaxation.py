@@ -77,7 +77,7 @@ def _least_squares(
         keys.append((column[:, None, :] * size + column[:, :, None])[below])
         products.append((weighted[:, :, None] * weighted[:, None, :])[below])
     entries, which = np.unique(np.concatenate(keys), return_inverse=True)
-    normal = np.bincount(which, np.concatenate(products))
+    normal = np.bincount(which, np.concatenate(products)).astype(np.float64, copy=False)
     starts = np.searchsorted(entries, size * np.arange(size + 1))
     if np.count_nonzero(normal[entries % (size + 1) == 0]) < size:
         return None
