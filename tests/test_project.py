@@ -96,7 +96,7 @@ def test_every_pinned_distribution_has_its_hashes() -> None:
     wanted = {f"{canonicalize_name(project)}=={version}" for project, version in parts}
     assert pins("hashes.txt") == wanted
     runtime = {each.partition("==")[0] for each in pins("hashes-run.txt") & wanted}
-    assert {"pip", *BUILDING, *closure("teamslam")} <= runtime
+    assert {"pip", *BUILDING, *closure(*PROJECT["dependencies"])} <= runtime
 
 
 def test_no_path_of_a_machine_is_committed() -> None:
@@ -148,6 +148,20 @@ def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> N
     assert "has no robot 'r9'" in ran.stderr
     kept_out = {"jaxtyping", "mcap", "scipy", "matplotlib", "pydantic", "teamslam.sim.cli.main"}
     assert loaded.isdisjoint(kept_out)
+
+
+def test_a_launch_and_its_report_need_no_scipy() -> None:
+    """SciPy is half of an environment that has no need of it."""
+    parts = (
+        "sim.launch.launch", "sim.cli.main", "sim.in_memory.team", "central.main",
+        "central.peers.main", "team.robot.main", "team.recording.shell", "central.desk.report.page",
+        "central.desk.view.server", "central.desk.verification.verification",
+        "team.estimation.map_joining.relaxation",
+    )  # fmt: skip
+    code = "import sys; sys.modules['scipy'] = None\n"
+    code += "".join(f"import teamslam.{part}\n" for part in parts)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    assert "scipy" not in closure(*PROJECT["dependencies"])
 
 
 def test_shapes_are_checked_in_tests() -> None:

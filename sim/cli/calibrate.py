@@ -1,5 +1,6 @@
 """Command `teamslam calibrate`."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -7,6 +8,7 @@ import typer
 
 from teamslam.sim.cli.help import Command
 from teamslam.sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
+from teamslam.team.extras import install_command
 
 app = typer.Typer()
 
@@ -36,6 +38,8 @@ def calibrate(
     """
     from dataclasses import asdict, replace
 
+    if find_spec("scipy") is None:
+        fail(f"calibrate needs SciPy: {install_command('calibrate')}", WRONG_USE)
     from rich.console import Console
     from rich.table import Table
 

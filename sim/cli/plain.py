@@ -7,8 +7,8 @@ is parsed as by Typer, which answers everything else: help, mistakes, options wi
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin
 
 from typer.models import ArgumentInfo
 
@@ -20,7 +20,8 @@ def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict
     found: dict[str, Any] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         annotated, info = get_args(parameter.annotation)
-        kind = next(each for each in (*get_args(annotated), annotated) if each is not NoneType)
+        kinds = get_args(annotated) if isinstance(annotated, UnionType) else (annotated,)
+        kind = next(each for each in kinds if each is not NoneType)
         if isinstance(info, ArgumentInfo):
             places.append((name, kind))
             continue
@@ -31,7 +32,8 @@ def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict
             for word, value in zip(written.split("/"), (True, False), strict=False):
                 options[word.strip()] = (name, kind, value)
         if parameter.default is not inspect.Parameter.empty:
-            found[name] = parameter.default
+            is_list = get_origin(kind) is list and parameter.default is None
+            found[name] = () if is_list else parameter.default
     rest = iter(words)
     for word in rest:
         if not word.startswith("-") and places:

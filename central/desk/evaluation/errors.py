@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from teamslam.team.estimation.consistency import chi2_interval, coverage, nees
 from teamslam.team.estimation.gaussian import cholesky_factor
@@ -155,7 +154,7 @@ def _shape_errors(
     G[0::2, 0] = G[1::2, 1] = 1.0
     G[0::2, 2], G[1::2, 2] = -centred[:, 1], centred[:, 0]
     L = cholesky_factor(covariance, "a map")
-    white_error, white_G = (solve_triangular(L, part, lower=True) for part in (error, G))
+    white_error, white_G = (np.linalg.solve(L, part) for part in (error, G))
     left = white_error - white_G @ np.linalg.lstsq(white_G, white_error)[0]
     basis = np.linalg.qr(G)[0]
     projection = np.eye(2 * count) - basis @ basis.T

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from teamslam.team.shapes import Float, Int64
 
@@ -43,7 +42,7 @@ def assign(
     of both sets and squared distances [m²].
     """
     squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
-    rows, columns = linear_sum_assignment(squared)
+    rows, columns = _cheapest(squared)
     near = squared[rows, columns] < gate_m**2
     return rows[near], columns[near], squared[rows, columns][near]
 
@@ -87,3 +86,39 @@ def half_spacing(true: Float[np.ndarray, "m 2"]) -> float | None:
     apart = np.hypot(*(true[:, None] - true[None]).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     return 0.5 * float(np.median(apart.min(axis=1)))
+
+
+def _cheapest(
+    costs: Float[np.ndarray, "n m"],
+) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
+    """Assign min(n, m) rows to columns with least sum of costs, rows ascending.
+
+    Shortest augmenting paths with potentials (Jonker and Volgenant 1987): O(n² m).
+    """
+    if len(costs) > costs.shape[1]:
+        columns, rows = _cheapest(costs.T)
+        order = np.argsort(rows)
+        return rows[order], columns[order]
+    n, m = costs.shape
+    of_row, of_column = np.zeros(n), np.zeros(m + 1)  # potentials; column m is the path's begin
+    taken = np.full(m + 1, -1)
+    for row in range(n):
+        taken[m], column = row, m
+        least, before = np.full(m, np.inf), np.full(m, m)
+        done = np.zeros(m + 1, bool)
+        while taken[column] >= 0:
+            done[column] = True
+            here = taken[column]
+            reduced = costs[here] - of_row[here] - of_column[:m]
+            nearer = ~done[:m] & (reduced < least)
+            least[nearer], before[nearer] = reduced[nearer], column
+            column = int(np.argmin(np.where(done[:m], np.inf, least)))
+            step = least[column]
+            of_row[taken[done]] += step
+            of_column[done] -= step
+            least[~done[:m]] -= step
+        while column != m:
+            taken[column], column = taken[before[column]], int(before[column])
+    columns = np.flatnonzero(taken[:m] >= 0)
+    order = np.argsort(taken[columns])
+    return taken[columns][order], columns[order]

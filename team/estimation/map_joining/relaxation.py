@@ -65,29 +65,29 @@ def _lifted(pose: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
 def _least_squares(
     rows: Sequence[_Rows], numbers: Values, free: Bool[np.ndarray, " _"]
 ) -> Values | None:
-    from scipy.sparse import csc_array, tril  # slow to import, and no robot uses it
-
-    weighted = [each.weights[:, None] * each.coefficients for each in rows]
-    counts = np.repeat([each.numbers.shape[1] for each in rows], [len(r.right) for r in rows])
-    line = np.repeat(np.arange(len(counts)), counts)
-    column = np.concatenate([each.numbers.ravel() for each in rows])
-    values = np.concatenate([each.ravel() for each in weighted])
-    A = csc_array((values, (line, column)), shape=(len(counts), len(numbers)))
-    right = np.concatenate([each.weights * each.right for each in rows])
-    B = A[:, np.flatnonzero(free)]
-    right = right - A[:, np.flatnonzero(~free)] @ numbers[~free]
-    normal = tril(B.T @ B, format="csc")
-    normal.sort_indices()
-    sizes, indices = np.ones(B.shape[1], np.int64), normal.indices.astype(np.int64)
-    if (normal.diagonal() == 0.0).any():
+    size, place = int(free.sum()), np.where(free, np.cumsum(free) - 1, -1)
+    keys, products, right = [], [], np.zeros(size)
+    for each in rows:
+        column, weighted = place[each.numbers], each.weights[:, None] * each.coefficients
+        is_free = column >= 0
+        fixed = np.where(is_free, 0.0, weighted * numbers[each.numbers]).sum(axis=1)
+        answers = weighted * (each.weights * each.right - fixed)[:, None]
+        right += np.bincount(column[is_free], answers[is_free], size)
+        below = (column[:, None, :] >= 0) & (column[:, :, None] >= column[:, None, :])
+        keys.append((column[:, None, :] * size + column[:, :, None])[below])
+        products.append((weighted[:, :, None] * weighted[:, None, :])[below])
+    entries, which = np.unique(np.concatenate(keys), return_inverse=True)
+    normal = np.bincount(which, np.concatenate(products)).astype(np.float64, copy=False)
+    starts = np.searchsorted(entries, size * np.arange(size + 1))
+    if np.count_nonzero(normal[entries % (size + 1) == 0]) < size:
         return None
     try:
-        pattern = core.Pattern(sizes, normal.indptr.astype(np.int64), indices)
-        factor = core.Cholesky(pattern, normal.data)
+        pattern = core.Pattern(np.ones(size, np.int64), starts, entries % size)
+        factor = core.Cholesky(pattern, normal)
     except core.NotPositiveDefiniteError:
         return None
     found = numbers.copy()
-    found[free] = factor.solve(B.T @ right)
+    found[free] = factor.solve(right)
     return found if np.isfinite(found).all() else None
 
 

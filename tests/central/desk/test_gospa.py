@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
-from teamslam.central.desk.evaluation.matching import gospa, half_spacing
+from teamslam.central.desk.evaluation.matching import assign, gospa, half_spacing
 
 TRUE = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
 
@@ -28,3 +29,14 @@ def test_a_duplicate_is_a_false_one() -> None:
 def test_the_cut_off_is_half_of_the_spacing() -> None:
     assert half_spacing(TRUE) == 2.0
     assert half_spacing(TRUE[:1]) is None
+
+
+def test_points_are_assigned_with_the_least_sum_of_squared_distances() -> None:
+    rng = np.random.default_rng(0)
+    for n, m in ((0, 3), (1, 1), (4, 7), (7, 4), (12, 12)):
+        found, true = rng.uniform(0.0, 3.0, (n, 2)), rng.uniform(0.0, 3.0, (m, 2))
+        rows, columns, squared = assign(found, true, 1.0)
+        costs = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), 1.0)
+        best = costs[linear_sum_assignment(costs)].sum()
+        assert len({*rows.tolist()}) == len({*columns.tolist()}) == len(squared)
+        assert squared.sum() + min(n, m) - len(squared) == pytest.approx(best)

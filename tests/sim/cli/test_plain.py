@@ -38,7 +38,8 @@ def test_what_is_parsed_is_as_by_typer(words: str) -> None:
     [
         "robot", "robot s.json", "robot s.json r1 r2", "robot s.json r1 --help",
         "robot s.json r1 --conect a", "robot s.json r1 --connect", "world s --seed 3",
-        "central s --patience 3", "record s", "record s -ofile", "router --listen --insecure",
+        "central s --patience 3", "central s --map a.toml", "record s", "record s -ofile",
+        "router --listen --insecure",
     ],
 )  # fmt: skip
 def test_help_mistakes_and_numbers_are_left_to_typer(words: str) -> None:
