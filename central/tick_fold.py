@@ -136,7 +136,7 @@ class TickFold:
         """
         tick = self._inputs.add_submap(submap, digest, sightings)
         if submap.robot not in self._gone or tick <= self._conviction.at:
-            self._roll_back(tick)
+            self.roll_back(tick)
         else:
             self._roll_back_others(tick)
 
@@ -164,11 +164,11 @@ class TickFold:
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
         until_ns = self._until_ns
         if math.isfinite(tick):
-            self._roll_back(tick)
+            self.roll_back(tick)
         self._ordered = self._ordered if ordered is None else ordered
         self.fold_until(until_ns)
 
-    def _roll_back(self, tick: float) -> None:
+    def roll_back(self, tick: float) -> None:
         """Drop the ticks folded from this one on, and a conviction based on them.
 
         A convicted robot was left out from the first tick on: no checkpoint contains it.
@@ -180,7 +180,7 @@ class TickFold:
 
     def _roll_back_others(self, tick: float) -> None:
         for other in self._others.values():
-            other._roll_back(tick)
+            other.roll_back(tick)
 
     # The fold of the closed ticks.
 
