@@ -330,7 +330,7 @@ def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None
     """
     profile = view.profile
     submaps = view.find_latest(stream, last)
-    patch = join_indices(view.seen_by[k] for k in submaps)
+    patch = _find_patch(view, submaps)
     target = _find_reachable(view, patch)
     if not len(target):
         return None
@@ -356,15 +356,16 @@ def search_other_island(
     """
     profile = mine.profile
     submaps = mine.find_latest(stream, last)
-    patch = join_indices(mine.seen_by[k] for k in submaps)
+    patch = _find_patch(mine, submaps)
     if min(len(patch), len(theirs.ids)) < profile.island_pairs:
         return None
     own = mine.joint.select(patch)
     of_patch = _make_patch(mine, patch, submaps)._replace(at=np.arange(len(patch)))
 
     def target_of(view: IslandView) -> tuple[Side, JointOf]:
-        side = _make_side(view, np.arange(len(view.ids)), range(len(view.seen_by)))
-        return side, lambda vote: combine_maps(own, view.joint, side, vote, profile)
+        at = np.flatnonzero(~view.missed)
+        side, joint = _make_side(view, at, range(len(view.seen_by))), view.joint.select(at)
+        return side, lambda vote: combine_maps(own, joint, side, vote, profile)
 
     def aliases() -> list[Placement]:
         found = align(of_patch, *target_of(mine), profile)
@@ -429,13 +430,18 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     return None
 
 
+def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
+    patch = join_indices(view.seen_by[k] for k in submaps)
+    return patch[~view.missed[patch]]
+
+
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
     """Find the landmarks that may coincide with the patch's by the joint covariance; none where all
     are certain.
 
     An alignment with any other landmark is no rival: `grow_pairs` would reject its seeds.
     """
-    others = np.setdiff1d(np.arange(len(view.ids)), patch)
+    others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
     at = evaluate_pairs(view.joint, one, two, view.profile)
     fits = at.chi2 < view.profile.gate
@@ -463,7 +469,7 @@ def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Sid
     for first in range(len(submaps)):
         part = join_indices([])
         for k in submaps[first:]:
-            part = np.union1d(part, view.seen_by[k])
+            part = np.union1d(part, np.intersect1d(view.seen_by[k], patch))
             if len(part) >= PART:
                 parts.append(np.searchsorted(patch, part))
                 break
