@@ -400,12 +400,12 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     """
     profile = view.profile
     most_sd = NEARLY * profile.same
-    others = view.sees.copy()
+    others = view.sees & ~view.missed
     others[submaps] = False
-    patch = join_indices(view.seen_by[k] for k in submaps)
+    patch = _find_patch(view, submaps)
     target = np.flatnonzero(others.any(axis=0))
     for k in reversed(submaps):
-        own = view.submaps[k].unnamed
+        own = np.intersect1d(view.submaps[k].unnamed, patch)
         for candidates in select_comparisons(view.joint, own, others, profile, most_sd):
             found = assign_jointly(view.joint, *list_pairs(own, candidates), profile, most_sd)
             sd = max((pair.sd for pair in found.pairs), default=0.0)
