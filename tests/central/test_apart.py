@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from teamslam.central import tick_fold
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
@@ -93,3 +94,22 @@ def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path: Path) -> N
     result = verify(written(tmp_path / "log.mcap", mirrored_run("r2", None)))
     assert result.first is None, str(result.first)
     assert {c.channel for c in result.channels if c.equal} >= {"prior", "final_map"}
+
+
+def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of folded ticks is at most that of the nominal run for each robot left out, for
+    each robot alone, and for a restart with each of the few suspensions.
+    """
+    counts = []
+    for robot in ("", "r2"):
+        samples, ticks = mirrored_run(robot, None), []
+        fold = tick_fold.fold_tick
+        monkeypatch.setattr(
+            tick_fold, "fold_tick", lambda *given, f=fold, n=ticks: n.append(1) or f(*given)
+        )
+        final = of_set(samples)
+        final.fold_until(60e9)
+        final.fold_apart(final.fold, ahead=False)
+        counts.append(len(ticks))
+        monkeypatch.undo()
+    assert counts[1] <= 12 * counts[0]

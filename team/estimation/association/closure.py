@@ -121,12 +121,14 @@ JointOf = Callable[[Vote], tuple[Joint, Side]]
 
 
 def align(
-    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile
+    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile, least: int
 ) -> list[Placement]:
-    """Find the alignments of a patch with a target, by decreasing evidence."""
+    """Find the alignments of a patch with a target, by decreasing evidence; those of fewer votes
+    than least / WEAK are neither closures of `least` pairs nor rivals.
+    """
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
-    votes = votes[:EXAMINED]
+    votes = [vote for vote in votes[:EXAMINED] if WEAK * len(vote.first) >= least]
     votes.sort(key=lambda vote: -_estimate_evidence(vote, patch, target, profile))
     found: list[Placement] = []
     most = 0
@@ -164,7 +166,7 @@ def find_closure(
     aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
     does not prove a place. Called only for an alignment that passes all other tests.
     """
-    found = align(patch, target, joint_of, profile)
+    found = align(patch, target, joint_of, profile, tests.pairs)
     if not found:
         return None
     best = found[0]
@@ -368,7 +370,7 @@ def search_other_island(
         return side, lambda vote: combine_maps(own, joint, side, vote, profile)
 
     def aliases() -> list[Placement]:
-        found = align(of_patch, *target_of(mine), profile)
+        found = align(of_patch, *target_of(mine), profile, profile.island_pairs)
         return [each for each in found if not _is_identity(each, patch)]
 
     found = find_closure(

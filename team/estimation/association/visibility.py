@@ -94,10 +94,14 @@ def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
     sees: landmarks of each submap. At least half of the landmark's submaps have a well-known one.
     """
     counts = sees.sum(axis=0)
-    beside = np.where(sees & (counts >= WELL_KNOWN), counts, len(sees) + 1).min(axis=1, initial=len(sees) + 1)
+    beside = np.where(sees & (counts >= WELL_KNOWN), counts, len(sees) + 1).min(
+        axis=1, initial=len(sees) + 1
+    )
     has_known = beside <= len(sees)
     knowing = sees[has_known].sum(axis=0)
-    fewest = np.where(sees & has_known[:, None], beside[:, None], len(sees) + 1).min(axis=0, initial=len(sees) + 1)
+    fewest = np.where(sees & has_known[:, None], beside[:, None], len(sees) + 1).min(
+        axis=0, initial=len(sees) + 1
+    )
     missed: Bool[np.ndarray, " n"] = (
         (counts > 0)
         & (counts < WELL_KNOWN)
