@@ -434,7 +434,8 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
 
 def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
     patch = join_indices(view.seen_by[k] for k in submaps)
-    return patch[~view.missed[patch]]
+    found: Indices = patch[~view.missed[patch]]
+    return found
 
 
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
