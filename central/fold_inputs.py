@@ -26,9 +26,13 @@ from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap
 
 
 class FoldInputs:
-    """The set of submaps by ticks, with initial poses and an operator's verdicts."""
+    """The set of submaps by ticks, with initial poses and an operator's verdicts.
+
+    robots: those with a submap.
+    """
 
     def __init__(self, config: CentralConfig) -> None:
+        self.robots: set[str] = set()
         self.tick_ns = round(config.tick_s * 1e9)
         self._bounds = config.bounds
         self._bounds_of_map = msgspec.structs.replace(config.bounds, submap_landmarks=MOST_SAVED)
@@ -46,6 +50,7 @@ class FoldInputs:
         tick.
         """
         tick = self._members.add(submap, digest, sightings)
+        self.robots.add(submap.robot)
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         return tick
 

@@ -74,6 +74,7 @@ class SubmapFold:
         self._judged = 0
         self._without: set[str] = set()
         self._accused: Mapping[str, str] = {}
+        self._apart: Mapping[str, Fold] = {}
         self._sent_priors = SentPriors(PRIOR_LANDMARKS)
         self._final: tuple[Fold, m.FusedMap] | None = None
 
@@ -98,6 +99,7 @@ class SubmapFold:
         self._file_members()
         ticks, self._accused = self._ticks, {}
         if tail == "final":
+            self._apart = {}
             return self._messages(ticks, ticks.solve(), tail, recorded)
         ticks.fold_until(closed_ns)
         fold = ticks.fold
@@ -107,6 +109,7 @@ class SubmapFold:
         if self._accused:
             ticks = ticks.leave_out(self._accused, math.inf)
             fold = ticks.fold
+        self._apart = ticks.fold_apart(fold, ahead=ahead)
         return self._messages(ticks, fold, tail, recorded)
 
     def save_map(self, name: str) -> m.SavedMap:
@@ -165,7 +168,12 @@ class SubmapFold:
             "taken as no surer than that"
             for robot, count in self._ticks.raised.items()
         )
-        undecided = (self._ticks.undecided,) if self._ticks.undecided else ()
+        undecided = [self._ticks.undecided] if self._ticks.undecided else []
+        if self._apart:
+            undecided.append(
+                f"{', '.join(self._apart)} contradict each other: until it is determined which of "
+                "them is wrong, each one's prior is made of its own submaps"
+            )
         return (*self.finding.warnings, *suspended, *undecided, *raised, *self.reasons)
 
     def _messages(
@@ -205,31 +213,46 @@ class SubmapFold:
         self._final = (fold, fused) if final else None
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
-        streams = (
-            self._streams_for_priors(fold, fused, shown.ids)
-            if recorded is None
-            else recorded.priors_of
-        )
-        of_robots = self._receivable(priors(fold, shown.ids, fused, streams))
+        of_robots = self._receivable(self._priors(fold, fused, shown.ids, recorded))
         if final:
             paths = self._receivable(trajectories(fold, digest, store.chains))
             return [*of_robots, *paths, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
         return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *of_robots]
 
-    def _streams_for_priors(
-        self, fold: Fold, fused: m.FusedMap, shown: Sequence[int]
-    ) -> Collection[Stream]:
-        """Select the latest stream of each robot whose prior has news."""
+    def _priors(
+        self,
+        fold: Fold,
+        fused: m.FusedMap,
+        shown: Sequence[int],
+        recorded: RecordedFields | None,
+    ) -> list[Outgoing]:
+        """Make the priors that have news, or the recorded ones, each of the latest stream of a
+        robot: from the team's fold, or from the robot's own while robots contradict each other.
+        """
+        out = []
+        streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)
+        parts = [(fold, shown, [each for each in streams if each[0] not in self._apart])]
+        for robot, own in self._apart.items():
+            ids = shown_landmarks(own, self.config, "closed").ids
+            parts.append((own, ids, [each for each in streams if each[0] == robot]))
+        for of, ids, requested in parts:
+            if recorded is None:
+                news = self._sent_priors
+                requested = (
+                    news.void(of, requested) if fused.final else news.worth(of, requested, ids)
+                )
+            out += priors(of, ids, fused, requested)
+        return out
+
+    def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
+        """List the latest stream of each robot that is in the map or withdrawn."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
             if is_map((robot, incarnation)):
                 continue
             latest[robot] = max(latest.get(robot, 0), incarnation)
-        streams = sorted(latest.items())
-        if fused.final:
-            return self._sent_priors.void(fold, streams)
-        return self._sent_priors.worth(fold, streams, shown)
+        return sorted(latest.items())
 
     def _receivable(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """Withhold messages that not every receiver accepts, with a warning."""

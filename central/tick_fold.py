@@ -37,6 +37,7 @@ from teamslam.central.withdrawal import (
     Conviction,
     Suspension,
     Trial,
+    disagreement,
     find_suspects,
     hold_trial,
 )
@@ -47,6 +48,7 @@ from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
 from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
     Fold,
     InitialPoseFactor,
     JoinSettings,
@@ -110,6 +112,7 @@ class TickFold:
         self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
         self._accused: Mapping[str, str] = {}
+        self._others: dict[frozenset[str], TickFold] = {}
         self.undecided = ""
         self._restart(Conviction())
 
@@ -133,7 +136,9 @@ class TickFold:
         """
         tick = self._inputs.add_submap(submap, digest, sightings)
         if submap.robot not in self._gone or tick <= self._conviction.at:
-            self._roll_back(tick)
+            self.roll_back(tick)
+        else:
+            self._roll_back_others(tick)
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> None:
         """Replace an operator's verdicts on pairs of unnamed landmarks, in present or future
@@ -159,11 +164,11 @@ class TickFold:
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
         until_ns = self._until_ns
         if math.isfinite(tick):
-            self._roll_back(tick)
+            self.roll_back(tick)
         self._ordered = self._ordered if ordered is None else ordered
         self.fold_until(until_ns)
 
-    def _roll_back(self, tick: float) -> None:
+    def roll_back(self, tick: float) -> None:
         """Drop the ticks folded from this one on, and a conviction based on them.
 
         A convicted robot was left out from the first tick on: no checkpoint contains it.
@@ -171,6 +176,11 @@ class TickFold:
         if tick <= self._conviction.at:
             self._restart(Conviction())
         self.checkpoints.roll_back(tick)
+        self._roll_back_others(tick)
+
+    def _roll_back_others(self, tick: float) -> None:
+        for other in self._others.values():
+            other.roll_back(tick)
 
     # The fold of the closed ticks.
 
@@ -319,8 +329,18 @@ class TickFold:
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
-        """Fold the same inputs up to a time without some robots; withdraw no other."""
-        return self._fold_others(robots, until_ns, self._limits)
+        """Fold the same inputs up to a time without some robots; withdraw no other.
+
+        The fold is kept and continued at the next call, until no robot is suspected.
+        """
+        gone = self._gone.union(robots)
+        other = self._others.get(gone)
+        if other is None:
+            other = self._others[gone] = self._fold_others(robots, -math.inf, self._limits)
+        if math.isfinite(until_ns):
+            other.checkpoints.roll_back(until_ns // self._inputs.tick_ns)
+        other.fold_until(until_ns)
+        return other
 
     def _fold_others(
         self, robots: Collection[str], until_ns: float, limits: Limits | None
@@ -330,6 +350,34 @@ class TickFold:
         other._ordered = self._gone.union(robots)
         other.fold_until(until_ns)
         return other
+
+    def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
+        """Fold each robot's submaps by themselves where joining them contradicts; else nothing.
+
+        It does where a robot's disagreement with the team exceeds the limit, and as many times its
+        disagreement alone: too small covariances by themselves are no contradiction. A fold in
+        another frame than the team's is empty. ahead: the fold has the ticks that are not closed.
+        """
+        limit = self._config.withdraw_above
+        if limit is None or not fold.contributions:
+            return {}
+        if not find_suspects(self.agreement(fold), limit):
+            if not self.suspended:
+                self._others.clear()
+            return {}
+        team = {robot for (robot, _), key in fold.home.items() if key == fold.main_key}
+        folds, alone = {}, {}
+        for robot in sorted(team):
+            own = self.leave_out(self._inputs.robots - {robot}, self._until_ns)
+            apart = own.fold_ahead() if ahead else own.fold
+            alone.update(disagreement(own.agreement(apart)) if apart.contributions else {})
+            is_in_frame = apart.frame == fold.frame or apart.frame in fold.starts
+            folds[robot] = apart if is_in_frame else EMPTY_FOLD
+        together = disagreement(self.agreement(fold))
+        contradict = any(
+            value > limit * max(1.0, alone.get(robot, 1.0)) for robot, value in together.items()
+        )
+        return folds if contradict and len(team) > 1 else {}
 
     # Solutions beyond the closed ticks.
 

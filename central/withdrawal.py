@@ -24,9 +24,9 @@ LEAST_SUBMAPS = 8
 """Least submaps of a robot for a median over all of them, and for its withdrawal before the final
 map.
 """
-NEWEST, MOST_OF = 4, 3
-"""With fewer submaps a robot is judged by its newest ones: the disagreement that MOST_OF of NEWEST
-exceed.
+FEWEST, NEWEST, MOST_OF = 2, 4, 3
+"""With fewer submaps a robot is judged by its NEWEST ones, FEWEST at least: the disagreement that
+MOST_OF of them exceed, or all if there are no more.
 """
 AGREEING = 0.5
 """Share of the limit that no disagreement may exceed for the rest to agree."""
@@ -121,16 +121,18 @@ def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
     """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
     None with too few submaps.
 
-    costs: χ² and dof of each, oldest first. The probability that MOST_OF of NEWEST submaps exceed
-    χ² bounds of probability e^−x each is below 4 e^(−3x).
+    costs: χ² and dof of each, oldest first. The probability that k of n submaps exceed χ² bounds of
+    probability e^−x each is below C(n, k) e^(−kx).
     """
     if len(costs) >= LEAST_SUBMAPS:
         return median(chi2 / dof for chi2, dof in costs)
-    if len(costs) < NEWEST:
+    if len(costs) < FEWEST:
         return None
-    beyond = (chance + math.log(math.comb(NEWEST, MOST_OF))) / MOST_OF
-    shares = (_share(chi2, dof, beyond) for chi2, dof in costs[-NEWEST:])
-    return sorted((1.0 if each is None else each for each in shares), reverse=True)[MOST_OF - 1]
+    newest = costs[-NEWEST:]
+    most = min(MOST_OF, len(newest))
+    beyond = (chance + math.log(math.comb(len(newest), most))) / most
+    shares = sorted(cost_share(chi2, dof, beyond) for chi2, dof in newest)
+    return shares[-most]
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:

@@ -388,7 +388,9 @@ def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four() -> Non
     assert np.isclose(found, 9.0 * sorted(of_last_four)[1])
     for few in ((*good, *bad[-2:]), (*bad[:3], *good[:4])):
         assert disagreement(Agreement(0.0, 1.0, {}, few))["a"] <= 1.0
-    assert disagreement(Agreement(0.0, 1.0, {}, bad[:3])) == {}
+    assert np.isclose(disagreement(Agreement(0.0, 1.0, {}, bad[:3]))["a"], 9.0 * 0.8)
+    assert disagreement(Agreement(0.0, 1.0, {}, (bad[0], *good[:2])))["a"] <= 1.0
+    assert disagreement(Agreement(0.0, 1.0, {}, bad[:1])) == {}
 
 
 def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:

@@ -49,7 +49,9 @@ class StressWorld:
     late: by robot, the time by which its detections are stamped after the truth [s].
     odometry_scale: factor on the logged speeds. bearing_offset: added to all bearings [rad], by
     robot. mirrored: robots whose bearings have the wrong sign. same_id: pairs (a, b): landmark b
-    is measured with the identity of a. noise: factor on the noise of odometry and sensor.
+    is measured with the identity of a. noise: factor on the noise of odometry and sensor. grid:
+    landmarks are a grid of so many by so many, 5 m apart; 0: spread at random. clutter: number of
+    false detections in each scan, without identities.
     """
 
     seed: int = 1
@@ -69,6 +71,8 @@ class StressWorld:
     outlier_share: float = 0.0
     same_id: tuple[tuple[int, int], ...] = ()
     noise: float = 1.0
+    grid: int = 0
+    clutter: int = 0
 
 
 SCENARIO = """\
@@ -114,6 +118,9 @@ def write(world: StressWorld, folder: Path | str) -> Path:
 
 def _spread(world: StressWorld, rng: np.random.Generator) -> np.ndarray:
     """Landmarks in the square, at least 3 m apart where there is room."""
+    if world.grid:
+        line = 5.0 * (np.arange(world.grid) - 0.5 * (world.grid - 1))
+        return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     points: list[np.ndarray] = []
     tries = 0
     while len(points) < world.landmarks:
@@ -220,6 +227,10 @@ def _scans(
             rows.append(
                 f"{stamp:.3f},{numbers}" if world.hidden else f"{stamp:.3f},{own},{numbers}"
             )
+        for _ in range(world.clutter):
+            z, b = rng.uniform(0.5, world.reach_m), rng.uniform(-pi, pi)
+            labels.append("0")
+            rows.append(f"{stamp:.3f},{z!r},{b!r}")
     if world.hidden:
         _table(place / "detections.csv", "t_s,range_m,bearing_rad", rows)
         _table(place / "labels.csv", "landmark", labels)
@@ -247,6 +258,8 @@ def main() -> None:
     parser.add_argument("--moved", nargs=4, action="append", default=[])
     parser.add_argument("--mirrored", nargs="*", default=[])
     parser.add_argument("--outliers", type=float, default=0.0)
+    parser.add_argument("--grid", type=int, default=0)
+    parser.add_argument("--clutter", type=int, default=0)
     parser.add_argument("--same-id", nargs=2, action="append", default=[])
     given = parser.parse_args()
     world = StressWorld(
@@ -267,6 +280,8 @@ def main() -> None:
         ),
         mirrored=tuple(given.mirrored),
         outlier_share=given.outliers,
+        grid=given.grid,
+        clutter=given.clutter,
         same_id=tuple((int(a), int(b)) for a, b in given.same_id),
     )
     print(write(world, given.folder))

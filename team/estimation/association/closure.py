@@ -126,12 +126,14 @@ JointOf = Callable[[Vote], tuple[Joint, Side]]
 
 
 def align(
-    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile
+    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile, least: int
 ) -> list[Placement]:
-    """Find the alignments of a patch with a target, by decreasing evidence."""
+    """Find the alignments of a patch with a target, by decreasing evidence; those of fewer votes
+    than least / WEAK are neither closures of `least` pairs nor rivals.
+    """
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
-    votes = votes[:EXAMINED]
+    votes = [vote for vote in votes[:EXAMINED] if WEAK * len(vote.first) >= least]
     votes.sort(key=lambda vote: -_estimate_evidence(vote, patch, target, profile))
     found: list[Placement] = []
     most = 0
@@ -169,7 +171,7 @@ def find_closure(
     aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
     does not prove a place. Called only for an alignment that passes all other tests.
     """
-    found = align(patch, target, joint_of, profile)
+    found = align(patch, target, joint_of, profile, tests.pairs)
     if not found:
         return None
     best = found[0]
@@ -341,7 +343,7 @@ def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None
     """
     profile = view.profile
     submaps = view.find_latest(stream, last)
-    patch = join_indices(view.seen_by[k] for k in submaps)
+    patch = _find_patch(view, submaps)
     target = _find_reachable(view, patch)
     if not len(target):
         return None
@@ -367,18 +369,19 @@ def search_other_island(
     """
     profile = mine.profile
     submaps = mine.find_latest(stream, last)
-    patch = join_indices(mine.seen_by[k] for k in submaps)
+    patch = _find_patch(mine, submaps)
     if min(len(patch), len(theirs.ids)) < profile.island_pairs:
         return None
     own = mine.joint.select(patch)
     of_patch = _make_patch(mine, patch, submaps)._replace(at=np.arange(len(patch)))
 
     def target_of(view: IslandView) -> tuple[Side, JointOf]:
-        side = _make_side(view, np.arange(len(view.ids)), range(len(view.seen_by)))
-        return side, lambda vote: combine_maps(own, view.joint, side, vote, profile)
+        at = np.flatnonzero(~view.missed)
+        side, joint = _make_side(view, at, range(len(view.seen_by))), view.joint.select(at)
+        return side, lambda vote: combine_maps(own, joint, side, vote, profile)
 
     def aliases() -> list[Placement]:
-        found = align(of_patch, *target_of(mine), profile)
+        found = align(of_patch, *target_of(mine), profile, profile.island_pairs)
         return [each for each in found if not _is_identity(each, patch)]
 
     found = find_closure(
@@ -410,12 +413,12 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     """
     profile = view.profile
     most_sd = NEARLY * profile.same
-    others = view.sees.copy()
+    others = view.sees & ~view.missed
     others[submaps] = False
-    patch = join_indices(view.seen_by[k] for k in submaps)
+    patch = _find_patch(view, submaps)
     target = np.flatnonzero(others.any(axis=0))
     for k in reversed(submaps):
-        own = view.submaps[k].unnamed
+        own = np.intersect1d(view.submaps[k].unnamed, patch)
         for candidates in select_comparisons(view.joint, own, others, profile, most_sd):
             found = assign_jointly(view.joint, *list_pairs(own, candidates), profile, most_sd)
             sd = max((pair.sd for pair in found.pairs), default=0.0)
@@ -440,13 +443,19 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     return None
 
 
+def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
+    patch = join_indices(view.seen_by[k] for k in submaps)
+    found: Indices = patch[~view.missed[patch]]
+    return found
+
+
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
     """Find the landmarks that may coincide with the patch's by the joint covariance; none where all
     are certain.
 
     An alignment with any other landmark is no rival: `grow_pairs` would reject its seeds.
     """
-    others = np.setdiff1d(np.arange(len(view.ids)), patch)
+    others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
     at = evaluate_pairs(view.joint, one, two, view.profile)
     fits = at.chi2 < view.profile.gate
@@ -479,7 +488,7 @@ def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Sid
     for first in range(len(submaps)):
         part = join_indices([])
         for k in submaps[first:]:
-            part = np.union1d(part, view.seen_by[k])
+            part = np.union1d(part, np.intersect1d(view.seen_by[k], patch))
             if len(part) >= PART:
                 parts.append(np.searchsorted(patch, part))
                 break

@@ -36,7 +36,7 @@ from teamslam.team.estimation.association.joint_compatibility import (
 )
 from teamslam.team.estimation.association.landmark_sets import Landmarks
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
-from teamslam.team.estimation.association.visibility import miss_probabilities
+from teamslam.team.estimation.association.visibility import mark_missed, miss_probabilities
 from teamslam.team.estimation.contribution import Observation, Stream
 from teamslam.team.shapes import Bool, Float, Int64
 
@@ -87,7 +87,8 @@ class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
     ids: the identity of each landmark; place_of: its index, by identity. submaps: those examined;
-    seen_by: their landmarks. sees: landmarks of each submap, updated by merges. merged: landmarks
+    seen_by: their landmarks. missed: landmarks that are probably false (`mark_missed`), which no
+    closure is searched with. sees: landmarks of each submap, updated by merges. merged: landmarks
     that are merged into another one. ties: the merges, with their figures. stamp_ns: last end of a
     submap.
     """
@@ -117,6 +118,7 @@ class IslandView:
         self.sees = np.zeros((len(submaps), count), np.bool_)
         for row, places in zip(self.sees, self.seen_by, strict=True):
             row[places] = True
+        self.missed = mark_missed(self.sees)
         self._merged_into = np.arange(count)
         self._landmarks = landmarks
         self.ties: list[tuple[int, MergeRecord]] = []

@@ -85,6 +85,16 @@ def find_failed_test(closure: Closure, profile: AssociationProfile, tests: Closu
     return ""
 
 
+def is_ambiguous(closure: Closure, profile: AssociationProfile) -> bool:
+    """Whether another alignment, with enough pairs for a merge of islands, is nearly as likely."""
+    evidence = closure.llr - profile.absent * closure.absent
+    is_rivalled = (
+        evidence - closure.rival_llr < profile.margin
+        or evidence < profile.ratio * closure.rival_llr
+    )
+    return is_rivalled and closure.rival_pairs >= profile.island_pairs
+
+
 def matched_share(
     one: Float[np.ndarray, "n 2"],
     two: Float[np.ndarray, "m 2"],

@@ -13,6 +13,8 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""
+WELL_KNOWN = 4
+"""Number of submaps from which a landmark shows that those beside it were missed."""
 LEAST_OVERLOOKED = 0.1
 """Lower bound of the same probability: some landmarks are visible from one side only."""
 
@@ -83,3 +85,27 @@ def miss_probabilities(
     counts = (seen @ near.astype(np.float32) > 0.0).sum(axis=0)  # exact: sums of ones
     chance = core.exp(core.log(OVERLOOKED) * np.maximum(counts - 1.0, 0.0))
     return np.asarray(np.maximum(chance, LEAST_OVERLOOKED))
+
+
+def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
+    """Mark the landmarks that nearly all submaps miss which look at their place: a landmark of n <
+    WELL_KNOWN submaps, if each well-known landmark beside it there has WELL_KNOWN n of them.
+
+    sees: landmarks of each submap. At least half of the landmark's submaps have a well-known one.
+    """
+    counts = sees.sum(axis=0)
+    beside = np.where(sees & (counts >= WELL_KNOWN), counts, len(sees) + 1).min(
+        axis=1, initial=len(sees) + 1
+    )
+    has_known = beside <= len(sees)
+    knowing = sees[has_known].sum(axis=0)
+    fewest = np.where(sees & has_known[:, None], beside[:, None], len(sees) + 1).min(
+        axis=0, initial=len(sees) + 1
+    )
+    missed: Bool[np.ndarray, " n"] = (
+        (counts > 0)
+        & (counts < WELL_KNOWN)
+        & (fewest >= WELL_KNOWN * counts)
+        & (2 * knowing >= counts)
+    )
+    return missed

@@ -25,7 +25,7 @@ from teamslam.team.estimation.association.landmark_sets import (
     name_sides,
 )
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
-from teamslam.team.estimation.association.verification import Closure
+from teamslam.team.estimation.association.verification import Closure, is_ambiguous
 from teamslam.team.estimation.contribution import Contribution, Stream
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
@@ -41,6 +41,9 @@ from teamslam.team.estimation.map_joining.minima import minimum
 from teamslam.team.estimation.map_joining.submap_graph import tied
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
+
+AMBIGUITY_GROWTH = 1.25
+"""Growth of the number of submaps of two islands after which an ambiguous attempt is repeated."""
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
@@ -157,10 +160,15 @@ def _join_island(
     fold: Fold, stream: Stream, last: int, other_key: Stream, views: _IslandViews
 ) -> Fold:
     key = fold.home[stream]
+    size = fold.islands[key].graph.size + fold.islands[other_key].graph.size
+    if size < AMBIGUITY_GROWTH * fold.ambiguous.get((stream, other_key), 0):
+        return fold
     mine, theirs = views.view(fold, key), views.view(fold, other_key)
     found = search_other_island(mine, theirs, stream, last)
     if found is None:
         return fold
+    if found.why and is_ambiguous(found, mine.profile):
+        fold = replace(fold, ambiguous={**fold.ambiguous, (stream, other_key): size})
     streams = sorted(fold.islands[key].graph.streams)
     sides = streams[0], min(fold.islands[other_key].graph.streams)
     pairs = [(mine.ids[pair.first], theirs.ids[pair.second]) for pair in found.pairs]

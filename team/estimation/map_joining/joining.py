@@ -163,7 +163,8 @@ class Fold:
     with the reason (`refusal`). motion_only: submaps of which only the motion is in the map.
     left_out: inter-robot measurements with which the map has no solution. set_aside: other refusals
     in words. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
-    still be undone (`auditing`).
+    still be undone (`auditing`). ambiguous: number of submaps of a stream's island and another one
+    at their last attempt that several alignments passed.
     """
 
     contributions: tuple[Contribution, ...]
@@ -184,6 +185,7 @@ class Fold:
     set_aside: tuple[str, ...] = ()
     landmarks: Landmarks = NO_LANDMARKS
     audits: tuple[Audit, ...] = ()
+    ambiguous: Mapping[tuple[Stream, Stream], int] = field(default_factory=dict)
 
     @property
     def condensed_count(self) -> int:

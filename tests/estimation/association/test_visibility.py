@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from teamslam.team.estimation.association.visibility import mark_visible, pad_views, renumber_views
+from teamslam.team.estimation.association.visibility import (
+    mark_missed,
+    mark_visible,
+    pad_views,
+    renumber_views,
+)
 from teamslam.team.estimation.submap import Unnamed
 
 
@@ -34,3 +39,13 @@ def test_views_lose_landmarks_that_are_left_out_and_views_of_fewer_than_three_go
     views = pad_views([np.array([0, 1, 2, 3]), np.array([1, 2, 4])])
     to = np.array([10, 11, 12, -1, -1])
     assert renumber_views(views, to).tolist() == [[10, 11, 12, -1]]
+
+
+def test_a_landmark_of_one_submap_among_well_known_ones_is_missed() -> None:
+    """Five submaps look at landmarks 0 and 1; 2 is false. 3 is where no other submap looks."""
+    sees = np.zeros((6, 4), np.bool_)
+    sees[:5, :2] = True
+    sees[2, 2] = sees[5, 3] = True
+    assert mark_missed(sees).tolist() == [False, False, True, False]
+    assert not mark_missed(sees[:3]).any(), "three submaps are no evidence"
+    assert mark_missed(np.zeros((0, 3), np.bool_)).tolist() == [False] * 3

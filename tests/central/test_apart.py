@@ -1,0 +1,115 @@
+"""While robots contradict each other, no robot's submaps enter another one's prior."""
+
+import math
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+import numpy as np
+import pytest
+
+from teamslam.central import tick_fold
+from teamslam.central.desk.verification.verification import verify
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
+from teamslam.team.wire.bus import Sample, opened
+from tests.central.test_withdrawal import messages, of_set, team_run
+from tests.sim.reruns import written
+from tests.trials.stress_world import StressWorld, write
+
+
+@cache
+def mirrored_run(robot: str, robust_c: float | None) -> tuple[Sample, ...]:
+    """A team of three with known initial poses, in which one robot's bearings have the wrong
+    sign.
+    """
+    with TemporaryDirectory() as place:
+        world = StressWorld(seed=3, seconds=60.0, mirrored=(robot,) if robot else ())
+        folder = write(world, Path(place) / "world")
+        of = with_options(load(folder / "scenario.toml"), dataset=folder)
+        of = msgspec.structs.replace(
+            of, central=msgspec.structs.replace(of.central, robust_c=robust_c)
+        )
+        return tuple(run_team(of, streams_of(of)))
+
+
+def worst_error(samples: tuple[Sample, ...], robot: str) -> float:
+    """Largest distance [m] of a robot's online poses in the team's frame from the true ones."""
+    times, places = [], []
+    for each in messages(samples, m.Truth):
+        if each.robot == robot:
+            times.append(stamps(each.stamps, "stamps"))
+            places.append(floats(each.poses, "poses").reshape(-1, 3)[:, :2])
+    when, where = np.concatenate(times), np.concatenate(places)
+    errors = []
+    for channel, _, each in map(opened, samples):
+        if channel is ch.TEAM_POSE and each.robot == robot and each.in_team_frame:
+            at = int(np.abs(when - each.stamp_ns).argmin())
+            errors.append(math.hypot(*(floats(each.pose, "pose")[:2] - where[at])))
+    assert len(errors) > 50
+    return max(errors)
+
+
+@pytest.mark.parametrize("robust_c", [None, 1.0])
+@pytest.mark.parametrize("wrong", ["r1", "r2", "r3"])
+def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong: str, robust_c: float | None) -> None:
+    """Its first submaps can not yet be told from the others'. r1 fixes the frame."""
+    samples = mirrored_run(wrong, robust_c)
+    assert final_map(list(samples)).withdrawn == (wrong,)
+    for robot in {"r1", "r2", "r3"} - {wrong}:
+        assert worst_error(samples, robot) < worst_error(mirrored_run("", None), robot) + 1.0
+
+
+def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_are_not() -> None:
+    for robot, apart in (("", False), ("r2", True)):
+        samples = mirrored_run(robot, None)
+        ticks = of_set(samples)
+        ticks.fold_until(10e9)
+        folds = ticks.fold_apart(ticks.fold, ahead=False)
+        assert bool(folds) == apart
+        for name, fold in folds.items():
+            assert {each.robot for each in fold.contributions} == {name}
+
+
+def test_too_small_covariances_by_themselves_are_no_contradiction() -> None:
+    """Everybody claims a fifth of its standard deviations: each disagrees with itself as much."""
+    ticks = of_set(team_run())
+    for each in messages(team_run(), m.Submap):
+        covariance = floats(each.covariance, "covariance") / 25.0
+        ticks.add_submap(
+            msgspec.structs.replace(each, covariance=covariance.tobytes(), sightings=0), bytes(8)
+        )
+    ticks.convicts = False
+    ticks.fold_until(math.inf)
+    assert min(cost / dof for cost, dof in ticks.agreement(ticks.fold).robots.values()) > 8.0
+    assert ticks.fold_apart(ticks.fold, ahead=False) == {}
+
+
+def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path: Path) -> None:
+    result = verify(written(tmp_path / "log.mcap", mirrored_run("r2", None)))
+    assert result.first is None, str(result.first)
+    assert {c.channel for c in result.channels if c.equal} >= {"prior", "final_map"}
+
+
+def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of folded ticks is at most that of the nominal run for each robot left out, for
+    each robot alone, and for a restart with each of the few suspensions.
+    """
+    counts = []
+    for robot in ("", "r2"):
+        samples, ticks = mirrored_run(robot, None), []
+        fold = tick_fold.fold_tick
+        monkeypatch.setattr(
+            tick_fold, "fold_tick", lambda *given, f=fold, n=ticks: n.append(1) or f(*given)
+        )
+        final = of_set(samples)
+        final.fold_until(60e9)
+        final.fold_apart(final.fold, ahead=False)
+        counts.append(len(ticks))
+        monkeypatch.undo()
+    assert counts[1] <= 12 * counts[0]
