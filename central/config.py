@@ -17,11 +17,11 @@ class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     range_offset [m]; range_scale, forward_scale: shares of the range and of the distance driven.
     """
 
-    bearing: Positive = 0.003
-    clock_offset: Positive = 0.01
-    range_offset: Positive = 0.01
-    range_scale: Positive = 0.003
-    forward_scale: Positive = 0.005
+    bearing: Positive = 0.002
+    clock_offset: Positive = 0.005
+    range_offset: Positive = 0.005
+    range_scale: Positive = 0.005
+    forward_scale: Positive = 0.0015
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -27,6 +27,9 @@ Bias = Literal["bearing", "clock_offset", "forward_scale", "range_offset", "rang
 MAP = "map-"
 """Before the name of a saved map, where members of the set have that of a robot."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
+CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
+"""The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry
+and ranges could shrink together, and with them every residual."""
 Exchange = Literal["continuous", "rendezvous"]
 """A robot sends each submap when it is closed, or all buffered submaps at an encounter."""
 if TYPE_CHECKING:
@@ -256,7 +259,7 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     """Share of measurements that are not of their landmark. Above 0 a window uses only measurements
     that others confirm (`teamslam.team.estimation.hybrid_slam.outliers`)."""
-    biases: tuple[Bias, ...] = BIASES
+    biases: tuple[Bias, ...] = CALIBRATED
     """Errors shared by all of the robot's windows, estimated by the centre; each submap carries its
     derivative by each of them. clock_offset: by so much the detections are stamped late against the
     odometry."""
