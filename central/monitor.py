@@ -104,8 +104,9 @@ def deviations(
 ) -> list[Deviation]:
     """List the biases that differ from their robot's configuration beyond doubt, the surest first.
 
-    scale: the team's covariance scale; above 1 the standard deviations grow by its root. Biases
-    within BEYOND_PRIOR scales of their prior are as the configuration states.
+    scale: the team's covariance scale, or cost per degree of freedom; above 1 the standard
+    deviations grow by its root. Biases within BEYOND_PRIOR scales of their prior are as the
+    configuration states.
     """
     grown = math.sqrt(max(scale, 1.0))
     found = [

@@ -181,7 +181,8 @@ class SubmapFold:
             else finding(agreement, self.config.normal_scale, final=final)
         )
         self.finding = found.with_biases(biases)
-        scale = self.finding.figures.get("covariance_scale", 1.0)
+        figures = self.finding.figures
+        scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
             *(map(str, ticks.find_carried_off(fold)) if final else ()),

