@@ -317,9 +317,7 @@ def extended(
     growth = _Growth(graph, state)
     priors = list(graph.priors)
     submaps = list(graph.submaps)
-    for contribution in contributions:
-        if not bias_sigma.keys() >= {*contribution.local.biases}:
-            contribution = replace(contribution, local=contribution.local.without_biases)
+    for contribution in (_with_states(each, bias_sigma) for each in contributions):
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
             start = starts.get(stream, InitialPoseFactor(*stream, np.zeros(3)))
@@ -374,6 +372,13 @@ def extended(
         memory=graph.memory,
     )
     return grown, np.concatenate([state, *growth.values])
+
+
+def _with_states(contribution: Contribution, bias_sigma: Mapping[Bias, float]) -> Contribution:
+    """Take a submap with a bias that has no scale without biases."""
+    if bias_sigma.keys() >= {*contribution.local.biases}:
+        return contribution
+    return replace(contribution, local=contribution.local.without_biases)
 
 
 def _in_common(
