@@ -10,16 +10,18 @@ from teamslam.team.config import Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior standard deviations of the errors shared by all submaps of a robot.
+    """Prior scales of the errors shared by all submaps of a robot.
 
-    bearing [rad]; range_offset [m]; range_scale, forward_scale: shares of the range and of the
-    distance driven.
+    The prior is Student's t of one degree of freedom: most robots are as well calibrated as the
+    scale, and one that is not may be off by any amount. bearing [rad]; clock_offset [s];
+    range_offset [m]; range_scale, forward_scale: shares of the range and of the distance driven.
     """
 
-    bearing: Positive = 0.01
-    range_offset: Positive = 0.02
+    bearing: Positive = 0.002
+    clock_offset: Positive = 0.005
+    range_offset: Positive = 0.005
     range_scale: Positive = 0.005
-    forward_scale: Positive = 0.05
+    forward_scale: Positive = 0.0015
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -31,6 +33,7 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     bearing: NonNegative = 0.0
+    clock_offset: NonNegative = 0.0
     range_offset: NonNegative = 0.0
     range_scale: NonNegative = 0.0
     forward_scale: NonNegative = 0.0

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,10 @@ MISCALIBRATED = 0.015
 """Bound of the mean of the robots' scale biases, beyond which the models are wrong."""
 SIGMAS = 3.0
 SCALE_SIGMAS = 3.3
+DEVIATES = 4.0
+"""Standard deviations by which a robot's bias differs from its configuration beyond doubt."""
+BEYOND_PRIOR = 3.0
+"""Least size of such a bias, in scales of its prior: how well a robot is calibrated anyway."""
 NAMED = 3
 """Most submaps that are named, the worst first."""
 TOO_SMALL = "the reported covariances are too small by a factor of"
@@ -58,29 +63,76 @@ class Finding:
 NOTHING = Finding({}, ())
 
 
+class Deviation(NamedTuple):
+    """An error of a robot that its configuration lacks: value, sigma and value/sigma."""
+
+    robot: str
+    bias: Bias
+    value: float
+    sigma: float
+    significance: float
+
+    def __str__(self) -> str:
+        """Describe the error with its figures and the field that removes it."""
+        return SENTENCES[self.bias].format(
+            robot=self.robot,
+            value=self.value,
+            sigma=self.sigma,
+            size=abs(self.value),
+            percent=100.0 * self.value,
+            percent_sigma=100.0 * self.sigma,
+            late="late against" if self.value > 0.0 else "ahead of",
+        )
+
+
+SENTENCES: Mapping[Bias, str] = {
+    "bearing": "{robot}'s bearings read {value:+.4f} ± {sigma:.4f} rad too much: add that to its "
+    "sensor.bearing_offset",
+    "clock_offset": "{robot}'s detections are stamped {size:.3f} ± {sigma:.3f} s {late} its "
+    "odometry: add {value:.3f} to its clock_offset_s",
+    "forward_scale": "{robot} drives {percent:+.1f} ± {percent_sigma:.1f} % farther than its "
+    "odometry measures: correct its motion.forward_scale",
+    "range_offset": "{robot}'s ranges read {value:+.3f} ± {sigma:.3f} m too much: add that to its "
+    "sensor.range_offset",
+    "range_scale": "{robot}'s ranges read {percent:+.1f} ± {percent_sigma:.1f} % too much: correct "
+    "its sensor.range_scale",
+}
+
+
+def deviations(
+    biases: Sequence[BiasEstimate], prior_sigma: Mapping[Bias, float], scale: float = 1.0
+) -> list[Deviation]:
+    """List the biases that differ from their robot's configuration beyond doubt, the surest first.
+
+    scale: the team's covariance scale, or cost per degree of freedom; above 1 the standard
+    deviations grow by its root. Biases within BEYOND_PRIOR scales of their prior are as the
+    configuration states.
+    """
+    grown = math.sqrt(max(scale, 1.0))
+    found = [
+        Deviation(each.stream[0], each.bias, each.value, sigma, abs(each.value) / sigma)
+        for each in biases
+        if (sigma := grown * each.sigma) > 0.0
+        and abs(each.value) > max(DEVIATES * sigma, BEYOND_PRIOR * prior_sigma[each.bias])
+    ]
+    return sorted(found, key=lambda each: (-each.significance, each.robot, each.bias))
+
+
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     """Describe where the team's data contradict the models of all robots together.
 
     Odometry and ranges both determine the size of a map. Where they contradict each other, the
     robots' range scales, each held near its model's, move in the same direction: the joint cost
-    hardly shows it, their mean does. At speeds outside the calibration the odometry's scale is free
-    instead; that is no error, but is reported.
+    hardly shows it, their mean does.
     """
-    found = []
     ranges = _mean_of(biases, "range_scale")
-    if ranges is not None:
-        found.append(
-            "odometry or range scale not calibrated, covariance not valid: by the odometry, the "
-            f"robots' ranges read {100.0 * ranges:+.1f} % long; without ground truth `teamslam "
-            "calibrate` learns the odometry's scale, with it both"
-        )
-    ways = _mean_of(biases, "forward_scale")
-    if ways is not None:
-        found.append(
-            "odometry not calibrated at these speeds: by the ranges, the robots drive "
-            f"{100.0 * ways:+.1f} % farther than it reports; corrected for"
-        )
-    return tuple(found)
+    if ranges is None:
+        return ()
+    return (
+        "odometry or range scale not calibrated, covariance not valid: by the odometry, the "
+        f"robots' ranges read {100.0 * ranges:+.1f} % long; without ground truth `teamslam "
+        "calibrate` learns the odometry's scale, with it both",
+    )
 
 
 def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:

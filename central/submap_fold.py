@@ -19,7 +19,7 @@ from teamslam.central.join_messages import (
     team_map,
     trajectories,
 )
-from teamslam.central.monitor import NOTHING, finding
+from teamslam.central.monitor import NOTHING, deviations, finding
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.tick_fold import TickFold
@@ -189,10 +189,13 @@ class SubmapFold:
             else finding(agreement, self.config.normal_scale, final=final)
         )
         self.finding = found.with_biases(biases)
+        figures = self.finding.figures
+        scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
             *(map(str, ticks.find_carried_off(fold)) if final else ()),
             *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
+            *map(str, deviations(biases, ticks.settings.bias_sigma, scale)),
         )
         store = self.store
         fused = team_map(

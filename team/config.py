@@ -23,10 +23,13 @@ Angle = Annotated[float, Meta(gt=0.0, le=math.pi)]
 UNNAMED = 2**31
 """Landmark ids below this are identities. Those from here on come from data association: 2³¹ + a
 local index in a submap, 2³¹ | a number of the first member in the team's map."""
-Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
+Bias = Literal["bearing", "clock_offset", "forward_scale", "range_offset", "range_scale"]
 MAP = "map-"
 """Before the name of a saved map, where members of the set have that of a robot."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
+CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
+"""The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry
+and ranges could shrink together, and with them every residual."""
 Exchange = Literal["continuous", "rendezvous"]
 """A robot sends each submap when it is closed, or all buffered submaps at an encounter."""
 if TYPE_CHECKING:
@@ -83,8 +86,8 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Below this logged speed [m/s], slow_scale replaces forward_scale."""
     slow_scale: Positive = 1.0
     calibrated_speed: tuple[NonNegative, NonNegative] | None = None
-    """Range of logged speeds [m/s] from which forward_scale was learnt. Outside, the scale has an
-    error of its own (the bias "forward_scale")."""
+    """Range of logged speeds [m/s] from which forward_scale was learnt. Outside, or everywhere
+    without it, the scale has an error of its own (the bias "forward_scale")."""
     alphas: Alphas | None = None
     """Ma & Ma's α₁ … α₆, in addition: at speed v and yaw rate ω the variance of forward is
     (α₁v² + α₂ω²)·alpha_interval_s·t; of turn with α₃, α₄; of final_turn with α₅, α₆."""
@@ -256,9 +259,10 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     """Share of measurements that are not of their landmark. Above 0 a window uses only measurements
     that others confirm (`teamslam.team.estimation.hybrid_slam.outliers`)."""
-    biases: tuple[Bias, ...] = ()
+    biases: tuple[Bias, ...] = CALIBRATED
     """Errors shared by all of the robot's windows, estimated by the centre; each submap carries its
-    derivative by each of them."""
+    derivative by each of them. clock_offset: by so much the detections are stamped late against the
+    odometry."""
     association: AssociationSettings = AssociationSettings()
 
     def __post_init__(self) -> None:

@@ -17,7 +17,9 @@ from teamslam.team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unname
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import (
+    derivatives,
     floats,
+    from_derivatives,
     from_floats,
     from_ids,
     from_numbers,
@@ -146,7 +148,7 @@ def submap_message(
         nodes=from_stamps(local.node_stamps),
         sightings=sightings,
         biases=local.biases,
-        sensitivity=from_floats(local.sensitivity),
+        sensitivity=from_derivatives(local.sensitivity),
         gated=gated,
         counts=from_ids(local.unnamed.counts),
         seen=np.packbits(local.unnamed.seen, axis=1, bitorder="little").tobytes(),
@@ -185,7 +187,8 @@ def classes_of(message: m.Submap | m.Detections, count: int) -> Float[np.ndarray
 def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
     if not message.biases:
         return NO_COLUMNS
-    rows = floats(message.sensitivity, "sensitivity").astype(np.float64)
+    count = len(message.biases) * len(message.mean) // 8
+    rows = derivatives(message.sensitivity, count, "sensitivity")
     return rows.reshape(len(message.biases), -1)
 
 

@@ -5,7 +5,8 @@ robots differ significantly (`own`).
 
 Without truth the reference is the joined map and its paths, in alternation (expectation and
 maximisation). The join trusts odometry less, so that ranges set the scale. Only odometry scales,
-drag and veer are calibrated: a team cannot observe the scale of its own ranges.
+drag and veer are calibrated, and the clocks of detections against odometry: a team cannot observe
+the scale of its own ranges.
 
 Detections without identities give clutter and miss rates (`detections`). Submap consistency
 (`covariance_factor`, the monitor's `normal_scale`) is calibrated without truth in both cases, from
@@ -47,6 +48,8 @@ MISTRUST = 4.0
 ROUNDS = 2
 SYSTEMATIC = 0.02
 """Relative standard deviation of a forward scale from the joined map."""
+CLOCK_ROUNDS = 3
+"""Repetitions of the estimate of clocks from the joined map, which is linear in an offset."""
 TYPICAL_M = 3.0
 BETTER = 0.8
 """A range model is reported if it reduces σ at TYPICAL_M below this share."""
@@ -138,18 +141,47 @@ def _by_truth(
     true = [_positions(world) for _, world in worlds]
     of_central = central_figures(folds, scenario, strays, progress, true)
     findings = (*notes, *placed, *_alarms(of_motion, scenario), *_other_model(data, depth))
+    of_clocks = _clock_figures(found, scenario)
+    return Calibration(
+        of_motion, of_sensor, True, findings, of_central, own.robots, clocks=of_clocks
+    )
+
+
+def _clock_figures(found: Mapping[str, clocks.Clock], scenario: Scenario) -> Mapping[str, Figure]:
+    """`clock_offset_s` of every robot, if the two clocks of one differ."""
+    if not any(each.is_off for each in found.values()):
+        return {}
     known = {robot.id: robot.clock_offset_s for robot in scenario.robots}
-    of_clocks = {
+    return {
         robot: replace(
             clock.clock_offset_s,
             value=known.get(robot, 0.0) + (clock.clock_offset_s.value if clock.is_off else 0.0),
         )
         for robot, clock in found.items()
-        if any(each.is_off for each in found.values())
     }
-    return Calibration(
-        of_motion, of_sensor, True, findings, of_central, own.robots, clocks=of_clocks
-    )
+
+
+def _clocks_by_map(
+    worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
+) -> tuple[Sequence[tuple[str, WorldStreams]], Mapping[str, clocks.Clock]]:
+    """Move each robot's detections to its odometry's clock; returns the worlds and the clocks."""
+    robots = sorted({stream.robot for _, world in worlds for stream in world.streams})
+    moved, total = dict.fromkeys(robots, 0.0), {}
+    for turn in range(CLOCK_ROUNDS):
+        progress(f"clocks by the joined map, {turn + 1} of at most {CLOCK_ROUNDS}")
+        folds = [joined_team(world, scenario).fold for _, world in worlds]
+        found = {
+            robot: clock
+            for robot in robots
+            if (clock := clocks.clock_of_map(robot, folds)) is not None
+        }
+        total = {robot: clock.later(moved[robot]) for robot, clock in found.items()}
+        off = {robot: clock.detections.value for robot, clock in found.items() if clock.is_off}
+        if not off:
+            break
+        moved |= {robot: moved[robot] + seconds for robot, seconds in off.items()}
+        worlds = [(label, clocks.on_one_clock(world, found)) for label, world in worlds]
+    return worlds, total
 
 
 def against_truth(
@@ -187,6 +219,7 @@ def _by_the_map(
 ) -> Calibration:
     learnt = scenario
     figures: tuple[Figure, ...] = ()
+    worlds, of_clocks = _clocks_by_map(worlds, scenario, progress)
     for turn in range(ROUNDS):
         data, notes = [], []
         for label, world in worlds:
@@ -210,8 +243,10 @@ def _by_the_map(
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
-    findings = (note, *notes, *_alarms(figures, scenario))
-    return Calibration(figures, (), False, findings, of_central)
+    findings = (note, *notes, *clocks.clock_notes(of_clocks), *_alarms(figures, scenario))
+    return Calibration(
+        figures, (), False, findings, of_central, clocks=_clock_figures(of_clocks, scenario)
+    )
 
 
 def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:

@@ -5,8 +5,11 @@ shrunk towards the mean of all robots by the spread s of e:
 
     m + (v̄_r − m) τ²/(τ² + s²/n_r),    τ² = var(v̄_r) − mean(s²/n_r).
 
-Robots are alike unless τ² is significant for some constant (F test). s is a robust estimate, so one
-moved camera does not count.
+Robots are alike unless their constants together differ significantly: with W the joint covariance
+of one world's constants, Σ_r n_r (v̄_r − m)ᵀ W⁻¹ (v̄_r − m)/(p (R − 1)) is compared with the F
+distribution of p (R − 1) and Σ(n_r − 1) degrees of freedom. Constants are correlated: an offset and
+a scale of the range compensate each other. s is a robust estimate, so one moved camera does not
+count, and at least the standard deviation of the fit.
 
 Landmarks, too, have range-proportional errors common to all robots, such as a marker that hangs
 higher or is larger (`marker_spread`).
@@ -20,7 +23,7 @@ from scipy.stats import f as f_distribution
 
 from teamslam.sim.calibration.data import Reference
 from teamslam.sim.calibration.figures import CalibrationError, Figure, groups_of
-from teamslam.sim.calibration.sensor import MAD_TO_SIGMA, UNITS, constants, shares_by_landmark
+from teamslam.sim.calibration.sensor import MAD_TO_SIGMA, UNITS, joint_constants, shares_by_landmark
 from teamslam.team.shapes import Float
 
 LEAST_ROBOTS = 3
@@ -52,28 +55,33 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
     """Each robot's constants over the worlds (or time stretches, for few worlds)."""
     found: dict[str, list[Mapping[str, float]]] = {}
+    covariances = []
     worlds: dict[str, list[str]] = {}
     for group in groups_of(data):
         try:
-            values = constants(group, depth=depth).figures
+            values, covariance = joint_constants(group, depth=depth)
         except CalibrationError:
             continue
-        found.setdefault(group[0].robot, []).append(values)
+        covariances.append(covariance)
+        found.setdefault(group[0].robot, []).append(values.figures)
         worlds.setdefault(group[0].robot, []).append(group[0].name.rpartition(" ")[0])
     found = {robot: each for robot, each in sorted(found.items()) if len(each) > 1}
     if len(found) < LEAST_ROBOTS:
         return NOTHING_OF_ITS_OWN
     counts = np.array([len(each) for each in found.values()], dtype=float)
     robots: dict[str, list[Figure]] = {robot: [] for robot in found}
-    strays, differ = [], False
-    for name in next(iter(found.values()))[0]:
+    strays, off, spreads = [], [], []
+    of_fit = np.mean(covariances, axis=0)
+    sigmas = np.sqrt(np.diag(of_fit))
+    dof = len(counts) - 1, int(counts.sum()) - len(counts)
+    for name, sigma_of_fit in zip(next(iter(found.values()))[0], sigmas, strict=True):
         parts = [np.array([values[name] for values in each]) for each in found.values()]
         means = np.array([part.mean() for part in parts])
-        stray = _within(parts)
+        stray = max(_within(parts), float(sigma_of_fit))
         of_means = stray**2 / counts
         between = float(np.var(means, ddof=1))
-        dof = len(means) - 1, int(counts.sum()) - len(means)
-        differ |= between > float(of_means.mean() * f_distribution.ppf(BEYOND_DOUBT, *dof))
+        off.append(np.sqrt(counts) * (means - means.mean()))
+        spreads.append(stray)
         tau2 = max(between - float(of_means.mean()), 0.0)
         share = tau2 / (tau2 + of_means) if tau2 > 0.0 else np.zeros(len(means))
         drawn = means.mean() + share * (means - means.mean())
@@ -85,7 +93,10 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
             strays.append(Figure(f"bias_sigma.{BIAS_OF[name]}", further, error, UNITS[name]))
         if name == "range_scale":
             strays.append(_in_common(parts, [worlds[robot] for robot in found], stray))
-    if not differ:
+    scale = np.array(spreads) / sigmas
+    T2 = float(np.sum(np.array(off) * np.linalg.solve(of_fit * np.outer(scale, scale), off)))
+    numbers = len(spreads) * dof[0]
+    if T2 / numbers <= float(f_distribution.ppf(BEYOND_DOUBT, numbers, dof[1])):
         return NOTHING_OF_ITS_OWN
     return Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
 

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares, minimize
 
 from teamslam.central.desk.evaluation.errors import on_circle
 from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
-from teamslam.sim.calibration.figures import CalibrationError, huber
+from teamslam.sim.calibration.figures import HUBER, CalibrationError, huber
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import corrected
 from teamslam.team.shapes import Float, Int64
@@ -137,6 +138,45 @@ def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
     bursts. Raises CalibrationError for too few measurements.
     """
     return _constants(_enough(_rows(data)), depth)
+
+
+def joint_constants(
+    data: Sequence[Reference], *, depth: bool
+) -> tuple[Constants, Float[np.ndarray, "p p"]]:
+    """Fit the constants, with their joint covariance in the order of `Constants.figures`.
+
+    The covariance is (JᵀWJ)⁻¹ JᵀW diag(e²) WJ (JᵀWJ)⁻¹ with the residuals e, those of outliers
+    bounded (White 1980, A heteroskedasticity-consistent covariance matrix estimator).
+    """
+    rows = _enough(_rows(data))
+    found = _constants(rows, depth)
+    d, one = rows.distances, np.ones(len(rows.distances))
+    if found.axis is None:
+        along, columns = one, [one, d]
+        bent, of_bearing = one[:, np.newaxis] * found.bearing_offset, [one]
+    else:
+        from_axis = rows.bearings - found.axis
+        along = np.cos(from_axis)
+        columns = [one, d * along, found.range_scale * d * np.sin(from_axis)]
+        of_bearing = list((rows.bearings[:, np.newaxis] ** np.arange(4)).T)
+        bent = np.column_stack(of_bearing) * (found.bearing_offset, *found.lens)
+    ranged = rows.ranges - found.range_scale * d * along - found.range_offset
+    turned = on_circle(rows.bearing_errors - bent.sum(axis=1))
+    of_ranges = _sandwich(np.column_stack(columns), ranged, np.hypot(0.05, 0.04 * d))
+    of_bearings = _sandwich(np.column_stack(of_bearing), turned, one)
+    joint = block_diag(of_ranges, of_bearings)
+    order = [0, 1, 2] if found.axis is None else [0, 1, 3, 4, 5, 6, 2]
+    return found, joint[np.ix_(order, order)]
+
+
+def _sandwich(
+    J: Float[np.ndarray, "n p"], error: Float[np.ndarray, " n"], sigma: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "p p"]:
+    weighted, e = J / sigma[:, np.newaxis], error / sigma
+    bound = HUBER * MAD_TO_SIGMA * float(np.median(np.abs(e)))
+    scores = weighted * np.clip(e, -bound, bound)[:, np.newaxis]
+    inverse = np.linalg.inv(weighted.T @ weighted)
+    return np.asarray(inverse @ (scores.T @ scores) @ inverse)
 
 
 def _enough(rows: _Rows) -> _Rows:

@@ -656,7 +656,7 @@ class MotionModel:
     def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
         """
         Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
-        times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.
+        times the measured one; zero where |forward| lies in `calibrated_speed`.
         """
 
 def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
@@ -703,8 +703,8 @@ class Odometry:
         """
         End the motion since the last keyframe here.
 
-        Returns it, its shift by an error of the scale of speed, and the motion since the last scan without
-        identities, if there was one.
+        Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the
+        motion since the last scan without identities, if there was one.
         """
 
     def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
@@ -988,7 +988,7 @@ class Window:
 
         own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
         resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,
-        in (forward, left, turn), by an error of the scale of speed.
+        in (forward, left, turn), by an error of the scale of speed, with the motion's duration [s].
         Raises MotionError, and leaves the window as it was.
         """
 
@@ -1036,7 +1036,7 @@ class Window:
         """
         Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.
 
-        Returns a row for each of bearing, forward_scale, range_offset and range_scale, by the window's smoother
+        Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother
         about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.
         """
 

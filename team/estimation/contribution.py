@@ -19,7 +19,13 @@ Stream: TypeAlias = tuple[str, int]
 Key: TypeAlias = tuple[int, str, int, int]
 """(end stamp, robot, incarnation, sequence): a submap's place in the canonical order."""
 RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
-    {"bearing": 1, "range_offset": 0, "range_scale": 1, "forward_scale": -1}
+    {
+        "bearing": 1,
+        "clock_offset": 0,
+        "forward_scale": -1,
+        "range_offset": 0,
+        "range_scale": 1,
+    }
 )
 """The power of a landmark's range with which each bias moves it; -1: it moves none."""
 UNIX_S = 1e9

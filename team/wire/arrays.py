@@ -29,7 +29,7 @@ Ids = bytes
 Stamps = bytes
 """int64 nanoseconds, little-endian."""
 
-_SIZES = {"<f8": 8, "<u4": 4, "<i8": 8, "u1": 1}
+_SIZES = {"<f8": 8, "<f4": 4, "<u4": 4, "<i8": 8, "u1": 1}
 FEW = 16
 """Largest number of plain floats that are encoded without an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
@@ -45,6 +45,17 @@ def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
 def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
     """Return a read-only float64 view."""
     return _array(data, "<f8", what)
+
+
+def derivatives(data: bytes, count: int, what: str) -> "np.typing.NDArray[np.float64]":
+    """Return `count` derivatives as float64: float32 on the wire, float64 in older logs."""
+    dtype = "<f8" if len(data) == 8 * count else "<f4"
+    found = _array(data, dtype, what)
+    if len(found) != count:
+        raise ValueError(f"wrong length: {what} has {len(found)} numbers, {count} expected")
+    if not np.isfinite(found).all():
+        raise ValueError(f"not finite: {what}")
+    return found.astype(np.float64)
 
 
 def ids(data: Ids, what: str) -> "np.typing.NDArray[np.uint32]":
@@ -65,6 +76,11 @@ def octets(data: bytes, what: str) -> "np.typing.NDArray[np.uint8]":
 def from_floats(values: Any) -> Floats:
     """Encode as little-endian float64 bytes, C order."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def from_derivatives(values: Any) -> bytes:
+    """Encode as little-endian float32 bytes, C order."""
+    return np.ascontiguousarray(values, dtype="<f4").tobytes()
 
 
 def from_numbers(values: Sequence[float]) -> Floats:

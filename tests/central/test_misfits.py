@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -27,6 +28,8 @@ def test_the_landmark_that_does_not_fit_is_named_and_no_other(
 ) -> None:
     place = write(world, tmp_path)
     scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
+    robust = msgspec.structs.replace(scenario.central, robust_c=1.0)  # else it enters the biases
+    scenario = msgspec.structs.replace(scenario, central=robust)
     fused = final_map(list(run_team(scenario, streams_of(scenario))))
     named = [each for each in fused.reasons if "does not fit: cost" in each]
     wanted = [] if landmark is None else [f"landmark {landmark} does not fit"]

@@ -23,7 +23,7 @@ from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.sim.world.config import OutlierKind, SimulatedWorld
 from teamslam.sim.world.simulator import simulated
 from teamslam.team import translate
-from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.config import CALIBRATED, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.map_joining.joining import converged
 from teamslam.team.estimation.map_joining.marginals import (
     Agreement,
@@ -43,8 +43,11 @@ MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.0
 
 
 def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
-    """A small world in which robots meet; each submap has a pose node or two."""
-    front = FrontEnd(particles=20, window_s=5.0, node_s=5.0)
+    """A small world in which robots meet; each submap has a pose node or two.
+
+    Without self-calibration, which would explain wheels that are a third too large.
+    """
+    front = FrontEnd(particles=20, window_s=5.0, node_s=5.0, biases=())
     world = SimulatedWorld(
         steps=steps, size_m=25.0, landmark_count=15, visible_from_m=1.0, visible_to_m=10.0
     )
@@ -190,6 +193,19 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) ->
     found = landmark_map(converged(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
+
+
+def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimated() -> None:
+    of = scenario()
+    team = tuple(
+        msgspec.structs.replace(
+            each, front_end=msgspec.structs.replace(each.front_end, biases=CALIBRATED)
+        )
+        for each in of.robots
+    )
+    final = final_map(run(msgspec.structs.replace(of, robots=team), "odometry"))
+    assert final.withdrawn == ()
+    assert any("r3 drives -2" in each and "than its odometry" in each for each in final.reasons)
 
 
 def test_no_number_of_robots_withdraws_a_robot_by_what_they_report() -> None:

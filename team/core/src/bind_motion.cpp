@@ -83,7 +83,7 @@ void bind_model(nb::module_& m) {
           },
           "duration_s"_a, "forward"_a, "yaw_rate"_a,
           "Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)\n"
-          "times the measured one; zero where |forward| lies in `calibrated_speed`, and without such a range.");
+          "times the measured one; zero where |forward| lies in `calibrated_speed`.");
 }
 
 }  // namespace
@@ -136,14 +136,14 @@ void bind_motion(nb::module_& m) {
       .def(
           "end_keyframe",
           [](Odometry& self) {
-            const auto [motion, shift, rest] = self.end_keyframe();
+            const auto [motion, shift, seconds, rest] = self.end_keyframe();
             std::optional<MadeIncrement> since_unnamed;
             if (rest) since_unnamed = made_increment(*rest);
-            return std::tuple(made_increment(motion), made_twist(shift), since_unnamed);
+            return std::tuple(made_increment(motion), made_numbers({shift.forward, shift.left, shift.turn, seconds}), since_unnamed);
           },
           "End the motion since the last keyframe here.\n\n"
-          "Returns it, its shift by an error of the scale of speed, and the motion since the last scan without\n"
-          "identities, if there was one.")
+          "Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the\n"
+          "motion since the last scan without identities, if there was one.")
       .def("pass_unnamed_scan", [](Odometry& self) { return made_increment(self.pass_unnamed_scan()); },
            "Return the motion since the last scan without identities or keyframe; this is such a scan.")
       .def("mark_scan", &Odometry::mark_scan, "A scan of a keyframe of several scans is here.")

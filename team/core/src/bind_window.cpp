@@ -99,9 +99,12 @@ Rows path_of(const Stack& paths, std::size_t count) {
   return path;
 }
 
-window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Triple>& shift = std::nullopt) {
+window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Quadruple>& shift = std::nullopt) {
   window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-  if (shift) increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
+  if (shift) {
+    increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
+    increment.seconds = (*shift)(3);
+  }
   return increment;
 }
 
@@ -260,7 +263,7 @@ void bind_window(nb::module_& m) {
           "advance",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
              const Numbers& bearings, const Table& own, std::optional<double> uniform, const Table& normals,
-             const std::optional<Triple>& shift) {
+             const std::optional<Quadruple>& shift) {
             check(!uniform || (*uniform >= 0.0 && *uniform < 1.0), "uniform must be in [0, 1)");
             return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own),
                                 uniform.value_or(window::NO_RESAMPLING), normals_of(normals, self.settings().particles));
@@ -269,7 +272,7 @@ void bind_window(nb::module_& m) {
           "Take a keyframe: the motion since the last one, then its measurements (there may be none).\n\n"
           "own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are\n"
           "resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,\n"
-          "in (forward, left, turn), by an error of the scale of speed.\n"
+          "in (forward, left, turn), by an error of the scale of speed, with the motion's duration [s].\n"
           "Raises MotionError, and leaves the window as it was.")
       .def(
           "step",
@@ -284,7 +287,7 @@ void bind_window(nb::module_& m) {
       .def(
           "move",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Table& normals,
-             const std::optional<Triple>& shift) {
+             const std::optional<Quadruple>& shift) {
             self.move(increment_of(motion, covariance, shift), normals_of(normals, self.settings().particles));
           },
           "motion"_a, "covariance"_a, "normals"_a, "shift"_a = nb::none(),
@@ -335,7 +338,7 @@ void bind_window(nb::module_& m) {
           },
           "mean"_a, "with_nodes"_a,
           "Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.\n\n"
-          "Returns a row for each of bearing, forward_scale, range_offset and range_scale, by the window's smoother\n"
+          "Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother\n"
           "about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.")
       .def_prop_ro(
           "has_shifts",

@@ -172,15 +172,14 @@ Numbers Estimate::prior_chi2() const {
   return found;
 }
 
-// Cauchy's for a robot's own bias, 1 for all others. A sensor changed since its calibration is one
-// robot's: its prior is an outlier, and must not draw the other robots' biases away through the common
-// errors. Markers do not change; the error of a marker seen from one side only is distinguished from its
+// Cauchy's for a robot's own bias, 1 for all others. Most sensors are as their configuration states, to
+// within the prior; one that is not is far off, and must not draw the other robots' biases away through
+// the common errors: a prior with the tails of Student's t of one degree of freedom. Markers do not change; the error of a marker seen from one side only is distinguished from its
 // landmark's position by its prior alone.
 Numbers Estimate::prior_weights() const {
   Numbers found(graph_->priors.size(), 1.0);
-  if (loss_.robust_c)
-    for (std::size_t k = 0; k < found.size(); k++)
-      if (graph_->priors[k].is_of_bias) found[k] = 1.0 / (1.0 + prior_terms()[k].chi2 / squared(*loss_.robust_c));
+  for (std::size_t k = 0; k < found.size(); k++)
+    if (graph_->priors[k].is_of_bias) found[k] = 1.0 / (1.0 + prior_terms()[k].chi2);
   return found;
 }
 
@@ -210,18 +209,14 @@ double Estimate::cost_of_factors(const Marked& marked) const {
   const std::size_t submaps = scale_.size(), sightings = sighting_scale_.size(), priors = of_priors.size();
   const auto is_submap = [&](std::size_t f) { return marked.submaps[f]; };
   const auto is_sighting = [&](std::size_t s) { return marked.sightings[s]; };
+  const double prior_cost = sum(priors, [&](std::size_t k) { return marked.priors[k]; },
+                                [&](std::size_t k) { return graph_->priors[k].is_of_bias ? loss_of(of_priors[k], 1.0) : of_priors[k]; });
   if (!loss_.robust_c) {
-    const double cost = sum(submaps, is_submap, [&](std::size_t f) { return chi2()[f]; }) +
-                        sum(priors, [&](std::size_t k) { return marked.priors[k]; }, [&](std::size_t k) { return of_priors[k]; });
+    const double cost = sum(submaps, is_submap, [&](std::size_t f) { return chi2()[f]; }) + prior_cost;
     return cost + sum(sightings, is_sighting, [&](std::size_t s) { return sighting_chi2()[s]; });
   }
-  const Numbers scales = squared_scales(), weights = prior_weights();
-  double cost = sum(submaps, is_submap, [&](std::size_t f) { return loss_of(chi2()[f], scales[f]); });
-  const double c2 = squared(*loss_.robust_c);
-  const double of_biases = sum(priors, [&](std::size_t k) { return weights[k] < 1.0 && marked.priors[k]; },
-                               [&](std::size_t k) { return loss_of(of_priors[k], c2); });
-  cost += of_biases + sum(priors, [&](std::size_t k) { return !(weights[k] < 1.0) && marked.priors[k]; },
-                          [&](std::size_t k) { return of_priors[k]; });
+  const Numbers scales = squared_scales();
+  double cost = sum(submaps, is_submap, [&](std::size_t f) { return loss_of(chi2()[f], scales[f]); }) + prior_cost;
   const auto& [own, gate] = landmark_chi2_and_gate();
   Numbers beyond;
   for (std::size_t f = 0; f < submaps; f++)

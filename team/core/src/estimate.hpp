@@ -1,8 +1,8 @@
 // A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
 //
 // Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ρ(prior) + condensed factor, where ρ is
-// the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting; of the priors only
-// those of biases have a loss. With a loss each landmark of a submap has a weight of its own as well:
+// the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting; of the priors those of
+// single robots' biases, and only they, have Cauchy's loss, always. With a loss each landmark of a submap has a weight of its own as well:
 // beyond the gate g its χ² counts g (1 + log(χ²/g)), whose slope, the weight, is g/χ².
 #pragma once
 

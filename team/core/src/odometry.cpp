@@ -29,14 +29,14 @@ void Odometry::go_on(Increment step, Point<double> column, double duration_s, co
   since_keyframe_ = compose(since_keyframe_, of_scanner);
   if (since_unnamed_) since_unnamed_ = compose(*since_unnamed_, of_scanner);
   in_keyframe_ = se2::compose(in_keyframe_, step.mean);
-  if (model_.calibrated_speed) {
-    const Motion carried = shift_after(shift_, step.mean);
-    shift_ = {carried.forward + shift.forward, carried.left + shift.left, carried.turn + shift.turn};
-  }
+  const Motion carried = shift_after(shift_, step.mean);
+  shift_ = {carried.forward + shift.forward, carried.left + shift.left, carried.turn + shift.turn};
+  seconds_ += duration_s;
 }
 
 Odometry::Keyframe Odometry::end_keyframe() {
-  return {std::exchange(since_keyframe_, {}), std::exchange(shift_, {}), std::exchange(since_unnamed_, std::nullopt)};
+  return {std::exchange(since_keyframe_, {}), std::exchange(shift_, {}), std::exchange(seconds_, 0.0),
+          std::exchange(since_unnamed_, std::nullopt)};
 }
 
 Increment Odometry::pass_unnamed_scan() {

@@ -24,6 +24,7 @@ class Odometry {
   struct Keyframe {
     Increment motion;
     Motion shift;                   // of the motion by an error of the scale of speed
+    double seconds;                 // that the motion lasted
     std::optional<Increment> rest;  // the motion since the last scan without identities
   };
   // Ends the motion since the last keyframe here.
@@ -52,6 +53,7 @@ class Odometry {
   std::optional<Pose<double>> mount_;
   Increment since_keyframe_, since_node_;
   Motion shift_{};
+  double seconds_ = 0.0;
   std::optional<Increment> since_unnamed_;
   Pose<double> in_keyframe_{};  // since the end of the last keyframe of several scans
   std::vector<Pose<double>> scans_;

@@ -10,43 +10,72 @@ namespace {
 
 using se2::Point;
 
+// Time [s] on each side of a keyframe over which its twist is averaged, where the window has it.
+constexpr double TWIST_S = 0.25;
+
 // Added to each motion's variances [m², m², rad²].
 constexpr double JITTER[3] = {1e-7, 1e-7, 1e-9};
 
-// Range or bearing of a measurement: ∂h by the pose's error and by the landmark, and its variance.
+using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
+
+// Range or bearing of a measurement: ∂h by the pose's error and by the landmark, its variance, and its
+// answer to each bias where pose and landmark stay.
 struct Line {
   double H[5], variance;
+  Shifts shifts{};
 };
 
 // A measurement, linearised. The bearing's line is less its regression on the range's, so that both are
 // independent.
 struct Sight {
   std::size_t keyframe, landmark;
-  double distance, slope;  // slope: of the regression
   Line range, bearing;
 };
 
-using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
+// The twist (forward, left, turn per second) of each pose but the end: of the motion from TWIST_S before
+// to TWIST_S after. Both sides count alike, so that a pose's own error does not enter.
+std::vector<se2::Motion> twists_of(const std::vector<Pose<double>>& path, std::span<const WindowMotion> motions) {
+  std::vector<se2::Motion> found(path.size());
+  for (std::size_t k = 0; k < path.size(); k++) {
+    std::size_t first = k + 1, last = k;  // the motions between them; pose k is the end of motion k
+    double before = 0.0, after = 0.0;
+    while (first > 0 && before < TWIST_S) before += motions[--first].seconds;
+    while (last + 1 < path.size() && after < TWIST_S) after += motions[++last].seconds;
+    if (!(before + after > 0.0)) continue;
+    const auto [forward, left, turn] = se2::logarithm(se2::between(first ? path[first - 1] : Pose<double>{}, path[last]));
+    const double rate = 1.0 / (before + after);
+    found[k] = {rate * forward, rate * left, rate * turn};
+  }
+  return found;
+}
 
 Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& pose, const Point<double>& at,
-               const Noise& noise) {
+               const Noise& noise, const se2::Motion& twist) {
   const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
   const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
   const auto of_landmark = models::landmark_jacobian(d, direction);
   const double range_variance = noise.range_variance + noise.range_per_m2 * d * d;
-  Sight sight{z.keyframe, landmark, d, 0.0, {{}, range_variance}, {{}, noise.bearing_variance}};
+  Sight sight{z.keyframe, landmark, {{}, range_variance}, {{}, noise.bearing_variance}};
   const auto set = [](Line& line, const std::array<double, 3>& by_pose, const std::array<double, 2>& by_landmark) {
     std::copy(by_pose.begin(), by_pose.end(), line.H);
     std::copy(by_landmark.begin(), by_landmark.end(), line.H + 3);
   };
   set(sight.range, of_pose[0], of_landmark[0]);
   set(sight.bearing, of_pose[1], of_landmark[1]);
+  double slope = 0.0;  // of the regression
   if (z.claim.is_made()) {
-    sight.slope = z.claim.rb / z.claim.rr;
+    slope = z.claim.rb / z.claim.rr;
     sight.range.variance = z.claim.rr;
-    sight.bearing.variance = z.claim.bb - sight.slope * z.claim.rb;
-    for (std::size_t i = 0; i < 5; i++) sight.bearing.H[i] -= sight.slope * sight.range.H[i];
+    sight.bearing.variance = z.claim.bb - slope * z.claim.rb;
+    for (std::size_t i = 0; i < 5; i++) sight.bearing.H[i] -= slope * sight.range.H[i];
   }
+  sight.range.shifts[RANGE_OFFSET] = 1.0;
+  sight.range.shifts[RANGE_SCALE] = d;
+  sight.bearing.shifts[BEARING] = 1.0;
+  sight.bearing.shifts[RANGE_OFFSET] = -slope;
+  sight.bearing.shifts[RANGE_SCALE] = -slope * d;
+  for (Line* line : {&sight.range, &sight.bearing})
+    line->shifts[CLOCK_OFFSET] = -(line->H[0] * twist.forward + line->H[1] * twist.left + line->H[2] * twist.turn);
   return sight;
 }
 
@@ -54,22 +83,12 @@ Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<doub
 void add_sight(dense::View A, dense::View B, const Sight& z, std::size_t chain) {
   const std::size_t pose = 3 * z.keyframe, landmark = chain + 2 * z.landmark;
   const std::size_t at[5] = {pose, pose + 1, pose + 2, landmark, landmark + 1};
-  const auto add = [&](const Line& line, std::size_t i) {
-    const double weighted = line.H[i] / line.variance;
-    for (std::size_t j = 0; j < 5; j++) A[at[i]][at[j]] += weighted * line.H[j];
-    return weighted;
-  };
-  for (std::size_t i = 0; i < 5; i++) {
-    const double weighted = add(z.range, i);
-    B[at[i]][RANGE_OFFSET] -= weighted;
-    B[at[i]][RANGE_SCALE] -= weighted * z.distance;
-  }
-  for (std::size_t i = 0; i < 5; i++) {
-    const double weighted = add(z.bearing, i);
-    B[at[i]][BEARING] -= weighted;
-    B[at[i]][RANGE_OFFSET] += weighted * z.slope;
-    B[at[i]][RANGE_SCALE] += weighted * z.slope * z.distance;
-  }
+  for (const Line* line : {&z.range, &z.bearing})
+    for (std::size_t i = 0; i < 5; i++) {
+      const double weighted = line->H[i] / line->variance;
+      for (std::size_t j = 0; j < 5; j++) A[at[i]][at[j]] += weighted * line->H[j];
+      for (std::size_t b = 0; b < BIASES; b++) B[at[i]][b] -= weighted * line->shifts[b];
+    }
 }
 
 // Sums over the measurements of one landmark, given the answers of their residuals.
@@ -117,12 +136,7 @@ GivenPath landmark_given(dense::Const xi, std::span<const Sight> sights, std::si
   std::vector<Shifts> of_ranges, of_bearings;
   for (const Sight& z : sights) {
     if (z.landmark != landmark) continue;
-    Shifts range{}, bearing{};
-    range[RANGE_OFFSET] = 1.0;
-    range[RANGE_SCALE] = z.distance;
-    bearing[BEARING] = 1.0;
-    bearing[RANGE_OFFSET] = -z.slope;
-    bearing[RANGE_SCALE] = -z.slope * z.distance;
+    Shifts range = z.range.shifts, bearing = z.bearing.shifts;
     add_answer(range, z.range, xi, z.keyframe);
     add_answer(bearing, z.bearing, xi, z.keyframe);
     ranges.push_back(&z.range);
@@ -159,11 +173,13 @@ Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, b
 
   const std::size_t chain = 3 * path.size();
   dense::Matrix A(chain + 2 * L, chain + 2 * L), B(chain + 2 * L, BIASES);
+  const std::vector<se2::Motion> twists = twists_of(path, window.motions());
   std::vector<Sight> sights;
   for (const WindowMeasurement& z : window.measurements()) {
     const std::size_t landmark = std::size_t(std::lower_bound(ids.begin(), ids.end(), z.id) - ids.begin());
     const Point<double> at{mean[first + 2 * landmark], mean[first + 2 * landmark + 1]};
-    sights.push_back(sight_of(z, landmark, path[z.keyframe], mount.is_mounted() ? away.base_point(at) : at, noise));
+    sights.push_back(sight_of(z, landmark, path[z.keyframe], mount.is_mounted() ? away.base_point(at) : at, noise,
+                              twists[z.keyframe]));
   }
   for (std::size_t k = 0; k < path.size(); k++) {
     const WindowMotion& motion = window.motions()[k];

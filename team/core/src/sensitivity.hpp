@@ -12,9 +12,10 @@
 
 namespace teamslam::window {
 
-// The errors: a bearing reads b too much, the way driven is (1 + b) times the odometry's, a range reads
-// b too much, or (1 + b) times itself.
-enum Bias : std::size_t { BEARING, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE, BIASES };
+// The errors: a bearing reads b too much, a measurement is stamped b too late against the odometry (it
+// was made at the pose x ∘ Exp(−b τ), with the twist τ), the way driven is (1 + b) times the odometry's,
+// a range reads b too much, or (1 + b) times itself.
+enum Bias : std::size_t { BEARING, CLOCK_OFFSET, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE, BIASES };
 
 // A row for each Bias over (end pose, pose nodes, landmarks by ascending id), in the base's frame.
 struct Sensitivity {

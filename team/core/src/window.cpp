@@ -5,7 +5,7 @@ namespace teamslam::window {
 namespace {
 
 Lower3 factor_of(const Increment& increment) {
-  const auto& [mean, covariance, shift] = increment;
+  const auto& [mean, covariance, shift, seconds] = increment;
   const Lower3 L = linalg::semidefinite_factor(covariance);
   if (!L.is_finite()) throw MotionError("not positive semi-definite");
   if (!std::isfinite(mean.forward) || !std::isfinite(mean.left) || !std::isfinite(mean.turn))
@@ -84,6 +84,7 @@ void Window::keep(const Increment& increment) {
   WindowMotion& motion = motions_.emplace_back();
   for (std::size_t i = 0; i < 9; i++) motion.covariance[i / 3][i % 3] = increment.covariance[i];
   motion.shift = increment.shift;
+  motion.seconds = increment.seconds;
 }
 
 double Window::take(const Increment& increment, const Lower3& L, const Scan& scan, std::span<const Reading> readings,

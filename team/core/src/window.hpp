@@ -19,18 +19,20 @@ struct Settings {
   se2::Mount mount;
 };
 
-// The motion since the last keyframe; its covariance, and its shift by an error of the scale of speed, in
-// the tangent space of its end.
+// The motion since the last keyframe, which lasted `seconds`; its covariance, and its shift by an error of
+// the scale of speed, in the tangent space of its end.
 struct Increment {
   Motion mean;
   std::span<const double, 9> covariance;
   std::array<double, 3> shift{};
+  double seconds = 0.0;
 };
 
-// The motion to a keyframe, or after the last one: its noise and its shift.
+// The motion to a keyframe, or after the last one: its noise, its shift and its duration.
 struct WindowMotion {
   linalg::Matrix3 covariance;
   std::array<double, 3> shift;
+  double seconds;
 };
 
 // Measurements of landmarks, corrected by the calibration; an id may occur twice. claims: the

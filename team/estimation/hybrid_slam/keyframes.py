@@ -32,7 +32,8 @@ class Keyframe(msgspec.Struct, frozen=True, gc=False):
     looks: the scans without identities since the last keyframe, as they came. rest: the motion
     since the last of them; None: there is none.
     is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
-    forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
+    forward: the motion's shift by an error of the scale of speed, and its duration
+    (`core.Odometry`).
     """
 
     stamp_ns: int
@@ -44,7 +45,7 @@ class Keyframe(msgspec.Struct, frozen=True, gc=False):
     looks: tuple[KeyframeScan, ...] = ()
     rest: Increment | None = None
     is_node: bool = False
-    forward: Float[np.ndarray, "3"] = msgspec.field(default_factory=lambda: np.zeros(3))
+    forward: Float[np.ndarray, "4"] = msgspec.field(default_factory=lambda: np.zeros(4))
 
     def __post_init__(self) -> None:
         if len(self.own) != len(self.ids):
@@ -89,7 +90,7 @@ class Segmenter:
         self._waiting: list[KeyframeScan] = []
         self._keyframe: list[KeyframeScan] = []
         self._keyframe_start_ns = 0
-        self.rest_forward = np.zeros(3)
+        self.rest_forward = np.zeros(4)
         self._last = STANDING
         self._unmeasured: tuple[float, float, float] | None = None
         self.now_ns: int | None = None
@@ -186,7 +187,7 @@ class Segmenter:
         """Close the window here: returns its last keyframe, if one is open, and the motion after
         it.
 
-        The shift of that motion by an error of the scale of speed is `rest_forward`.
+        `rest_forward` is the `Keyframe.forward` of that motion.
         """
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
         rest, self.rest_forward, _ = self._odometry.end_keyframe()

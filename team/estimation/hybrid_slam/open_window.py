@@ -90,9 +90,7 @@ class OpenWindow:
         self._try(self._settle)
 
     def move(self, rest: Increment, forward: np.ndarray) -> None:
-        """Take the motion after the last keyframe; forward: its shift by an error of the scale
-        of speed.
-        """
+        """Take the motion after the last keyframe; forward: as of `Keyframe`."""
         if rest.mean.any() or rest.covariance.any():
             self._motions.append(rest)
             self._try(self._go, rest, forward)

@@ -23,7 +23,7 @@ from teamslam.team.estimation.se2 import tangent
 from teamslam.team.estimation.submap import NO_NODES, LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
-STILL = np.zeros(3)
+STILL = np.zeros(4)
 
 
 class Window(msgspec.Struct, gc=False):
@@ -103,7 +103,7 @@ def advance(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
     random: core.Random,
-    forward: Float[np.ndarray, "3"] = STILL,
+    forward: Float[np.ndarray, "4"] = STILL,
     *,
     own: Own | None = None,
 ) -> None:
@@ -111,7 +111,8 @@ def advance(
 
     The measurements are accepted and corrected already (`models.scanned`). The innovation does not
     count them where their predictive covariance is singular.
-    forward: the motion's shift by an error of the scale of speed (`core.Odometry`).
+    forward: the motion's shift by an error of the scale of speed, and its duration
+    (`core.Odometry`).
     own: the noises that the measurements claim (`teamslam.team.estimation.scans`).
     Raises NotACovarianceError, and leaves the window as it was.
     """
@@ -138,7 +139,7 @@ def move(
     window: Window,
     increment: Increment,
     random: core.Random,
-    forward: Float[np.ndarray, "3"] = STILL,
+    forward: Float[np.ndarray, "4"] = STILL,
 ) -> None:
     """Move the particles without a keyframe, as from the last one to the window's end.
 
@@ -189,7 +190,7 @@ def motion_alone(motion: Increment) -> LocalMap:
 def _sensitivity(
     window: Window, mean: Float[np.ndarray, " n"], running: bool
 ) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"]]:
-    """The biases, and the derivatives of the window's mean by them.
+    """The biases, and the derivatives of the window's mean by them, as precise as in a message.
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
@@ -198,4 +199,5 @@ def _sensitivity(
     rows, fault = window.core.sensitivity(mean, not running)
     if fault:
         raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    return biases, rows[[BIASES.index(bias) for bias in biases]]
+    chosen = rows[[BIASES.index(bias) for bias in biases]]
+    return biases, chosen.astype(np.float32).astype(np.float64)

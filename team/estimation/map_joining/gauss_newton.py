@@ -2,7 +2,8 @@
 rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
-prior), where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting.
+prior), where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting;
+that of a robot's own bias is always Cauchy's.
 A robust factor enters with a wide scale that narrows with each iteration since it was added, so
 that a true loop closure is not taken for an outlier before the chain has adapted to it.
 
@@ -59,9 +60,9 @@ class JoinSettings:
     solve ends when no unknown changes by more than step_tolerance [m, rad], or after
     max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
     alignment_heading_sigma: for the same, largest standard deviation [rad] of the heading from the
-    shape of the shared landmarks. bias_sigma: prior standard deviation of each error that a robot's
-    submaps share. common_bias_sigma: the same for errors that all robots share, in addition;
-    "marker": the share of the range by which all robots measure one landmark too far.
+    shape of the shared landmarks. bias_sigma: scale of the Cauchy prior on each error that a
+    robot's submaps share. common_bias_sigma: standard deviation of those that all robots share, in
+    addition; "marker": the share of the range by which all robots measure one landmark too far.
     joined_ranges: whether errors of ranges are proportional to the range in the joined map
     (`core.SubmapFactor.at_joined_ranges`). landmark_sigma: standard deviation [m], per direction,
     of the measured point, the same for all robots, about the landmark's place: part of a map's

@@ -310,13 +310,14 @@ def extended(
 
     A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
     first submap that observes it. A stream without an initial pose is fixed at (0, 0, 0): the gauge
-    of its frame. A bias is N(0, bias_sigma²), a common error N(0, common_bias_sigma²). numbers: for
+    of its frame. A bias has scale bias_sigma about 0 (submaps with one that has no scale are taken
+    without biases), a common error is N(0, common_bias_sigma²). numbers: for
     submaps with unnamed landmarks, the team's number of each landmark; other submaps contain them.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
     submaps = list(graph.submaps)
-    for contribution in contributions:
+    for contribution in (_with_states(each, bias_sigma) for each in contributions):
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
             start = starts.get(stream, InitialPoseFactor(*stream, np.zeros(3)))
@@ -371,6 +372,13 @@ def extended(
         memory=graph.memory,
     )
     return grown, np.concatenate([state, *growth.values])
+
+
+def _with_states(contribution: Contribution, bias_sigma: Mapping[Bias, float]) -> Contribution:
+    """Take a submap with a bias that has no scale without biases."""
+    if bias_sigma.keys() >= {*contribution.local.biases}:
+        return contribution
+    return replace(contribution, local=contribution.local.without_biases)
 
 
 def _in_common(

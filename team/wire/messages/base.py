@@ -17,7 +17,7 @@ Document = Annotated[str, Meta(max_length=1_000_000)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 StampNs = Annotated[int, Meta(ge=-(2**62), lt=2**62)]
 Digest = Annotated[bytes, Meta(min_length=8, max_length=8)]
-Bias = Literal["bearing", "forward_scale", "range_offset", "range_scale"]
+Bias = Literal["bearing", "clock_offset", "forward_scale", "range_offset", "range_scale"]
 Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
 """A finite number: the bounds reject NaN and the infinities."""
 

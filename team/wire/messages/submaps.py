@@ -5,7 +5,7 @@ from itertools import pairwise
 
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import check_ascending, check_finite, check_packed_covariance
-from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
+from teamslam.team.wire.arrays import Floats, Ids, Stamps, derivatives, ids, stamps
 from teamslam.team.wire.messages.base import (
     Bias,
     Count,
@@ -27,8 +27,9 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed
     upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings:
     number of its SightingFactor messages. biases: errors that the robot's submaps share, B of them,
-    ascending; sensitivity: B × n floats, the mean's derivative by each: given the error b of the
-    bearings [rad], of the scale of the ranges or of the speed, the mean is mean + b · sensitivity.
+    ascending; sensitivity: B × n float32 (float64 in older logs), the mean's derivative by each:
+    given the error b of the bearings [rad], of the detections' clock [s], of the scale of the
+    ranges or of the speed, the mean is mean + b · sensitivity.
     gated: number of rejected landmark measurements, which no others of the window confirmed.
 
     ids from 2³¹ on are unnamed landmarks, associated in the window: 2³¹ + a local index. counts:
@@ -51,7 +52,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     nodes: Stamps = b""
     sightings: Count = 0
     biases: tuple[Bias, ...] = ()
-    sensitivity: Floats = b""
+    sensitivity: bytes = b""
     gated: Count = 0
     counts: Ids = b""
     seen: bytes = b""
@@ -64,7 +65,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
         n = 3 + 3 * len(times) + 2 * len(ids(self.ids, "ids"))
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
-        check_finite(self.sensitivity, "sensitivity", n * len(self.biases))
+        derivatives(self.sensitivity, n * len(self.biases), "sensitivity")
         if any(a >= b for a, b in pairwise(self.biases)):
             raise ValueError("not ascending: biases")
         if not (times[1:] > times[:-1]).all():

@@ -26,7 +26,13 @@ from teamslam.team.wire import channels as ch
 from tests.estimation.submap_world import local_truth, team, wrap
 from tests.teams import config, driven, of, published
 
-SIGMA = {"bearing": 0.01, "forward_scale": 0.05, "range_offset": 0.02, "range_scale": 0.01}
+SIGMA = {
+    "bearing": 0.01,
+    "clock_offset": 0.01,
+    "forward_scale": 0.05,
+    "range_offset": 0.02,
+    "range_scale": 0.01,
+}
 MOTION = MotionModel(
     "turn-then-drive",
     MotionNoise(per_s=0.02),
@@ -38,7 +44,7 @@ MOTION = MotionModel(
 # --- the columns of a window ---
 
 
-def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
+def window_of(bearing, clock_offset, forward_scale, range_offset, range_scale, white=1.0):
     """A robot drives a curve among six landmarks, read without noise but with these errors."""
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
     front = FrontEnd(particles=1600, resample_below=0.0, biases=BIASES)
@@ -47,10 +53,12 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
     pose = np.zeros(3)
     for _ in range(8):
         pose = se2.compose(pose, increment_of(MOTION, 1.0, 1.0, 0.1).mean)
-        offset = landmarks - pose[:2]
+        earlier = increment_of(MOTION, -clock_offset, 1.0, 0.1).mean
+        there = se2.compose(pose, earlier)
+        offset = landmarks - there[:2]
         ranges = np.hypot(*offset.T)
-        seen = np.flatnonzero(ranges < 8.0)
-        bearings = wrap(np.arctan2(*offset.T[::-1]) - pose[2])[seen]
+        seen = np.flatnonzero(np.hypot(*(landmarks - pose[:2]).T) < 8.0)
+        bearings = wrap(np.arctan2(*offset.T[::-1]) - there[2])[seen]
         windows.advance(
             window,
             increment_of(MOTION, 1.0, 1.0 / (1.0 + forward_scale), 0.1),
@@ -58,7 +66,7 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
             ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
-            model_of(MOTION).forward_column(1.0, 1.0, 0.1),
+            np.append(model_of(MOTION).forward_column(1.0, 1.0, 0.1), 1.0),
         )
     return windows.gaussian(window)
 
@@ -66,7 +74,13 @@ def window_of(bearing, forward_scale, range_offset, range_scale, white=1.0):
 @pytest.mark.parametrize("white", [1.0, 0.3])
 @pytest.mark.parametrize(
     ("bias", "size"),
-    [("bearing", 4e-3), ("range_offset", 0.02), ("range_scale", 4e-3), ("forward_scale", 1e-2)],
+    [
+        ("bearing", 4e-3),
+        ("clock_offset", 0.02),
+        ("range_offset", 0.02),
+        ("range_scale", 4e-3),
+        ("forward_scale", 1e-2),
+    ],
 )
 def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements(bias, size, white):
     errors = dict.fromkeys(BIASES, 0.0)
@@ -83,12 +97,12 @@ def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
     step, column = (
         increment_of(motion, 1.0, 1.0, 0.1),
-        model_of(motion).forward_column(1.0, 1.0, 0.1),
+        np.append(model_of(motion).forward_column(1.0, 1.0, 0.1), 1.0),
     )
     windows.advance(window, step, *seen, random, column)
     local = windows.gaussian(window)
-    assert local.biases == ("bearing", "range_offset", "range_scale")
-    assert local.sensitivity.shape == (3, 5)
+    assert local.biases == ("bearing", "clock_offset", "range_offset", "range_scale")
+    assert local.sensitivity.shape == (4, 5)
 
 
 def test_columns_change_nothing_else():
@@ -117,7 +131,7 @@ def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
         own = np.empty((len(ids), 0))
         if k == 3:
             own = np.array([[0.05, 0.006, 0.002, 0.0], [0.0, 0.0, 0.0, -1.0]])
-        shift = rng.normal(size=3)
+        shift = np.append(rng.normal(size=3), rng.uniform(0.2, 1.0))
         normals = rng.standard_normal((5, 3))
         window.advance(step.mean, step.covariance, ids, ranges, bearings, own, None, normals, shift)
         motions.append((step.covariance, shift))
@@ -138,15 +152,17 @@ def stated(window, motions, points):
     K, W, biased = len(path), [], []
     for covariance, shift in motions:
         W.append(np.linalg.inv(covariance + np.diag([1e-7, 1e-7, 1e-9])))
-        biased.append([[0.0, -each, 0.0, 0.0] for each in shift])
+        biased.append([[0.0, 0.0, -each, 0.0, 0.0] for each in shift[:3]])
     for k, landmark, claim in zip(keyframes, seen, own, strict=True):
-        distance = np.hypot(*(points[np.searchsorted(ids, landmark)] - path[k][:2]))
+        slot = np.searchsorted(ids, landmark)
+        distance = np.hypot(*(points[slot] - path[k][:2]))
         variance = white.range_variance + white.range_per_m2 * distance**2
         R = np.diag([variance, white.bearing_variance])
         if claim[3] >= 0.0:
             R = np.array([[claim[0], claim[1]], [claim[1], claim[2]]])
         W.append(np.linalg.inv(R))
-        biased.append([[0.0, 0.0, 1.0, distance], [1.0, 0.0, 0.0, 0.0]])
+        late = measured_later(path, [each[3] for _, each in motions], k, points[slot])
+        biased.append([[0.0, late[0], 0.0, 1.0, distance], [1.0, late[1], 0.0, 0.0, 0.0]])
 
     def residuals(x):
         poses = [se2.compose(p, se2.exponential(x[3 * k : 3 * k + 3])) for k, p in enumerate(path)]
@@ -170,6 +186,27 @@ def stated(window, motions, points):
         weights[at : at + len(block), at : at + len(block)] = block
         at += len(block)
     return -np.linalg.solve(J.T @ weights @ J, J.T @ weights @ np.vstack(biased))
+
+
+def measured_later(path, seconds, k, point):
+    """How range and bearing change with the delay of their stamp, by differences along the motion
+    from a quarter of a second before keyframe k to a quarter after.
+    """
+    ends, times = [np.zeros(3), *path], np.append(0.0, np.cumsum(seconds))
+    first = max(j for j in range(k + 1) if j == 0 or times[k + 1] - times[j] >= 0.25)
+    last = min(
+        j for j in range(k + 1, len(ends)) if j == len(path) or times[j] - times[k + 1] >= 0.25
+    )
+    step = se2.logarithm(se2.between(ends[first], ends[last])) / (times[last] - times[first])
+
+    def seen(delay):
+        d = se2.transformed(
+            se2.inverse(se2.compose(path[k], se2.exponential(-delay * step))), point
+        )
+        return np.array([np.hypot(*d), np.arctan2(d[1], d[0])])
+
+    change = seen(1e-6) - seen(-1e-6)
+    return np.array([change[0], wrap(change[1])]) / 2e-6
 
 
 SMOOTHED = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.02)
@@ -196,8 +233,8 @@ def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(
                 of_base(se2.compose(path[k], se2.exponential(h * xi))) for h in (1e-6, -1e-6)
             )
             np.testing.assert_allclose(row, wrap_pose(up - down) / 2e-6, rtol=1e-5, atol=1e-5)
-    expected = answer[:, 18:].reshape(4, -1, 2) @ turn.T
-    np.testing.assert_allclose(rows[:, 9:], expected.reshape(4, -1), rtol=1e-5, atol=1e-5)
+    expected = answer[:, 18:].reshape(5, -1, 2) @ turn.T
+    np.testing.assert_allclose(rows[:, 9:], expected.reshape(5, -1), rtol=1e-5, atol=1e-5)
 
 
 def wrap_pose(difference):
@@ -207,7 +244,7 @@ def wrap_pose(difference):
 def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
     window = core.Window(5, noise_of(SMOOTHED))
     rows, fault = window.sensitivity(np.zeros(3), True)
-    assert rows.shape == (4, 3)
+    assert rows.shape == (5, 3)
     assert not rows.any()
     assert fault == 0
     assert not window.has_shifts
@@ -414,7 +451,7 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
 
     assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
-    assert plain.estimate.prior_weights[k] == 1.0
+    assert plain.estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     graph, h = island.graph, 1e-4 * sigma
     counts = len(graph.submaps), len(graph.sightings), len(graph.priors)
     marks = [np.full(count, k == 2) for k, count in enumerate(counts)]

@@ -77,7 +77,9 @@ def test_the_scale_of_unseen_speeds_is_estimated_from_the_ranges() -> None:
     assert run.scale == pytest.approx(1.0, abs=0.008)
     assert run.map.errors is not None
     assert run.map.errors.in_band
-    assert any("odometry not calibrated at these speeds" in words for words in run.map.reasons)
+    told = [words for words in run.map.reasons if "farther than its odometry measures" in words]
+    assert len(told) == 3
+    assert all("drives +" in words for words in told)
     assert not any("not valid" in words for words in run.map.reasons)
 
 
