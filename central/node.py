@@ -64,7 +64,7 @@ class CentralNode:
         )
         self._door = Door(robots)
         self._admits = admit
-        self._maps: tuple[m.SavedMap, ...] = ()
+        self._loaded: tuple[m.SavedMap, ...] = ()
         self._admitted: list[str] = []
         self._broadcasts = 0
         self._begin_set()
@@ -94,13 +94,13 @@ class CentralNode:
 
     def load_maps(self, maps: Sequence[m.SavedMap]) -> None:
         """Load saved maps of earlier days, before `begin`."""
-        self._maps = tuple(maps)
+        self._loaded = tuple(maps)
 
     def begin(self) -> list[Outgoing]:
         """Make the first messages of the node: its configuration, and the maps of earlier days."""
-        for saved in self._maps:
+        for saved in self._loaded:
             self.file(saved)
-        maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._maps]
+        maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._loaded]
         return [Outgoing(ch.CENTRAL_CONFIG, "", self.announcement), *maps]
 
     # Receive.

@@ -14,6 +14,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import msgspec
 
+from teamslam.team.config import MAP
 from teamslam.team.containment import Boundary
 from teamslam.team.spare_time import SpareTime
 from teamslam.team.the_end import TheEnd
@@ -76,8 +77,9 @@ def judge(boundary: Boundary, final: FusedMap | None) -> None:
 def lacking(final: FusedMap) -> str:
     """Describe the robots that the final map lacks; empty: none."""
     found = []
-    if final.withdrawn:
-        found.append(f"the final map is without {', '.join(final.withdrawn)}: withdrawn")
+    robots = [each for each in final.withdrawn if not each.startswith(MAP)]
+    if robots:
+        found.append(f"the final map is without {', '.join(robots)}: withdrawn")
     if final.lost:
         names = ", ".join(final.lost)
         found.append(f"the final map is provisional: {names} lost, and not wholly in it")

@@ -17,7 +17,7 @@ from teamslam.sim.cli.help import NETWORK, RARE
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
-from teamslam.team.config import Estimator, FusionRule
+from teamslam.team.config import MAP, Estimator, FusionRule
 from teamslam.team.wire.text import lines, one_line
 
 if TYPE_CHECKING:
@@ -328,10 +328,10 @@ def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
 
 
 def check_names(team: str, robot: str | None = None) -> None:
-    """Exit if a robot's or team's name is invalid."""
+    """Exit if a team's name is invalid, or a robot's, which may be that of a saved map."""
     from teamslam.team.keys.roster import ROBOT, TEAM
 
-    if robot is not None and not ROBOT.fullmatch(robot):
+    if robot is not None and not ROBOT.fullmatch(robot.removeprefix(MAP)):
         fail(f"{robot!r} is no robot's name", WRONG_USE)
     if not TEAM.fullmatch(team):
         fail(f"{team!r} is no team's name", WRONG_USE)

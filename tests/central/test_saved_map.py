@@ -1,15 +1,18 @@
 """A saved map of an earlier day joins that of a later one, shows what moved, and may be wrong."""
 
 import dataclasses
+import json
 from functools import cache
 
 import msgspec
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from teamslam.central.desk.verification.centre import recomputed_centre, recorded_map
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.node import CentralNode, make_centre
+from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.air import Air
 from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -18,6 +21,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.estimation.gaussian import unpacked
 from teamslam.team.estimation.map_joining.alignment import aligned, procrustes
+from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import SavedMapError, map_figures, read_map, submap_of, write_map
 from teamslam.team.store import SubmapStore
 from teamslam.team.wire import channels as ch
@@ -280,6 +284,34 @@ def test_the_submap_of_a_map_has_landmarks_and_no_motion():
     submap = decoded(encoded(msgspec.structs.replace(submap_of(first_day()[1]), robot="r1")))
     assert isinstance(submap, m.Submap)
     assert not floats(submap.mean, "mean")[:3].any()
+
+
+def test_the_commands_save_show_and_load_a_map(tmp_path):
+    """`map save` of a log, `map show` of the file; `rerun --map` of a later day loads it."""
+    log, later, site = (tmp_path / name for name in ("log.mcap", "later.mcap", "site.map"))
+    for path, samples in ((log, first_day()[0]), (later, second_day(loaded=False)[0])):
+        with Recorder(path, "small", {"seed": "1"}) as recorder:
+            recorder.write(samples)
+    run = CliRunner().invoke
+    made = run(app, ["map", "save", str(log), "-o", str(site)])
+    assert made.exit_code == 0, made.output
+    assert read_map(site) == first_day()[1]
+    shown = run(app, ["map", "show", str(site), "--json", str(tmp_path / "site.json")])
+    assert shown.exit_code == 0
+    assert "landmark,x,y,sigma_x,sigma_y,submaps" in shown.output
+    assert len(json.loads((tmp_path / "site.json").read_text())["landmarks"]) == 18
+    again = run(app, ["rerun", str(later), "--map", str(site), "--json", str(tmp_path / "x.json")])
+    assert again.exit_code == 0, again.output
+    changes = json.loads((tmp_path / "x.json").read_text())["recomputed"]["changes"]
+    assert [each["state"] for each in changes] == ["unchanged"] * 18
+    assert {"landmark", "state", "dx_m", "dy_m", "sigma_m", "chi2"} <= changes[0].keys()
+    for words in (["map", "show", str(log)], ["rerun", str(log), "--map", str(log)]):
+        wrong = run(app, words)
+        assert wrong.exit_code == 2
+        assert "no saved map" in wrong.output
+    named = run(app, ["map", "save", str(log), "-o", str(tmp_path / "A map.map")])
+    assert named.exit_code == 2
+    assert "--name" in named.output
 
 
 def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> WorldStreams:

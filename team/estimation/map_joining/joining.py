@@ -300,7 +300,7 @@ def folded(
         waiting=waiting,
         landmarks=landmarks,
     )
-    return separated(_with_merges(_with_searches(grown)), SEQUENTIAL)
+    return _separated(_with_merges(_with_searches(grown)), SEQUENTIAL, contributions)
 
 
 def compacted(fold: Fold) -> Fold:
@@ -357,19 +357,23 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     )
 
 
-def separated(fold: Fold, chance: float) -> Fold:
+def _separated(fold: Fold, chance: float, newest: Sequence[Contribution] | None = None) -> Fold:
     """Separate the landmarks that have moved since a saved map from their former places.
 
-    The worst one first; each island is solved again before its next one is tested.
+    The worst one first; its island is solved again before the next one is tested. newest: the
+    submaps whose landmarks are tested; None: all.
     """
     islands = dict(fold.islands)
     for key, island in fold.islands.items():
-        if len(island.graph.streams) == sum(map(is_map, island.graph.streams)) or not maps_of(
-            island.graph
-        ):
+        if not maps_of(island.graph):
             continue
+        nodes = None
+        if newest is not None:
+            new = {id(each) for each in newest if not is_map(each.stream)}
+            submaps = (s for s in island.graph.submaps if id(s.contribution) in new)
+            nodes = {node for each in submaps for node in each.landmarks.tolist()}
         with suppress(*UNSOLVABLE):
-            while (found := next_change(islands[key], chance)) is not None:
+            while (found := next_change(islands[key], chance, nodes)) is not None:
                 apart = separate(islands[key], found[0], [found[1].landmark])
                 islands[key] = iterated(apart)
     return replace(fold, islands=islands)
@@ -382,7 +386,7 @@ def _with_changes(fold: Fold) -> Fold:
         with suppress(*UNSOLVABLE):
             for stream, id_ in returned(island, FALSE_ALARM):
                 islands[key] = iterated(reunite(islands[key], stream, id_))
-    return separated(replace(fold, islands=islands), FALSE_ALARM)
+    return _separated(replace(fold, islands=islands), FALSE_ALARM)
 
 
 def _search(island: Island) -> Search:

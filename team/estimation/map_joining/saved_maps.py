@@ -11,7 +11,7 @@ degrees of freedom. A landmark beyond the limit gets a second node, its former p
 alone has; the others are tested again without it, the worst first.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import Stream, is_map, named
-from teamslam.team.estimation.gaussian import NotACovarianceError, deviation, information
+from teamslam.team.estimation.gaussian import deviation, information
 from teamslam.team.estimation.map_joining.alignment import aligned
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import Graph, Joined, tied, with_former
@@ -65,20 +65,25 @@ def maps_of(graph: Graph) -> list[Joined]:
     return sorted(found, key=lambda each: each.contribution.stream)
 
 
-def displacements(island: Island, saved: Joined) -> list[Displacement]:
+def displacements(
+    island: Island, saved: Joined, among: Collection[int] | None = None
+) -> list[Displacement]:
     """Estimate the displacement of each landmark of a saved map that others observed, by id.
 
-    Landmarks of which the rest of the map gives no test are left out.
+    among: the nodes of landmarks to test, without those that are apart; None: all. Landmarks of
+    which the rest of the map gives no test are left out.
     """
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     nodes = saved.landmarks.tolist()
-    by_others = _observed_by_others(island.graph, saved)
+    by_others = _observed_by_others(island.graph, saved) if among is None else among
     tested = [k for k, node in enumerate(nodes) if node in by_others and node in id_of]
     found = [
         Displacement(id_of[nodes[k]], *each)
         for k, each in zip(tested, _tests(island, saved, tested), strict=True)
         if each is not None
     ]
+    if among is not None:
+        return sorted(found, key=lambda each: each.landmark)
     stream = saved.contribution.stream
     for (of, id_), former in island.graph.former.items():
         if of == stream and id_ in island.graph.landmarks:
@@ -183,13 +188,18 @@ def reunite(island: Island, stream: Stream, id_: int) -> Island:
     return replace(island, graph=graph, state=state)
 
 
-def next_change(island: Island, chance: float) -> tuple[Joined, Displacement] | None:
-    """Find the landmark that disagrees most with its place in a saved map, beyond chance."""
+def next_change(
+    island: Island, chance: float, nodes: Collection[int] | None = None
+) -> tuple[Joined, Displacement] | None:
+    """Find the landmark that disagrees most with its place in a saved map, beyond chance.
+
+    nodes: the landmarks to test; None: all.
+    """
     limit = chi2_limit(2, chance)
     found = [
         (each.chi2, saved, each)
         for saved in maps_of(island.graph)
-        for each in displacements(island, saved)
+        for each in displacements(island, saved, nodes)
         if not each.is_apart and each.chi2 > limit
     ]
     if not found:
@@ -229,9 +239,10 @@ def disagreeing(
 ) -> list[int] | str:
     """Find the landmarks of two islands, one with a saved map, that moved between them.
 
-    The largest set of landmarks that one rigid motion places within `confidence` is taken from all
-    pairs; then those that disagree with the rest are removed, the worst first, and those that agree
-    are added again. Returns the reason if fewer than half of the landmarks agree.
+    Where not all agree within `confidence`, the largest set of landmarks that one rigid motion
+    places is taken from all pairs; then those that disagree with the rest are removed, the worst
+    first, and those that agree are added again. Returns the reason if no more than half of the
+    landmarks agree.
     """
     n = len(ids)
     in_main = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
@@ -239,9 +250,14 @@ def disagreeing(
     a, A = in_main[0].reshape(-1, 2), in_main[1]
     b, B = in_other[0].reshape(-1, 2), in_other[1]
     limit = chi2_limit(2, 1.0 - confidence)
-    agree = _largest_agreement(a, A, b, B, limit)
+    agree = np.ones(n, np.bool_)
+    chi2 = _disagreements(a, A, b, B, agree)
+    if chi2.max() > limit:
+        agree = _largest_agreement(a, A, b, B, limit)
+        if agree.sum() < LEAST_AGREEING:
+            return _refusal(main, other, n, int(agree.sum()))
     for _ in range(n):
-        chi2 = _leave_one_out(a, A, b, B, agree)
+        chi2 = _disagreements(a, A, b, B, agree)
         worst = int(np.argmax(np.where(agree, chi2, -np.inf)))
         if chi2[worst] > limit and agree.sum() > LEAST_AGREEING:
             agree[worst] = False
@@ -251,14 +267,18 @@ def disagreeing(
             break
         agree[best] = True
     count = int(agree.sum())
-    if count < LEAST_AGREEING or 2 * count <= n:
-        of = next(each for island in (main, other) for each in maps_of(island.graph))
-        return (
-            f"{n} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
-            f"{count} are at one place; it is the map of another site, or half of the site has "
-            "changed"
-        )
+    if 2 * count <= n:
+        return _refusal(main, other, n, count)
     return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
+
+
+def _refusal(main: Island, other: Island, shared: int, agreeing: int) -> str:
+    of = next(each for island in (main, other) for each in maps_of(island.graph))
+    return (
+        f"{shared} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
+        f"{agreeing} are at one place; it is the map of another site, or half of the site has "
+        "changed"
+    )
 
 
 def _largest_agreement(
@@ -321,35 +341,46 @@ def _turned(P: Float[np.ndarray, "n 2 2"], s: float, c: float) -> Float[np.ndarr
     return found
 
 
-def _leave_one_out(
+def _disagreements(
     a: Float[np.ndarray, "n 2"],
     A: Float[np.ndarray, "m m"],
     b: Float[np.ndarray, "n 2"],
     B: Float[np.ndarray, "m m"],
     agree: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """χ² of two degrees of freedom of each landmark against the others that agree."""
-    found = np.full(len(a), np.inf)
-    for k in range(len(a)):
-        others = agree.copy()
-        others[k] = False
-        with_k = others.copy()
-        with_k[k] = True
-        try:
-            costs = [_cost(a, A, b, B, each) for each in (with_k, others)]
-        except NotACovarianceError:
-            continue
-        found[k] = costs[0] - costs[1]
+    """χ² of two degrees of freedom of each landmark against the others that agree.
+
+    With the differences d = a − (R b + t) at the motion of the landmarks I that agree, their
+    covariance D and their Jacobian J by the motion of covariance N: of one in I it is that of the
+    module's equation; another one k is predicted as D_kI D_II⁻¹ d_I.
+    """
+    n, inside = len(a), np.repeat(agree, 2)
+    of = np.ix_(inside, inside)
+    x, y, turn = aligned(a[agree], A[of], b[agree], B[of]).a_from_b
+    s, c = core.sin_and_cos(turn)
+    R = np.array([[c, -s], [s, c]])
+    turned = dense.product(b, R.T)
+    d = (a - turned - [x, y]).ravel()
+    T = np.kron(np.eye(n), R)
+    D = A + dense.product(dense.product(T, B), T.T)
+    J = np.zeros((2 * n, 3))
+    J[0::2, 0] = J[1::2, 1] = 1.0
+    J[0::2, 2], J[1::2, 2] = -turned[:, 1], turned[:, 0]
+    W = information(D[of], "the shared landmarks of two maps")
+    gain = dense.product(D[:, inside], W)
+    along = dense.product(W, J[inside])
+    N = information(dense.product(J[inside].T, along), "the motion between two maps")
+    M = W - dense.product(dense.product(along, N), along.T)
+    g = dense.product(W, d[inside])
+    G = J - dense.product(gain, J[inside])
+    e = d - dense.product(gain, d[inside])
+    S = D - dense.product(gain, D[inside]) + dense.product(dense.product(G, N), G.T)
+    found = np.empty(n)
+    place = np.cumsum(agree) - 1
+    for k in range(n):
+        at = 2 * int(place[k]) if agree[k] else 2 * k
+        block, own = (M, g) if agree[k] else (S, e)
+        two = slice(at, at + 2)
+        metric = information(0.5 * (block[two, two] + block[two, two].T), "a difference")
+        found[k] = float(dense.product(dense.product(own[two], metric), own[two]))
     return found
-
-
-def _cost(
-    a: Float[np.ndarray, "n 2"],
-    A: Float[np.ndarray, "m m"],
-    b: Float[np.ndarray, "n 2"],
-    B: Float[np.ndarray, "m m"],
-    which: Bool[np.ndarray, " n"],
-) -> float:
-    rows = np.repeat(which, 2)
-    both = np.ix_(rows, rows)
-    return aligned(a[which], A[both], b[which], B[both]).chi2

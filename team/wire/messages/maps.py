@@ -286,8 +286,9 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
         counts = ids(self.counts, "counts")
         if len(counts) != n or not counts.min():
             raise ValueError(f"wrong length: counts are not {n} positive numbers")
-        for name, each in (("biases", self.biases), ("sets", self.sets)):
-            if any(a >= b for a, b in pairwise(each)):
-                raise ValueError(f"not ascending: {name}")
+        if any(a >= b for a, b in pairwise(self.biases)):
+            raise ValueError("not ascending: biases")
+        if any(a >= b for a, b in pairwise(self.sets)):
+            raise ValueError("not ascending: sets")
         if not self.sets:
             raise ValueError("out of bounds: a map of no set")
