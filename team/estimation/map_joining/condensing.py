@@ -143,9 +143,9 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
-    graph, c = island.graph, island.settings.robust_c
+    graph = island.graph
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
-    narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c
+    narrow = (island.scale <= 1.0) | (not island.settings.robust)
     leaving = np.zeros(len(graph.submaps), np.bool_)
     blocked = set[Stream]()
     for f, (contribution, *_) in enumerate(graph.submaps):
