@@ -13,7 +13,8 @@ namespace {
 // hundred.
 constexpr double EVIDENCE = 4.605170185988092;
 constexpr double JITTER[3] = {1e-6, 1e-6, 1e-8};  // added to each motion's variances [m², m², rad²]
-constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 200;
+constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 100;
+constexpr double MOST_REJECTED = 0.1;
 constexpr int ROUNDS = 5;                         // of classifying and smoothing; it comes to rest in two or three
 
 // A symmetric 2 × 2 covariance of range and bearing.
@@ -216,8 +217,20 @@ Consensus::Smoothed Consensus::started() const {
 }
 
 std::vector<bool> Consensus::confirmed() const {
+  std::vector<bool> taken = confirmed_by_others();
+  double compared = 0.0, rejected = 0.0;
+  for (const auto& [id, landmark] : landmarks_)
+    for (const std::size_t n : landmark.measurements)
+      if (landmark.measurements.size() > 1) compared += 1.0, rejected += taken[n] ? 0.0 : 1.0;
+  if (rejected > MOST_REJECTED * compared)
+    for (const auto& [id, landmark] : landmarks_)
+      if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = false;
+  return taken;
+}
+
+std::vector<bool> Consensus::confirmed_by_others() const {
   const std::vector<bool> agreed = agreeing();
-  if (motions_.size() > MOST_SMOOTHED || std::find(agreed.begin(), agreed.end(), false) == agreed.end()) return agreed;
+  if (agreed.empty() || motions_.size() > MOST_SMOOTHED) return agreed;
   Smoothed window = started();
   if (window.metrics.size() < window.path.size()) return agreed;
   std::vector<bool> taken = agreed;

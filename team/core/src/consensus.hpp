@@ -40,8 +40,9 @@ class Consensus {
   //
   // The smoother estimates poses and landmarks by least squares over the odometry and the accepted
   // measurements; then every measurement is compared with its prediction from the others. Where the
-  // normal equations have no solution in floating point, the window has more than MOST_SMOOTHED scans,
-  // or all measurements agree, nothing more is rejected.
+  // normal equations have no solution in floating point or the window has more than MOST_SMOOTHED
+  // scans, nothing more is rejected. Where more than a tenth of the measurements that others could
+  // confirm are rejected, the only measurement of a landmark is rejected too.
   std::vector<bool> confirmed() const;
 
  private:
@@ -63,6 +64,7 @@ class Consensus {
   struct Smoothed;
 
   double odds() const;
+  std::vector<bool> confirmed_by_others() const;
   Support support_of(const Landmark& landmark, double odds) const;
   Smoothed started() const;
   bool smooth(Smoothed& window, const std::vector<bool>& taken) const;

@@ -117,7 +117,7 @@ class OpenWindow:
         most = self._config.bounds.submap_landmarks
         bounded = nearest_landmarks(keyframe, self.particles.landmarks, most)
         if self._gate.add(bounded):
-            self._take(self._gate.keyframes[-1])
+            self._take(self._gate.last)
         else:
             self._take_all(self._gate.keyframes)
 

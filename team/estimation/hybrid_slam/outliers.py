@@ -33,6 +33,7 @@ class OutlierGate:
         """Begin a window."""
         sensor = self._sensor
         self._all: list[Keyframe] = []
+        self._begins = [0]
         self._accepted: Bool[np.ndarray, " n"] = np.zeros(0, np.bool_)
         self._consensus = core.Consensus(
             noise_of(sensor), sensor.max_range, sensor.field_of_view, OUTLIER_SHARE
@@ -46,17 +47,21 @@ class OutlierGate:
     @property
     def keyframes(self) -> Sequence[Keyframe]:
         """The keyframes, reduced to their accepted measurements."""
-        if self._accepted.all():
-            return self._all
-        bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._all)])
-        return [
-            keyframe.only(self._accepted[begin:end])
-            for keyframe, begin, end in zip(self._all, bounds, bounds[1:], strict=False)
-        ]
+        return [self._reduced(k) for k in range(len(self._all))]
+
+    @property
+    def last(self) -> Keyframe:
+        """The last keyframe, reduced to its accepted measurements."""
+        return self._reduced(len(self._all) - 1)
+
+    def _reduced(self, k: int) -> Keyframe:
+        accepted = self._accepted[self._begins[k] : self._begins[k + 1]]
+        return self._all[k] if accepted.all() else self._all[k].only(accepted)
 
     def add(self, keyframe: Keyframe) -> bool:
         """Add a keyframe; return whether all measurements accepted before it stay accepted."""
         self._all.append(keyframe)
+        self._begins.append(self._begins[-1] + len(keyframe.ids))
         with refused_by_name():
             self._consensus.add(
                 keyframe.increment.mean,

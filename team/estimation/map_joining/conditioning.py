@@ -47,7 +47,7 @@ TRUSTING = JoinSettings(robust=False)
 """Settings of plain least squares."""
 DOUBTING = JoinSettings(submap_gate=math.inf, landmark_gate=GATE)
 """Settings that discount landmarks beyond a narrowing gate, but no submap as a whole."""
-DISPUTED = JoinSettings(landmark_gate=GATE)
+DISPUTED = JoinSettings(submap_gate=0.5, landmark_gate=GATE)
 """Settings for contradictory input: a whole submap, or the map, may be down-weighted."""
 FEWEST = 2
 """Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a

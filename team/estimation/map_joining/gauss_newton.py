@@ -14,7 +14,7 @@ does not break the robot's chain. The weight enters as additional variance of th
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -308,9 +308,27 @@ def settled(island: Island) -> tuple[Island, int, float]:
     """Solve in full from this state; return also the number of iterations and the last change [m,
     rad].
 
-    The robust scale of every factor is annealed anew. The solve ends when converged, after
+    Without robust weights first: where no factor of that solution is beyond its gate, it is the
+    robust solution. Else the gates of all factors narrow anew. A solve ends when converged, after
     `max_iterations`, or where no step lowers the cost; the last change shows whether it converged.
     """
+    if island.settings.robust:
+        with suppress(*UNSOLVABLE):
+            plain, *end = _descended(replace(island, settings=replace(island.settings, robust=False)))
+            found = aged(replace(plain, settings=island.settings), FULL_AGE)
+            if not _has_outliers(found):
+                return (found, *end)
+    return _descended(island)
+
+
+def _has_outliers(island: Island) -> bool:
+    """Whether a factor or a landmark of a submap is beyond its gate."""
+    at = island.estimate
+    weights = at.weights, at.landmark_weights, at.sighting_weights, at.prior_weights
+    return any((each < 1.0).any() for each in weights)
+
+
+def _descended(island: Island) -> tuple[Island, int, float]:
     settings = island.settings
     island = aged(island, None)
     damping, change, count = 0.0, math.inf, 0
