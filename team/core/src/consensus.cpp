@@ -362,16 +362,18 @@ std::vector<bool> Consensus::misread(const Smoothed& window, std::span<const dou
     for (std::size_t n = 0; n < taken.size(); n++) {
       const auto& [scan, reading] = measurements_[n];
       const std::size_t l = window.slots[n];
-      if (!taken[n] || l == m || count[l] < 2.0 || count[l] > count[m]) continue;
+      if (!taken[n] || l == m || count[l] > count[m]) continue;
       const Polar as_other = models::polar(window.path[scan], window.landmarks[m]);
       const auto [e0, e1, rr, rb, bb] = models::innovation_of(reading, as_other);
       const Covariance2 M = window.spread(jacobian_of(as_other, window.path[scan].heading), scan, m);
       predicted[l] += log_density(e0, e1, {rr + M.rr, rb + M.rb, bb + M.bb});
     }
     for (std::size_t l = 0; l < L; l++) {
-      if (l == m || count[l] < 2.0 || count[l] > count[m]) continue;
-      const double own = total[l] * (count[l] - 1.0) / count[l] - (odds() - prior_);
-      if (count[l] * own_name + own - predicted[l] < EVIDENCE) doubtful[l] = true;
+      if (l == m || count[l] == 0.0 || count[l] > count[m]) continue;
+      const bool is_alone = count[l] == 1.0;
+      const double by_others = is_alone ? 0.0 : total[l] * (count[l] - 1.0) / count[l];
+      const double evidence = count[l] * own_name + by_others - (odds() - prior_) - predicted[l];
+      if (evidence < (is_alone ? 0.0 : EVIDENCE)) doubtful[l] = true;
     }
   }
   return doubtful;

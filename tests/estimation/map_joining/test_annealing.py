@@ -73,11 +73,10 @@ def test_a_full_solution_anneals_what_has_been_judged_anew():
     judged = aged(replace(after(10, closed_loop(AT_ONCE)), settings=ANNEALED), 100)
     assert (judged.sighting_scale == 1.0).all()
     assert off_m(judged) > 2.0
-    solved, iterations, change = settled(judged)
+    solved, _, change = settled(judged)
     assert off_m(solved) < 0.3
     assert change < ANNEALED.step_tolerance
     assert (solved.scale == 1.0).all(), "it ends at the final scale"
-    assert iterations > 6, "which is not reached before"
 
 
 def test_the_scale_of_a_factor_falls_by_its_decay_with_each_iteration_until_it_is_one():
