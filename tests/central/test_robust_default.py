@@ -38,9 +38,7 @@ def final(world: StressWorld, folder: Path) -> MapResult:
 def errors_of_rest(found: MapResult) -> MapErrors:
     kept = np.flatnonzero(found.known & ~np.isin(found.ids, WRONG))
     rows = np.column_stack([2 * kept, 2 * kept + 1]).ravel()
-    return map_errors(
-        found.means[kept], found.covariance[np.ix_(rows, rows)], found.truth[kept]
-    )
+    return map_errors(found.means[kept], found.covariance[np.ix_(rows, rows)], found.truth[kept])
 
 
 @pytest.fixture(scope="module")

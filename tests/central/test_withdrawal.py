@@ -290,10 +290,7 @@ def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
     """The small world with three in ten measurements spoilt."""
     of = scenario(landmark_submaps=2)
     replaced = msgspec.structs.replace
-    team = tuple(
-        replaced(r, front_end=replaced(r.front_end, particles=40))
-        for r in of.robots
-    )
+    team = tuple(replaced(r, front_end=replaced(r.front_end, particles=40)) for r in of.robots)
     world = replaced(of.world, outlier_share=0.3, outlier_kind=kind)
     return replaced(of, world=world, robots=team, seed=seed)
 

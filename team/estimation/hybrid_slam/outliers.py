@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import noise_of, refused_by_name
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.shapes import Bool
 
 OUTLIER_SHARE = 0.01
 """Probability of an outlier before the window's measurements are compared. A landmark measurement

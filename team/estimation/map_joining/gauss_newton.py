@@ -42,7 +42,7 @@ STILL = 1e-3
 tenth of the shift by condensing (docs/decisions/25).
 """
 PLAIN = 1e9
-"""Robust scale at which Cauchy's loss is χ² to the last bit."""
+"""Widening of gates beyond every χ²."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -314,7 +314,9 @@ def settled(island: Island) -> tuple[Island, int, float]:
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):
-            plain, *end = _descended(replace(island, settings=replace(island.settings, robust=False)))
+            plain, *end = _descended(
+                replace(island, settings=replace(island.settings, robust=False))
+            )
             found = aged(replace(plain, settings=island.settings), FULL_AGE)
             if not _has_outliers(found):
                 return (found, *end)

@@ -19,7 +19,6 @@ from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import ids
 from tests.teams import config, driven, published, stream
 
 
@@ -133,4 +132,3 @@ def test_with_outliers_the_map_is_nearly_that_of_the_good_measurements(
     kind: str, clean_rmse: float
 ) -> None:
     assert aligned_rmse(world_with(kind)) < 1.3 * clean_rmse
-

@@ -54,7 +54,9 @@ def apart(one, other):
     return difference @ np.linalg.solve(a.covariance, difference) / len(difference)
 
 
-@pytest.mark.parametrize("settings", [JoinSettings(robust=False), ROBUST], ids=["squares", "robust"])
+@pytest.mark.parametrize(
+    "settings", [JoinSettings(robust=False), ROBUST], ids=["squares", "robust"]
+)
 @pytest.mark.parametrize("seed", range(2))
 def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
     full, bounded = both(team(seed, submaps=20), settings)
@@ -120,7 +122,9 @@ def test_an_inter_robot_measurement_that_was_left_out_is_not_restored():
 
 
 @pytest.mark.parametrize(
-    ("settings", "near"), [(JoinSettings(robust=False), 1e-4), (ROBUST, 1e-3)], ids=["squares", "robust"]
+    ("settings", "near"),
+    [(JoinSettings(robust=False), 1e-4), (ROBUST, 1e-3)],
+    ids=["squares", "robust"],
 )
 def test_an_iteration_that_would_hardly_move_a_condensed_fold_is_left_out(
     monkeypatch, settings, near

@@ -242,7 +242,14 @@ def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_i
     options = JoinSettings(landmark_gate=gate, step_tolerance=1e-9)
     fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
     costs, graph = joint_cost(fold).submaps, fold.main.graph
-    assert min(fold.main.estimate.landmark_weights if gate < np.inf else [each.weight for each in costs]) < 0.3
+    assert (
+        min(
+            fold.main.estimate.landmark_weights
+            if gate < np.inf
+            else [each.weight for each in costs]
+        )
+        < 0.3
+    )
     redundancy = sum(each.dof for each in costs)
     assert redundancy == pytest.approx(graph.dimensions.sum() - graph.unknowns)
     if gate == np.inf:

@@ -43,7 +43,9 @@ def at_rest(fold):
     return set(landmark_view.resting_of(fold.main).ids.tolist())
 
 
-@pytest.mark.parametrize("settings", [JoinSettings(robust=False), ROBUST], ids=["squares", "robust"])
+@pytest.mark.parametrize(
+    "settings", [JoinSettings(robust=False), ROBUST], ids=["squares", "robust"]
+)
 def test_a_fold_whose_landmarks_rest_and_wake_is_the_fold_in_which_none_rests(settings):
     resting, woke = set(), 0
     for one, other in zip(

@@ -53,9 +53,7 @@ def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distan
 
 def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised():
     world = meeting(3, robots=3, submaps=2)
-    island = joined_with(
-        world.submaps, world.starts, world.sightings, JoinSettings()
-    ).main
+    island = joined_with(world.submaps, world.starts, world.sightings, JoinSettings()).main
     assert len(island.graph.sightings) == len(world.sightings) == 12
     gradient = island.estimate.gradient
     for k in range(0, len(island.state), 4):
