@@ -43,9 +43,9 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fusion: `join` joins submaps by least squares; `teamslam.team.pairs` lists the inputs of the
     others. Under rules with feedback the robots' covariance counts measurements more than once,
     save that of `covariance-intersection`. tick_s: span of team time that is folded at once.
-    broadcast_s: least team time between two broadcasts of the map. batch_robust_c: under `batch` and
-    for `batch-reference`, scale of the Cauchy loss on sqrt(chi2) of each measurement (a range and a
-    bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a
+    broadcast_s: least team time between two broadcasts of the map. batch_robust_c: under `batch`
+    and for `batch-reference`, scale of the Cauchy loss on sqrt(chi2) of each measurement (a range
+    and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a
     landmark needs to enter the map; above 1 where outliers are expected. covariance_factor: scales
     the submaps' covariances; 1 for errors independent from measurement to measurement.
     normal_scale: the monitor's covariance scale where the covariances are right: 1 where the errors

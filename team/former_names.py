@@ -13,7 +13,7 @@ FIELDS = {
 }
 """The former name and today's, of fields of `world` and `central`."""
 GONE = {
-    "robust_c": "the join discounts outliers without it: leave it out (under `batch`: `batch_robust_c`)",
+    "robust_c": "the join is robust without it: leave it out (under `batch`: batch_robust_c)",
     "outlier_share": "windows reject outliers without it: leave it out",
 }
 """Settings of `central` and `front_end` that scenario files of that time have, with the remedy."""

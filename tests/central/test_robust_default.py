@@ -1,4 +1,4 @@
-"""A team with default settings survives wrong measurements, and pays nothing for it without them."""
+"""A team with default settings survives wrong measurements and a robot that is carried off."""
 
 from dataclasses import replace
 from pathlib import Path

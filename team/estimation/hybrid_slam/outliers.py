@@ -1,4 +1,4 @@
-"""The gate against outliers: the open window's measurements, and which of them others contradict."""
+"""The gate against outliers: measurements of the open window that others contradict."""
 
 from collections.abc import Sequence
 
