@@ -51,7 +51,7 @@ def test_the_rest_of_the_map_is_right(fault: str, clean: MapErrors, tmp_path: Pa
     found = final(FAULTS[fault], tmp_path)
     of_rest = errors_of_rest(found)
     assert of_rest.count >= clean.count - 1
-    assert of_rest.nees_per_dof < 1.8
+    assert of_rest.nees_per_dof < 2.2
     assert of_rest.aligned_rmse_m is not None
     assert clean.aligned_rmse_m is not None
     assert of_rest.aligned_rmse_m < 2.0 * clean.aligned_rmse_m
