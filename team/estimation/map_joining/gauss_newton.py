@@ -314,12 +314,12 @@ def settled(island: Island) -> tuple[Island, int, float]:
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):
-            plain, *end = _descended(
+            plain, count, change = _descended(
                 replace(island, settings=replace(island.settings, robust=False))
             )
             found = aged(replace(plain, settings=island.settings), FULL_AGE)
             if not _has_outliers(found):
-                return (found, *end)
+                return found, count, change
     return _descended(island)
 
 
