@@ -46,8 +46,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fusion: `join` joins submaps by least squares; `teamslam.team.pairs` lists the inputs of the
     others. Under rules with feedback the robots' covariance counts measurements more than once,
     save that of `covariance-intersection`. tick_s: span of team time that is folded at once.
-    broadcast_s: least team time between two broadcasts of the map. robust_c: scale of the Cauchy
-    loss on sqrt(chi2/dim) of each submap, under `batch` on sqrt(chi2) of each measurement (a range
+    broadcast_s: least team time between two broadcasts of the map. batch_robust_c: under `batch`
+    and for `batch-reference`, scale of the Cauchy loss on sqrt(chi2) of each measurement (a range
     and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a
     landmark needs to enter the map; above 1 where outliers are expected. covariance_factor: scales
     the submaps' covariances; 1 for errors independent from measurement to measurement.
@@ -71,7 +71,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fusion: FusionRule = "join"
     tick_s: Positive = 10.0
     broadcast_s: Positive = 10.0
-    robust_c: Positive | None = None
+    batch_robust_c: Positive | None = None
     landmark_submaps: Annotated[int, Meta(ge=1, le=100)] = 1
     covariance_factor: Annotated[float, Meta(ge=1.0, le=1e9)] = 1.0
     normal_scale: Positive = 1.0

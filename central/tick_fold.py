@@ -75,7 +75,6 @@ def join_settings(config: CentralConfig) -> JoinSettings:
     """Return the join's settings of a centre's configuration."""
     return JoinSettings(
         iterations_per_tick=config.gauss_newton_per_tick,
-        robust_c=config.robust_c,
         covariance_factor=config.covariance_factor,
         bias_sigma={bias: getattr(config.bias_sigma, bias) for bias in BIASES},
         common_bias_sigma={

@@ -256,9 +256,6 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Largest distance in time of an inter-robot measurement from its node."""
     teammate_speed: NonNegative = 0.2
     """Speed of a teammate in between [m/s]."""
-    outlier_share: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
-    """Share of measurements that are not of their landmark. Above 0 a window uses only measurements
-    that others confirm (`teamslam.team.estimation.hybrid_slam.outliers`)."""
     biases: tuple[Bias, ...] = CALIBRATED
     """Errors shared by all of the robot's windows, estimated by the centre; each submap carries its
     derivative by each of them. clock_offset: by so much the detections are stamped late against the

@@ -6,11 +6,19 @@ from typing import Any
 
 FIELDS = {
     "garbage": "outlier_share",
+    "robust_c": "batch_robust_c",
     "garbage_kind": "outlier_kind",
     "landmarks_told": "landmark_form",
     "look_at_start": "observe_at_start",
 }
-"""The former name and today's, of fields of `world` and of a robot's `front_end`."""
+"""The former name and today's, of fields of `world` and `central`."""
+GONE = {
+    "robust_c": "the join is robust without it: leave it out (under `batch`: batch_robust_c)",
+    "outlier_share": "windows reject outliers without it: leave it out",
+}
+"""Settings of `central` and `front_end` that scenario files of that time have, with the remedy."""
+SHARES = ("garbage", "outlier_share")
+"""Fields of a robot's `front_end` that have no successor."""
 VALUES = {("outlier_kind", "reading"): "measurement"}
 """Values that had another name, by today's name of their field."""
 
@@ -23,6 +31,9 @@ def with_current_names(value: Any) -> Any:
         return value
     former: dict[str, Any] = value
     current = {FIELDS.get(name, name): each for name, each in former.items()}
+    if "front_end" in current:
+        front_end = current["front_end"]
+        current["front_end"] = {k: v for k, v in front_end.items() if k not in SHARES}
     return {
         name: VALUES.get((name, each), each) if isinstance(each, str) else with_current_names(each)
         for name, each in current.items()

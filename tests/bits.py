@@ -54,16 +54,10 @@ def pair(estimator: str, fusion: str) -> Scenario:
 
 
 def outliers() -> Scenario:
-    """Three measurements in ten are outliers, and the robots' configurations allow for them."""
+    """Three measurements in ten are outliers."""
     scenario = world("thesis", outlier_share=0.3)
-    robots = tuple(
-        msgspec.structs.replace(
-            r, front_end=msgspec.structs.replace(r.front_end, outlier_share=0.3)
-        )
-        for r in scenario.robots
-    )
-    central = msgspec.structs.replace(scenario.central, landmark_submaps=2, robust_c=2.0)
-    return msgspec.structs.replace(scenario, robots=robots, central=central)
+    central = msgspec.structs.replace(scenario.central, landmark_submaps=2)
+    return msgspec.structs.replace(scenario, central=central)
 
 
 def utias(number: int) -> Scenario:

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
+from teamslam.team.former_names import GONE
+
 TOP_LEVEL = ("seed", "estimator", "fusion")
 """Robot and centre fields that the scenario has once, at its top."""
 
@@ -74,6 +76,8 @@ def check_known(name: str, known: list[str], at: str) -> None:
         return
     where = f"at {at}" if at else "at the top"
     hint = close(name, known)
+    if name in GONE:
+        raise ScenarioError(f"{name} {where} is not a setting any more; {GONE[name]}")
     if name in TOP_LEVEL:
         hint = f"; `{name}` is set once for the whole team, at the top of the file"
     raise ScenarioError(f"unknown field `{name}` {where}; known: {', '.join(known)}{hint}")

@@ -353,11 +353,11 @@ class Estimate:
     """
     A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
 
-    scale, sighting_scale: the robust c of each submap and inter-robot measurement. robust_c: their
-    final one; None for least squares. The arrays are in the graph's order. What is computed is kept.
+    scale, sighting_scale: widening of the gates of each submap and inter-robot measurement. submap_gate:
+    factor on the gates of submaps; landmark_gate: χ² of a landmark's. The arrays are in the graph's order. What is computed is kept.
     """
 
-    def __init__(self, graph: SubmapGraph, state: NDArray[numpy.float64], scale: NDArray[numpy.float64], sighting_scale: NDArray[numpy.float64], robust_c: float | None, landmark_gate: float, covariance_factor: float, joined_ranges: bool) -> None: ...
+    def __init__(self, graph: SubmapGraph, state: NDArray[numpy.float64], scale: NDArray[numpy.float64], sighting_scale: NDArray[numpy.float64], robust: bool, submap_gate: float, landmark_gate: float, covariance_factor: float, joined_ranges: bool) -> None: ...
 
     @property
     def landmark_weights(self) -> NDArray[numpy.float64]:
@@ -401,9 +401,7 @@ class Estimate:
 
     @property
     def prior_weights(self) -> NDArray[numpy.float64]:
-        """
-        Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.
-        """
+        """Robust weight of each prior: below 1 only for a robot's own bias."""
 
     @property
     def cost(self) -> float:

@@ -22,7 +22,6 @@ def status_of(
     withheld: number of its messages that no receiver would have accepted.
     """
     config, poses, submaps, nis = mapper.config, mapper.poses, mapper.submaps, mapper.innovation
-    outliers = config.front_end.outlier_share
     figures = {
         "steps": float(steps),
         "measurements": float(measurements),
@@ -38,7 +37,7 @@ def status_of(
         figures |= {"nis_per_dof": nis.per_dof, "nis_dof": float(nis.dof)}
     if poses.has_prior:
         figures["landmarks_refused"] = float(poses.team_map.refused)
-    if outliers:
+    if mapper.gated:
         figures["gated"] = float(mapper.gated)
     warnings = ["no measurements of this team yet"] if state == "waiting" else []
     if waits_for_driver and state != "done":
@@ -52,7 +51,7 @@ def status_of(
         figures={name: value for name, value in figures.items() if abs(value) <= 1e300},
         warnings=(
             *warnings,
-            *unexpected(nis, outliers, config.estimator),
+            *unexpected(nis, config.estimator),
             *[*mapper.warnings][-3:],
         ),
     )

@@ -14,26 +14,14 @@ UNEXPECTED_DOF = 60
 """… computed from this many degrees of freedom at least."""
 
 
-def unexpected(nis: Innovation, outliers: float, estimator: Estimator) -> tuple[str, ...]:
-    """Warns that measurements lie far from their predictions, and says what to configure then.
-
-    outliers: the configured share of outliers.
-    """
+def unexpected(nis: Innovation, estimator: Estimator) -> tuple[str, ...]:
+    """Warns that measurements lie far from their predictions, and says what to configure then."""
     ratio = nis.per_dof
     if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
         return ()
-    remedy = "outliers, or noise that is larger than the sensor's sigmas?"
-    if outliers:
-        remedy = (
-            f"is front_end.outlier_share = {outliers:g} too few, or the sensor's noise too small?"
-        )
-    elif estimator != "hybrid":
-        remedy += f" {estimator} takes every measurement as it is, and believes itself too much"
-    else:
-        remedy += (
-            " Outliers need front_end.outlier_share (their share), central.robust_c = 2, "
-            "central.landmark_submaps = 2"
-        )
+    remedy = "is the sensor's or the odometry's noise larger than its sigmas?"
+    if estimator != "hybrid":
+        remedy = f"outliers, or {remedy.removeprefix('is ')} {estimator} uses every measurement"
     return (
         f"measurements lie far from their predictions, NIS {ratio:.0f} per degree of freedom "
         f"(1 is right): {remedy}",

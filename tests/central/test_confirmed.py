@@ -71,18 +71,14 @@ def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(
 
 
 def test_what_two_submaps_agree_on_enters_the_map_with_both() -> None:
-    fused = final(rule(set(SAME), landmark_submaps=2, robust_c=2.0))
+    fused = final(rule(set(SAME), landmark_submaps=2))
     assert FALSE in ids(fused.ids, "ids")
     assert left_out(fused) == []
 
 
-@pytest.mark.parametrize(("robust_c", "stands"), [(2.0, False), (None, True)])
-def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither(
-    robust_c: float | None, stands: bool
-) -> None:
-    """Without a robust loss the centre expects no outliers and discounts no robot."""
-    fused = final(rule(set(APART), landmark_submaps=2, robust_c=robust_c))
-    assert (FALSE in ids(fused.ids, "ids")) == stands
+def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither() -> None:
+    fused = final(rule(set(APART), landmark_submaps=2))
+    assert FALSE not in ids(fused.ids, "ids")
 
 
 def test_running_maps_and_priors_have_the_same_landmarks() -> None:

@@ -94,7 +94,7 @@ class Liar(RobotNode):
 
 
 @cache
-def run_with(liar: str, kind: str, robust_c: float | None = None) -> tuple[Sample, ...]:
+def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
     """The small team in which one robot lies."""
 
     def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
@@ -103,7 +103,7 @@ def run_with(liar: str, kind: str, robust_c: float | None = None) -> tuple[Sampl
             node.kind = kind
         return node
 
-    of: Scenario = scenario(robust_c=robust_c)
+    of: Scenario = scenario()
     talking = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
     of = msgspec.structs.replace(of, robots=talking)
     return tuple(run_team(of, simulated(of.world, of.robots, of.seed), robot))
@@ -166,8 +166,8 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
 @pytest.mark.parametrize("kind", ["micrometre", "far", "swap"])
 def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind: str) -> None:
     """Most of its newest submaps contradict the map, however little they weigh."""
-    samples = run_with("r1", kind, 1.0)
-    ticks = of_set(samples, central=scenario(robust_c=1.0).central)
+    samples = run_with("r1", kind)
+    ticks = of_set(samples, central=scenario().central)
     ticks.fold_until(30e9)
     assert list(ticks.suspended) == ["r1"]
     ticks.fold_until(math.inf)

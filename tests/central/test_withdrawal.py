@@ -303,13 +303,10 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
 
 
 def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
-    """The small world with three in ten measurements spoilt, which windows and centre expect."""
-    of = scenario(robust_c=2.0, landmark_submaps=2)
+    """The small world with three in ten measurements spoilt."""
+    of = scenario(landmark_submaps=2)
     replaced = msgspec.structs.replace
-    team = tuple(
-        replaced(r, front_end=replaced(r.front_end, outlier_share=0.3, particles=40))
-        for r in of.robots
-    )
+    team = tuple(replaced(r, front_end=replaced(r.front_end, particles=40)) for r in of.robots)
     world = replaced(of.world, outlier_share=0.3, outlier_kind=kind)
     return replaced(of, world=world, robots=team, seed=seed)
 
@@ -319,7 +316,7 @@ def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
 def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
     kind: OutlierKind, seed: int
 ) -> None:
-    """Nor is anybody a suspect; by windows that take every measurement all are (2000 and more)."""
+    """Nor is anybody a suspect; by windows without rejection all are (2000 and more)."""
     of = with_outliers(kind, seed)
     samples = tuple(run(of))
     assert final_map(list(samples)).withdrawn == ()

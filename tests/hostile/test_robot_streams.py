@@ -158,7 +158,6 @@ def test_any_estimator_goes_on_through_a_hostile_stream(estimator, fusion, seed)
     rng = np.random.default_rng(seed)
     front = {
         "node_s": 2.0 * (fusion == "join"),
-        "outlier_share": 0.1 * (estimator == "hybrid" and seed % 2),
     }
     node, out = robot_session(
         hostile_stream(rng, "r1", 60), config(estimator, fusion, front_end=front)

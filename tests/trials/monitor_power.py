@@ -33,17 +33,11 @@ CLAIMED = ((1.0, ""), (0.5, "too much"), (2.0, "too little"))
 
 
 def robust() -> Scenario:
-    """`thesis-b` with outliers, and a team that expects them."""
+    """`thesis-b` with outliers."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, outlier_share=OUTLIERS)
-    central = msgspec.structs.replace(scenario.central, robust_c=2.0, landmark_submaps=2)
-    robots = tuple(
-        msgspec.structs.replace(
-            robot, front_end=msgspec.structs.replace(robot.front_end, outlier_share=OUTLIERS)
-        )
-        for robot in scenario.robots
-    )
-    return msgspec.structs.replace(scenario, world=world, central=central, robots=robots)
+    central = msgspec.structs.replace(scenario.central, landmark_submaps=2)
+    return msgspec.structs.replace(scenario, world=world, central=central)
 
 
 def found_at(fold: Fold, claimed: float, normal: float) -> Finding:

@@ -100,8 +100,7 @@ def profile_graph(
 ) -> Any:
     """All factors. The range noise is that at the joined solution's range.
 
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement; the centre's is on √(χ²/dim) of
-    each submap.
+    The Cauchy loss of scale c is on √(χ²/2) of each measurement.
     """
     graph = path_graph(gtsam, chains, poses)
     loss = None if robust_c is None else math.sqrt(2.0) * robust_c

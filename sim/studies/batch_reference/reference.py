@@ -4,11 +4,12 @@
 Each robot has one pose of its sensor per keyframe. Factors: the initial poses; the odometry, truth
 = mean ∘ Exp(ξ) with the tangent covariance of `increment_of` (GTSAM's `BetweenFactorPose2` with its
 logarithm); each accepted range and bearing, independent, with the sensor's noise or its own, under
-a Cauchy loss if the centre has `robust_c`. Levenberg-Marquardt starts from the joined solution with
-the paths filled in three ways, so the result is never worse (noise `profile`: from the best of the
-three). With the noise `white` errors are independent and inter-robot measurements unused; with
-`profile` the sensor's errors persist, biases are estimated and inter-robot measurements are factors
-(`errors`). Not modelled: an odometry scale error at speeds outside the profile.
+a Cauchy loss if the centre has `batch_robust_c`. Levenberg-Marquardt starts from the joined
+solution with the paths filled in three ways, so the result is never worse (noise `profile`: from
+the best of the three). With the noise `white` errors are independent and inter-robot measurements
+unused; with `profile` the sensor's errors persist, biases are estimated and inter-robot
+measurements are factors (`errors`). Not modelled: an odometry scale error at speeds outside the
+profile.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -150,7 +151,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
             "no robot's trajectory is in the log: the batch starts from the joined solution, "
             "so run the same scenario and seed with `--fusion join`"
         )
-    robust_c = run.scenario.central.robust_c
+    robust_c = run.scenario.central.batch_robust_c
     fillings = list(
         zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
     )

@@ -31,10 +31,6 @@ LANDMARK_SUBMAPS = 2
 """Least number of submaps of a landmark, also in clean runs: a landmark of one submap may be an
 outlier.
 """
-ROBUST_C = 2.0
-"""Scale of the centre's robust loss, also in clean runs: it down-weights outliers that agree by
-chance.
-"""
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
 NAMES = {"drop": "clean", "measurement": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30
@@ -99,20 +95,11 @@ def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
 
 
 def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
-    """The scenario with outliers, and windows and centre that expect them.
-
-    The clean run has the same centre, and windows without rejection.
-    """
+    """The scenario with outliers, and a centre that requires two submaps of a landmark."""
     replace = msgspec.structs.replace
     assert isinstance(scenario.world, SimulatedWorld)
-    expected = 0.0 if kind == "drop" else SHARE
-    robots = tuple(
-        replace(robot, front_end=replace(robot.front_end, outlier_share=expected))
-        for robot in scenario.robots
-    )
     return replace(
         scenario,
         world=replace(scenario.world, outlier_share=SHARE, outlier_kind=kind),
-        robots=robots,
-        central=replace(scenario.central, robust_c=ROBUST_C, landmark_submaps=LANDMARK_SUBMAPS),
+        central=replace(scenario.central, landmark_submaps=LANDMARK_SUBMAPS),
     )

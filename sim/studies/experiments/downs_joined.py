@@ -75,7 +75,7 @@ def his_protocol(scenario: Scenario) -> Scenario:
         for robot in scenario.robots
     )  # fmt: skip
     central = change(
-        scenario.central, tick_s=NEVER_S, robust_c=None, covariance_factor=1.0,
+        scenario.central, tick_s=NEVER_S, covariance_factor=1.0,
         withdraw_above=None,
     )  # fmt: skip
     world = scenario.world

@@ -9,6 +9,7 @@ wrong, too.
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -87,7 +88,7 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
             ticks.add_submap(submap, b"", sightings.get((*stream, sequence), ()))
     ticks.fold_until(float("inf"))
-    return converged(ticks.fold, ticks.settings)
+    return converged(ticks.fold, replace(ticks.settings, robust=False))
 
 
 def judged(
@@ -97,8 +98,8 @@ def judged(
 ) -> TrueMinimum:
     """Figures of an island in the truth's frame, with plain squares and without biases."""
     graph, settings = island.graph, island.settings
-    if settings.robust_c is not None:
-        raise NotImplementedError("this cost has plain squares: central.robust_c must be left out")
+    if settings.robust:
+        raise NotImplementedError("this cost has plain squares, without a robust loss")
     if settings.joined_ranges:
         raise NotImplementedError("this cost has no central.joined_ranges: leave it out")
     fixed = np.repeat(graph.fixed, np.diff(graph.offset))

@@ -64,7 +64,7 @@ class BatchCentre(MeasurementCentre):
         return tuple(self._findings)
 
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        self._batch = batch.initial_state(starts, self.config.robust_c)
+        self._batch = batch.initial_state(starts, self.config.batch_robust_c)
         self._findings += taken_as_white(self.models)
 
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:

@@ -233,16 +233,16 @@ void bind_graph(nb::module_& m) {
   };
   nb::class_<Estimate>(m, "Estimate",
                        "A state of a graph, with the weights of the factors there, and its Gauss-Newton step.\n\n"
-                       "scale, sighting_scale: the robust c of each submap and inter-robot measurement. robust_c: their\n"
-                       "final one; None for least squares. The arrays are in the graph's order. What is computed is kept.")
+                       "scale, sighting_scale: widening of the gates of each submap and inter-robot measurement. submap_gate:\n"
+                       "factor on the gates of submaps; landmark_gate: χ² of a landmark's. The arrays are in the graph's order. What is computed is kept.")
       .def("__init__",
            [](Estimate* self, std::shared_ptr<Graph> graph, const Numbers& state, const Numbers& scale,
-              const Numbers& sighting_scale, std::optional<double> robust_c, double landmark_gate, double covariance_factor,
+              const Numbers& sighting_scale, bool robust, double submap_gate, double landmark_gate, double covariance_factor,
               bool joined_ranges) {
              new (self) Estimate(std::move(graph), listed(state), listed(scale), listed(sighting_scale),
-                                 {robust_c, landmark_gate, covariance_factor, joined_ranges});
+                                 {robust, submap_gate, landmark_gate, covariance_factor, joined_ranges});
            },
-           "graph"_a, "state"_a, "scale"_a, "sighting_scale"_a, "robust_c"_a.none(), "landmark_gate"_a,
+           "graph"_a, "state"_a, "scale"_a, "sighting_scale"_a, "robust"_a, "submap_gate"_a, "landmark_gate"_a,
            "covariance_factor"_a, "joined_ranges"_a)
       .def_prop_ro("landmark_weights", copied(&Estimate::landmark_weights), nb::rv_policy::move,
                    "Weight of each landmark of each submap: 1 up to its gate or without a robust loss.")
@@ -261,7 +261,7 @@ void bind_graph(nb::module_& m) {
                    "Robust weight of each inter-robot measurement.")
       .def_prop_ro("prior_chi2", made_by(&Estimate::prior_chi2), nb::rv_policy::move, "χ² of each prior.")
       .def_prop_ro("prior_weights", made_by(&Estimate::prior_weights), nb::rv_policy::move,
-                   "Robust weight of each prior: Cauchy's for a robot's own bias, 1 for all others.")
+                   "Robust weight of each prior: below 1 only for a robot's own bias.")
       .def_prop_ro("cost", &Estimate::cost, "The minimised cost, at these robust scales.")
       .def("cost_of",
            [](const Estimate& self, const Estimate& other) {

@@ -13,6 +13,8 @@ namespace {
 // hundred.
 constexpr double EVIDENCE = 4.605170185988092;
 constexpr double JITTER[3] = {1e-6, 1e-6, 1e-8};  // added to each motion's variances [m², m², rad²]
+constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 100;
+constexpr double MOST_REJECTED = 0.1;
 constexpr int ROUNDS = 5;                         // of classifying and smoothing; it comes to rest in two or three
 
 // A symmetric 2 × 2 covariance of range and bearing.
@@ -113,13 +115,16 @@ void Consensus::add(const motion::Increment& motion, const Scan& scan) {
     farthest_ = std::max(farthest_, reading.range);
     Landmark& landmark = landmarks_[scan.ids[k]];
     std::vector<double> of_others;
-    for (std::size_t i = 0; i < landmark.measurements.size(); i++) {
+    const bool may_place = landmark.logs.size() < MOST_COMPARED;
+    for (std::size_t i = 0; i < landmark.logs.size(); i++) {
       const Measurement& other = measurements_[landmark.measurements[i]];
       landmark.logs[i].push_back(log_likelihood(reading, other.reading, to_last_[other.scan]));
-      of_others.push_back(log_likelihood(other.reading, reading, from_last[other.scan]));
+      if (may_place) of_others.push_back(log_likelihood(other.reading, reading, from_last[other.scan]));
     }
-    of_others.push_back(0.0);
-    landmark.logs.push_back(std::move(of_others));
+    if (may_place) {
+      of_others.push_back(0.0);
+      landmark.logs.push_back(std::move(of_others));
+    }
     landmark.measurements.push_back(size());
     measurements_.push_back({b, reading});
   }
@@ -141,6 +146,7 @@ std::vector<bool> Consensus::agreeing() const {
   const double odds = this->odds();
   for (const auto& [id, landmark] : landmarks_) {
     const auto [best, total] = support_of(landmark, odds);
+    if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = true;
     if (!(total > EVIDENCE - prior_)) continue;
     for (std::size_t j = 0; j < landmark.measurements.size(); j++)
       taken[landmark.measurements[j]] = j == best || landmark.logs[best][j] + odds > 0.0;
@@ -211,8 +217,20 @@ Consensus::Smoothed Consensus::started() const {
 }
 
 std::vector<bool> Consensus::confirmed() const {
+  std::vector<bool> taken = confirmed_by_others();
+  double compared = 0.0, rejected = 0.0;
+  for (const auto& [id, landmark] : landmarks_)
+    for (const std::size_t n : landmark.measurements)
+      if (landmark.measurements.size() > 1) compared += 1.0, rejected += taken[n] ? 0.0 : 1.0;
+  if (rejected > MOST_REJECTED * compared)
+    for (const auto& [id, landmark] : landmarks_)
+      if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = false;
+  return taken;
+}
+
+std::vector<bool> Consensus::confirmed_by_others() const {
   const std::vector<bool> agreed = agreeing();
-  if (agreed.empty()) return agreed;
+  if (agreed.empty() || motions_.size() > MOST_SMOOTHED) return agreed;
   Smoothed window = started();
   if (window.metrics.size() < window.path.size()) return agreed;
   std::vector<bool> taken = agreed;
@@ -307,11 +325,11 @@ std::vector<double> Consensus::logs_of_others(const Smoothed& window, const std:
 // The measurements with odds above even, of landmarks whose measurements have enough evidence.
 //
 // Each of k measurements is predicted by the k − 1 others, so their odds are weighted by (k − 1)/k. A
-// landmark that has lost all its measurements stays out.
+// landmark that has lost all its measurements stays out; the only measurement of one stays in.
 std::vector<bool> Consensus::judged(const Smoothed& window, std::span<const double> logs,
                                     const std::vector<bool>& before) const {
   const double odds = this->odds();
-  const std::vector<double> earlier = window.counts(before);
+  const std::vector<double> earlier = window.counts(before), all = window.counts(std::vector<bool>(logs.size(), true));
   std::vector<bool> taken(logs.size());
   std::vector<double> of_each;
   for (std::size_t n = 0; n < logs.size(); n++) {
@@ -321,7 +339,8 @@ std::vector<bool> Consensus::judged(const Smoothed& window, std::span<const doub
   const std::vector<double> count = window.counts(taken), total = window.sums(of_each, taken);
   for (std::size_t n = 0; n < logs.size(); n++) {
     const std::size_t l = window.slots[n];
-    taken[n] = taken[n] && count[l] >= 2.0 && prior_ + total[l] * (count[l] - 1.0) / count[l] > EVIDENCE;
+    const bool has_evidence = count[l] >= 2.0 && prior_ + total[l] * (count[l] - 1.0) / count[l] > EVIDENCE;
+    taken[n] = all[l] == 1.0 || (taken[n] && has_evidence);
   }
   return taken;
 }
@@ -351,8 +370,10 @@ std::vector<bool> Consensus::misread(const Smoothed& window, std::span<const dou
     }
     for (std::size_t l = 0; l < L; l++) {
       if (l == m || count[l] == 0.0 || count[l] > count[m]) continue;
-      const double own = total[l] * (count[l] - 1.0) / count[l] - (odds() - prior_);
-      if (count[l] * own_name + own - predicted[l] < EVIDENCE) doubtful[l] = true;
+      const bool is_alone = count[l] == 1.0;
+      const double by_others = is_alone ? 0.0 : total[l] * (count[l] - 1.0) / count[l];
+      const double evidence = count[l] * own_name + by_others - (odds() - prior_) - predicted[l];
+      if (evidence < (is_alone ? 0.0 : EVIDENCE)) doubtful[l] = true;
     }
   }
   return doubtful;

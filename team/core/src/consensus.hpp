@@ -4,7 +4,8 @@
 // brings, or it is an outlier, uniform over the sensor's range and field of view with density u. It is
 // accepted if (1 − ε) p(z | the other accepted ones, odometry) > ε u. A landmark is accepted if its
 // measurements together reach odds of EVIDENCE against being outliers and against being another
-// landmark of the window under a wrong identity. Only measurements of the window itself are used: a gate
+// landmark of the window under a wrong identity. The only measurement of a landmark is accepted: it
+// does not act on the path, and is compared with other windows at the centre. Only measurements of the window itself are used: a gate
 // by a map or an earlier window would keep rejecting correct measurements once that map is wrong, and
 // would use measurements twice. All variances of a measurement are its whole ones, since the persistent
 // part of its error is nearly constant within a window.
@@ -32,13 +33,16 @@ class Consensus {
   //
   // The measurement of a landmark that the others support best places it; it is accepted together with
   // those that support it. Measurement j supports i with max(0, log p(j | i, odometry) + odds of j).
+  // Only the first MOST_COMPARED measurements of a landmark can place it.
   std::vector<bool> agreeing() const;
 
   // As `agreeing`, then by a smoother over the whole window until the classification is stable.
   //
   // The smoother estimates poses and landmarks by least squares over the odometry and the accepted
   // measurements; then every measurement is compared with its prediction from the others. Where the
-  // normal equations have no solution in floating point, nothing more is rejected.
+  // normal equations have no solution in floating point or the window has more than MOST_SMOOTHED
+  // scans, nothing more is rejected. Where more than a tenth of the measurements that others could
+  // confirm are rejected, the only measurement of a landmark is rejected too.
   std::vector<bool> confirmed() const;
 
  private:
@@ -46,7 +50,8 @@ class Consensus {
     std::size_t scan;
     Reading reading;
   };
-  // The measurements of one landmark; logs[i][j]: log p(j | i, odometry), 0 of one by itself.
+  // The measurements of one landmark; logs[i][j]: log p(j | i, odometry), 0 of one by itself, for the
+  // first MOST_COMPARED i.
   struct Landmark {
     std::vector<std::size_t> measurements;
     std::vector<std::vector<double>> logs;
@@ -59,6 +64,7 @@ class Consensus {
   struct Smoothed;
 
   double odds() const;
+  std::vector<bool> confirmed_by_others() const;
   Support support_of(const Landmark& landmark, double odds) const;
   Smoothed started() const;
   bool smooth(Smoothed& window, const std::vector<bool>& taken) const;

@@ -31,8 +31,6 @@ double weighted_sum(const Numbers& weights, const Numbers& chi2) {
   return sum(chi2.size(), ALL, [&](std::size_t k) { return weights[k] * chi2[k]; });
 }
 
-// scale log(1 + χ²/scale), Cauchy's loss.
-double loss_of(double chi2, double scale) { return scale * elementary::log1p(chi2 / scale); }
 
 }  // namespace
 
@@ -61,14 +59,14 @@ const Estimate::Submaps& Estimate::submaps() const {
 const std::pair<Numbers, Numbers>& Estimate::landmark_chi2_and_gate() const {
   return once(landmark_chi2_, [&] {
     const std::size_t count = graph_->landmarks();
-    if (!loss_.robust_c) return std::pair{Numbers(count), Numbers(count, 1.0)};
+    if (!loss_.is_robust) return std::pair{Numbers(count), Numbers(count, 1.0)};
     std::pair<Numbers, Numbers> found{Numbers(count), {}};
     for (std::size_t f = 0; f < submaps().size(); f++) {
       const Submap& each = *submaps()[f];
       each.landmark_chi2(state_, graph_->submaps[f].at, loss_.covariance_factor,
                          std::span(found.first).subspan(graph_->landmark_start[f], each.landmarks.size()));
       found.second.insert(found.second.end(), each.landmarks.size(),
-                          loss_.landmark_gate * squared(scale_[f] / *loss_.robust_c));
+                          loss_.landmark_gate * squared(scale_[f]));
     }
     return found;
   });
@@ -79,7 +77,7 @@ const Numbers& Estimate::landmark_weights() const {
     const auto& [chi2, gate] = landmark_chi2_and_gate();
     Numbers found(chi2.size(), 1.0);
     for (std::size_t l = 0; l < found.size(); l++)
-      if (chi2[l] > gate[l]) found[l] = pack::max(gate[l] / chi2[l], LEAST_WEIGHT);
+      found[l] = pack::max(robust_weight(chi2[l], gate[l]), LEAST_WEIGHT);
     return found;
   });
 }
@@ -131,16 +129,22 @@ Numbers Estimate::counted_chi2() const {
   return costs(discounted_by(squares), state_);
 }
 
-std::vector<double> Estimate::squared_scales() const {
+Numbers Estimate::gates() const {
   Numbers found;
   for (std::size_t f = 0; f < scale_.size(); f++)
-    found.push_back(double(graph_->submaps[f].submap->size()) * squared(scale_[f]));
+    found.push_back(loss_.submap_gate * gate_of(double(graph_->submaps[f].submap->size()), scale_[f]));
+  return found;
+}
+
+Numbers Estimate::sighting_gates() const {
+  Numbers found;
+  for (const double scale : sighting_scale_) found.push_back(gate_of(2.0, scale));
   return found;
 }
 
 Numbers Estimate::weights() const {
-  Numbers found = squared_scales();
-  for (std::size_t f = 0; f < found.size(); f++) found[f] = 1.0 / (1.0 + chi2()[f] / found[f]);
+  Numbers found = gates();
+  for (std::size_t f = 0; f < found.size(); f++) found[f] = robust_weight(chi2()[f], found[f]);
   return found;
 }
 
@@ -153,8 +157,8 @@ const Numbers& Estimate::sighting_chi2() const {
 }
 
 Numbers Estimate::sighting_weights() const {
-  Numbers found = sighting_chi2();
-  for (std::size_t s = 0; s < found.size(); s++) found[s] = 1.0 / (1.0 + found[s] / (2.0 * squared(sighting_scale_[s])));
+  Numbers found = sighting_gates();
+  for (std::size_t s = 0; s < found.size(); s++) found[s] = robust_weight(sighting_chi2()[s], found[s]);
   return found;
 }
 
@@ -174,8 +178,9 @@ Numbers Estimate::prior_chi2() const {
 
 // Cauchy's for a robot's own bias, 1 for all others. Most sensors are as their configuration states, to
 // within the prior; one that is not is far off, and must not draw the other robots' biases away through
-// the common errors: a prior with the tails of Student's t of one degree of freedom. Markers do not change; the error of a marker seen from one side only is distinguished from its
-// landmark's position by its prior alone.
+// the common errors: a prior with the tails of Student's t of one degree of freedom. Markers do not
+// change; the error of a marker seen from one side only is distinguished from its landmark's position by
+// its prior alone.
 Numbers Estimate::prior_weights() const {
   Numbers found(graph_->priors.size(), 1.0);
   for (std::size_t k = 0; k < found.size(); k++)
@@ -190,7 +195,7 @@ const Quadratic::Terms& Estimate::condensed_terms() const {
 }
 
 double Estimate::cost_of(const Estimate& other) const {
-  const bool are_equal = &other == this || (!loss_.robust_c && !loss_.has_joined_ranges);
+  const bool are_equal = &other == this || (!loss_.is_robust && !loss_.has_joined_ranges);
   const double chi2 = weighted_sum(weights(), are_equal ? other.chi2() : costs(discounted(), other.state_));
   double seen = weighted_sum(sighting_weights(), other.sighting_chi2());
   seen += weighted_sum(prior_weights(), other.prior_chi2());
@@ -205,31 +210,30 @@ double Estimate::cost() const {
 }
 
 double Estimate::cost_of_factors(const Marked& marked) const {
-  const Numbers of_priors = prior_chi2();
-  const std::size_t submaps = scale_.size(), sightings = sighting_scale_.size(), priors = of_priors.size();
+  const Numbers of_priors = prior_chi2(), gates = this->gates(), seen = sighting_gates();
   const auto is_submap = [&](std::size_t f) { return marked.submaps[f]; };
   const auto is_sighting = [&](std::size_t s) { return marked.sightings[s]; };
-  const double prior_cost = sum(priors, [&](std::size_t k) { return marked.priors[k]; },
-                                [&](std::size_t k) { return graph_->priors[k].is_of_bias ? loss_of(of_priors[k], 1.0) : of_priors[k]; });
-  if (!loss_.robust_c) {
-    const double cost = sum(submaps, is_submap, [&](std::size_t f) { return chi2()[f]; }) + prior_cost;
-    return cost + sum(sightings, is_sighting, [&](std::size_t s) { return sighting_chi2()[s]; });
+  const auto is_prior = [&](std::size_t k) { return marked.priors[k]; };
+  double cost = sum(gates.size(), is_submap, [&](std::size_t f) { return robust_loss(chi2()[f], gates[f]); });
+  cost += sum(of_priors.size(), is_prior, [&](std::size_t k) {
+    return graph_->priors[k].is_of_bias ? elementary::log(1.0 + of_priors[k]) : of_priors[k];
+  });
+  if (loss_.is_robust) {
+    const auto& [own, gate] = landmark_chi2_and_gate();
+    Numbers beyond;  // a discounted landmark's share of χ² is w χ² already
+    for (std::size_t f = 0; f < gates.size(); f++)
+      for (std::size_t l = graph_->landmark_start[f]; l < graph_->landmark_start[f + 1]; l++)
+        if (marked.submaps[f] && own[l] > gate[l])
+          beyond.push_back(robust_loss(own[l], gate[l]) - robust_weight(own[l], gate[l]) * own[l]);
+    cost += pairwise_sum(beyond);
   }
-  const Numbers scales = squared_scales();
-  double cost = sum(submaps, is_submap, [&](std::size_t f) { return loss_of(chi2()[f], scales[f]); }) + prior_cost;
-  const auto& [own, gate] = landmark_chi2_and_gate();
-  Numbers beyond;
-  for (std::size_t f = 0; f < submaps; f++)
-    for (std::size_t l = graph_->landmark_start[f]; l < graph_->landmark_start[f + 1]; l++)
-      if (marked.submaps[f] && own[l] > gate[l]) beyond.push_back(gate[l] * elementary::log(own[l] / gate[l]));
-  cost += pairwise_sum(beyond);
-  return cost + sum(sightings, is_sighting,
-                    [&](std::size_t s) { return loss_of(sighting_chi2()[s], 2.0 * squared(sighting_scale_[s])); });
+  return cost + sum(seen.size(), is_sighting, [&](std::size_t s) { return robust_loss(sighting_chi2()[s], seen[s]); });
 }
 
 const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
   return once(normal_, [&] {
     const Graph& graph = *graph_;
+    const Numbers gates = this->gates(), seen = sighting_gates();
     std::pair made{Numbers(std::size_t(graph.pattern()->numbers())), Numbers(state_.size())};
     auto& [values, gradient] = made;
     for (std::size_t node = 0; node < graph.nodes(); node++)
@@ -240,7 +244,7 @@ const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
       const Joined& at = graph.submaps[f];
       const Normal normal = discounted()[f]->normal(state_, at.at);
       const double chi2 = normal.chi2 / loss_.covariance_factor;
-      const double weight = robust_weight(chi2, double(at.submap->size()), scale_[f]) / loss_.covariance_factor;
+      const double weight = robust_weight(chi2, gates[f]) / loss_.covariance_factor;
       std::size_t row = 0;
       for (std::size_t a = 0; a < at.nodes.size(); a++)
         for (std::size_t p = 0, size = graph.size_of(at.nodes[a]); p < size; p++, row++)
@@ -254,7 +258,7 @@ const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
       double slope[2];
       for (std::size_t i = 0; i < 2; i++) slope[i] = W[i][0] * at.residual[0] + W[i][1] * at.residual[1];
       const double chi2 = at.residual[0] * slope[0] + at.residual[1] * slope[1];
-      const double weight = robust_weight(chi2, 2.0, sighting_scale_[s]);
+      const double weight = robust_weight(chi2, seen[s]);
       const Index nodes[] = {each.observer, each.teammate};
       for (std::size_t i = 0; i < 2; i++)
         for (std::size_t p = 0; p < 3; p++)

@@ -1,9 +1,9 @@
 // A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
 //
-// Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ρ(prior) + condensed factor, where ρ is
-// the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting; of the priors those of
-// single robots' biases, and only they, have Cauchy's loss, always. With a loss each landmark of a submap has a weight of its own as well:
-// beyond the gate g its χ² counts g (1 + log(χ²/g)), whose slope, the weight, is g/χ².
+// Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ρ(prior) + condensed factor by iterated
+// re-weighting. ρ(χ²) is χ² up to a gate g that a sound factor does not exceed, and g (2 − g/χ²) beyond,
+// whose slope, the weight, is (g/χ²)²; of the priors only those of single robots' biases have a loss,
+// Cauchy's. Each landmark of a submap has a gate and a weight of its own as well.
 #pragma once
 
 #include "graph.hpp"
@@ -13,7 +13,8 @@ namespace teamslam::graph {
 inline constexpr double LEAST_WEIGHT = 1e-6;  // of a landmark, so that each stays determined
 
 struct Loss {
-  std::optional<double> robust_c;  // Cauchy's scale; none for least squares
+  bool is_robust;                  // otherwise all weights are 1
+  double submap_gate;              // factor on the gate of a submap as a whole
   double landmark_gate;            // χ² of two numbers from which a landmark is discounted
   double covariance_factor;
   bool has_joined_ranges;          // whether errors of ranges are proportional to those of the joined map
@@ -40,7 +41,8 @@ struct Step {
 
 class Estimate {
  public:
-  // scale, sighting_scale: the robust c of each submap and inter-robot measurement, which narrows.
+  // scale, sighting_scale: widening of the gates of each submap and inter-robot measurement; its square
+  // multiplies them, and it narrows to 1.
   Estimate(std::shared_ptr<const Graph> graph, Numbers state, Numbers scale, Numbers sighting_scale, Loss loss);
 
   const Graph& graph() const { return *graph_; }
@@ -97,7 +99,8 @@ class Estimate {
   const std::pair<Numbers, Numbers>& landmark_chi2_and_gate() const;
   const std::vector<Prior::Terms>& prior_terms() const;
   const Quadratic::Terms& condensed_terms() const;
-  std::vector<double> squared_scales() const;  // c² dim of each submap
+  Numbers gates() const;           // of the submaps
+  Numbers sighting_gates() const;
   Numbers moved(const Numbers& step, double share) const;
   Sighting::Linear linear(const Sighting& sighting) const {
     return sighting.linear(&state_[graph_->offset[sighting.observer]], &state_[graph_->offset[sighting.teammate]]);

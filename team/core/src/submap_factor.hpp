@@ -100,9 +100,15 @@ struct Submap {
   Normal unbiased_normal(const Numbers& shifted, Values state, Indices at) const;
 };
 
-// Cauchy's weight on √(χ²/dim): 1/(1 + χ²/(dim c²)); 1 for c = ∞.
-inline double robust_weight(double chi2, double dimension, double scale) {
-  return 1.0 / (1.0 + chi2 / (dimension * scale * scale));
+// χ² beyond which a factor of `dimension` numbers is discounted; a sound one exceeds it with a
+// probability below e⁻⁷ (Laurent & Massart 2000, lemma 1).
+inline double gate_of(double dimension, double scale) {
+  return (dimension + 2.0 * pack::sqrt(7.0 * dimension) + 14.0) * scale * scale;
 }
+
+// The loss is χ² up to the gate g and g (2 − g/χ²) beyond. Its slope, the weight, is (g/χ²)² there, so
+// that the pull of an outlier falls with the third power of its distance.
+inline double robust_weight(double chi2, double gate) { return chi2 > gate ? (gate / chi2) * (gate / chi2) : 1.0; }
+inline double robust_loss(double chi2, double gate) { return chi2 > gate ? gate * (2.0 - gate / chi2) : chi2; }
 
 }  // namespace teamslam::graph

@@ -44,10 +44,9 @@ class OpenWindow:
     def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
         self._config = config
         self._key = incarnation, sequence
-        self._gate = OutlierGate(config.sensor, config.front_end.outlier_share)
+        self._gate = OutlierGate(config.sensor)
         self._solvable = True
         self._motions: list[Increment] = []
-        self._keyframes: list[Keyframe] = []
         self.settled = AssociatedKeyframes(())
         self._begin()
 
@@ -72,18 +71,21 @@ class OpenWindow:
 
     @property
     def gated(self) -> int:
-        """Number of measurements that no others of the window confirmed."""
+        """Number of measurements that others of the window contradicted."""
         return self._gate.gated + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
-        """Move and weigh the particles with the measurements that agree with others so far."""
+        """Move and weigh the particles with the measurements that agree with others so far.
+
+        Where a keyframe contradicts one that was used before, the window is computed again.
+        """
         self._motions.append(keyframe.increment)
         self._try(self._admit, keyframe)
 
     def confirm(self) -> None:
-        """Compute the window again with the measurements that are confirmed by all of it.
+        """Compute the window again if it has other measurements now that all of it is compared.
 
-        Only where outliers are expected or there are detections without identities. Where that
+        It has where outliers are found or there are detections without identities. Where that
         depletes the particles, the window is computed with more of them (where landmarks have
         identities and errors are white: decision 20).
         """
@@ -112,8 +114,10 @@ class OpenWindow:
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
         bounded = nearest_landmarks(keyframe, self.particles.landmarks, most)
-        self._keyframes.append(bounded)
-        self._take(self._gate.admit(bounded) if self._gate.judges else bounded)
+        if self._gate.add(bounded):
+            self._take(self._gate.last)
+        else:
+            self._take_all(self._gate.keyframes)
 
     def _take(self, keyframe: Keyframe) -> None:
         windows.advance(
@@ -132,8 +136,9 @@ class OpenWindow:
             windows.mark_node(self.particles, keyframe.stamp_ns)
 
     def _settle(self) -> None:
-        keyframes = self._gate.confirm() if self._gate.judges else tuple(self._keyframes)
-        has_unnamed = bool([each for each in self._keyframes if each.looks])
+        has_others = self._gate.confirm()
+        keyframes = self._gate.keyframes
+        has_unnamed = bool([each for each in keyframes if each.looks])
         if has_unnamed:
             config = self._config
             self.settled = associate_keyframes(
@@ -143,7 +148,7 @@ class OpenWindow:
                 config.bounds.submap_landmarks,
             )
             keyframes = self.settled.keyframes
-        if has_unnamed or self._gate.judges:
+        if has_unnamed or has_others:
             self._take_all(keyframes)
         if has_unnamed:
             redraw_paths(self.particles, keyframes, self._random)

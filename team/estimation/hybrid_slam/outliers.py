@@ -1,4 +1,4 @@
-"""The gate against outliers: the open window's measurements, and which of them others confirm."""
+"""The gate against outliers: measurements of the open window that others contradict."""
 
 from collections.abc import Sequence
 
@@ -8,39 +8,60 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import noise_of, refused_by_name
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.shapes import Bool
+
+OUTLIER_SHARE = 0.01
+"""Probability of an outlier before the window's measurements are compared. A landmark measurement
+is rejected where it is this much less likely given the others than anywhere in view; with ten times
+the share a tenth of the same likelihood is needed, so the value hardly matters."""
 
 
 class OutlierGate:
-    """Accepts measurements that agree with others of the same window; keeps nothing beyond its end.
+    """Accepts measurements that others of the same window do not contradict; keeps nothing beyond
+    its end.
 
-    While the window is open, a measurement is accepted if earlier ones, or others at the same time,
-    agree with it. For the submap all are compared with all others, since the first measurement of a
-    landmark can only be confirmed by a later one.
-
-    judges: whether outliers are expected; otherwise all measurements are accepted.
+    While the window is open, a measurement is accepted if it agrees with the other ones of its
+    landmark so far under the odometry, or is the only one. For the submap all are compared with all
+    others by a smoother over the window.
     """
 
-    def __init__(self, sensor: Sensor, outlier_share: float) -> None:
+    def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self._outlier_share = outlier_share
-        self.judges = outlier_share > 0.0
         self.begin()
 
     def begin(self) -> None:
         """Begin a window."""
-        self._keyframes: list[Keyframe] = []
-        self.gated = 0
-        if self.judges:
-            sensor = self._sensor
-            self._consensus = core.Consensus(
-                noise_of(sensor), sensor.max_range, sensor.field_of_view, self._outlier_share
-            )
+        sensor = self._sensor
+        self._all: list[Keyframe] = []
+        self._begins = [0]
+        self._accepted: Bool[np.ndarray, " n"] = np.zeros(0, np.bool_)
+        self._consensus = core.Consensus(
+            noise_of(sensor), sensor.max_range, sensor.field_of_view, OUTLIER_SHARE
+        )
 
-    def admit(self, keyframe: Keyframe) -> Keyframe:
-        """Reduce the keyframe to its measurements that agree with those up to it."""
-        if not self.judges:
-            return keyframe
-        self._keyframes.append(keyframe)
+    @property
+    def gated(self) -> int:
+        """Number of measurements that are not accepted."""
+        return int(np.count_nonzero(~self._accepted))
+
+    @property
+    def keyframes(self) -> Sequence[Keyframe]:
+        """The keyframes, reduced to their accepted measurements."""
+        return [self._reduced(k) for k in range(len(self._all))]
+
+    @property
+    def last(self) -> Keyframe:
+        """The last keyframe, reduced to its accepted measurements."""
+        return self._reduced(len(self._all) - 1)
+
+    def _reduced(self, k: int) -> Keyframe:
+        accepted = self._accepted[self._begins[k] : self._begins[k + 1]]
+        return self._all[k] if accepted.all() else self._all[k].only(accepted)
+
+    def add(self, keyframe: Keyframe) -> bool:
+        """Add a keyframe; return whether all measurements accepted before it stay accepted."""
+        self._all.append(keyframe)
+        self._begins.append(self._begins[-1] + len(keyframe.ids))
         with refused_by_name():
             self._consensus.add(
                 keyframe.increment.mean,
@@ -50,16 +71,12 @@ class OutlierGate:
                 keyframe.bearings,
                 keyframe.own,
             )
-        if not len(keyframe.ids):
-            return keyframe
-        return keyframe.only(self._consensus.agreeing()[-len(keyframe.ids) :])
+        agreed, count = self._consensus.agreeing(), len(self._accepted)
+        stay = bool((self._accepted <= agreed[:count]).all())
+        self._accepted = np.concatenate([self._accepted, agreed[count:]]) if stay else agreed
+        return stay
 
-    def confirm(self) -> Sequence[Keyframe]:
-        """Reduce all keyframes of the window to their confirmed measurements; count the others."""
-        taken = self._consensus.confirmed()
-        self.gated = int(np.count_nonzero(~taken))
-        bounds = np.cumsum([0, *(len(keyframe.ids) for keyframe in self._keyframes)])
-        return [
-            keyframe.only(taken[begin:end])
-            for keyframe, begin, end in zip(self._keyframes, bounds, bounds[1:], strict=False)
-        ]
+    def confirm(self) -> bool:
+        """Compare all measurements of the window; return whether other ones are accepted now."""
+        before, self._accepted = self._accepted, self._consensus.confirmed()
+        return not np.array_equal(before, self._accepted)

@@ -26,7 +26,7 @@ from teamslam.team.estimation.map_joining.condensed_factor import (
     newest,
     places,
 )
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE, Island
+from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, UNSOLVABLE, Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
@@ -143,9 +143,9 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
 
 def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
-    graph, c = island.graph, island.settings.robust_c
+    graph = island.graph
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
-    narrow = np.ones(len(graph.submaps), np.bool_) if c is None else island.scale <= c
+    narrow = (island.scale <= 1.0) | (island.scale >= PLAIN)
     leaving = np.zeros(len(graph.submaps), np.bool_)
     blocked = set[Stream]()
     for f, (contribution, *_) in enumerate(graph.submaps):

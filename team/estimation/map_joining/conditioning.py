@@ -43,11 +43,11 @@ are tested for each pose, and leaving out a correct one costs little.
 """
 CONTRADICTED = 1e-6
 """Probability below which the cost of a prior and submaps counts as a contradiction."""
-TRUSTING = JoinSettings()
+TRUSTING = JoinSettings(robust=False)
 """Settings of plain least squares."""
-DOUBTING = JoinSettings(robust_c=1e3, landmark_gate=GATE)
+DOUBTING = JoinSettings(submap_gate=math.inf, landmark_gate=GATE)
 """Settings that discount landmarks beyond a narrowing gate, but no submap as a whole."""
-DISPUTED = JoinSettings(robust_c=2.0, landmark_gate=GATE)
+DISPUTED = JoinSettings(submap_gate=0.5, landmark_gate=GATE)
 """Settings for contradictory input: a whole submap, or the map, may be down-weighted."""
 FEWEST = 2
 """Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a

@@ -2,20 +2,19 @@
 rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
-prior), where ρ is the identity, or Cauchy's loss on √(χ²/dim) per factor, by iterated re-weighting;
-that of a robot's own bias is always Cauchy's.
-A robust factor enters with a wide scale that narrows with each iteration since it was added, so
-that a true loop closure is not taken for an outlier before the chain has adapted to it.
+prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g that a sound factor does not exceed, and
+g (2 − g/χ²) beyond, whose slope, the weight, is (g/χ²)². A factor enters with a wide gate that
+narrows with each iteration since it was added, so that a true loop closure is not taken for an
+outlier before the chain has adapted to it. The prior of a robot's own bias has Cauchy's loss.
 
-With a robust loss each landmark of a submap has a weight of its own as well, so that a mistaken
-landmark does not break the robot's chain: beyond the gate g its χ² counts g (1 + log(χ²/g)), whose
-slope, the weight, is g/χ². The weight enters as additional variance of that landmark alone.
+Each landmark of a submap has a gate and a weight of its own as well, so that a mistaken landmark
+does not break the robot's chain. The weight enters as additional variance of that landmark alone.
 `core.Estimate` computes all of these.
 """
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -43,7 +42,7 @@ STILL = 1e-3
 tenth of the shift by condensing (docs/decisions/25).
 """
 PLAIN = 1e9
-"""Robust scale at which Cauchy's loss is χ² to the last bit."""
+"""Widening of gates beyond every χ²."""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -52,10 +51,11 @@ FULL_AGE = 1_000_000
 class JoinSettings:
     """Settings of map joining.
 
-    iterations_per_tick: Gauss-Newton iterations of `folded`. robust_c: Cauchy's scale on √(χ²/dim)
-    of a factor; None for least squares. The scale begins at robust_start · c and is multiplied by
-    robust_decay with each iteration until it is c. landmark_gate: χ² of two numbers from which a
-    submap's landmark is discounted, with a robust loss; it narrows with the scale.
+    iterations_per_tick: Gauss-Newton iterations of `folded`. robust: whether factors beyond their
+    gates are discounted; otherwise least squares. The gates of χ² are wider by robust_start² at
+    first, and by robust_decay² less with each iteration, until the factor is 1. submap_gate: factor
+    on the gate of a submap as a whole. landmark_gate: χ² of two numbers from which a submap's
+    landmark is discounted.
     covariance_factor: factor on every submap's covariance. max_iterations, step_tolerance: a full
     solve ends when no unknown changes by more than step_tolerance [m, rad], or after
     max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
@@ -70,9 +70,10 @@ class JoinSettings:
     """
 
     iterations_per_tick: int = 2
-    robust_c: float | None = None
+    robust: bool = True
     robust_start: float = 8.0
     robust_decay: float = 0.7
+    submap_gate: float = 1.0
     landmark_gate: float = 13.8
     covariance_factor: float = 1.0
     max_iterations: int = 50
@@ -114,21 +115,23 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """Robust scale c of each submap at its age; PLAIN for a saved map (see `saved_maps`)."""
+        """Widening of each submap's gates at its age; PLAIN for a saved map (see `saved_maps`)."""
         scale = self._scale_at(self.age)
-        if self.settings.robust_c is not None:
+        if self.settings.robust:
             saved = [is_map(each.contribution.stream) for each in self.graph.submaps]
             scale[np.flatnonzero(saved)] = PLAIN
         return scale
 
     @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
-        """Robust scale c of each inter-robot measurement at its age."""
+        """Widening of each inter-robot measurement's gate at its age."""
         return self._scale_at(self.sighting_age)
 
     def _scale_at(self, age: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         settings = self.settings
-        return robust_scale(age, settings.robust_c, settings.robust_start, settings.robust_decay)
+        if not settings.robust:
+            return np.full(len(age), math.inf)
+        return robust_scale(age, settings.robust_start, settings.robust_decay)
 
     @cached_property
     def estimate(self) -> core.Estimate:
@@ -139,7 +142,8 @@ class Island:
             self.state,
             self.scale,
             self.sighting_scale,
-            settings.robust_c,
+            settings.robust,
+            settings.submap_gate,
             settings.landmark_gate,
             settings.covariance_factor,
             settings.joined_ranges,
@@ -304,17 +308,35 @@ def settled(island: Island) -> tuple[Island, int, float]:
     """Solve in full from this state; return also the number of iterations and the last change [m,
     rad].
 
-    The robust scale of every factor is annealed anew. The solve ends when converged, after
+    Without robust weights first: where no factor of that solution is beyond its gate, it is the
+    robust solution. Else the gates of all factors narrow anew. A solve ends when converged, after
     `max_iterations`, or where no step lowers the cost; the last change shows whether it converged.
     """
+    if island.settings.robust:
+        with suppress(*UNSOLVABLE):
+            plain, count, change = _descended(
+                replace(island, settings=replace(island.settings, robust=False))
+            )
+            found = aged(replace(plain, settings=island.settings), FULL_AGE)
+            if not _has_outliers(found):
+                return found, count, change
+    return _descended(island)
+
+
+def _has_outliers(island: Island) -> bool:
+    """Whether a factor or a landmark of a submap is beyond its gate."""
+    at = island.estimate
+    weights = at.weights, at.landmark_weights, at.sighting_weights, at.prior_weights
+    return any((each < 1.0).any() for each in weights)
+
+
+def _descended(island: Island) -> tuple[Island, int, float]:
     settings = island.settings
     island = aged(island, None)
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
-        narrow = settings.robust_c is None or bool(
-            ((scales == settings.robust_c) | (scales == PLAIN)).all()
-        )
+        narrow = not settings.robust or bool(((scales == 1.0) | (scales == PLAIN)).all())
         island, (damping, change) = _iteration(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):

@@ -32,18 +32,13 @@ def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray
 
 
 def robust_scale(
-    age: Int64[np.ndarray, " k"], robust_c: float | None, start: float, decay: float
+    age: Int64[np.ndarray, " k"], start: float, decay: float
 ) -> Float[np.ndarray, " k"]:
-    """Cauchy's scale c of factors after `age` iterations: robust_c · max(1, start · decay^age).
-
-    Infinite without a robust loss.
-    """
-    if robust_c is None:
-        return np.full(len(age), math.inf)
+    """Widening of the gates of factors after `age` iterations: max(1, start · decay^age)."""
     if decay >= 1.0:  # it never narrows
-        return robust_c * np.maximum(1.0, start * _powers(decay, age))
+        return np.maximum(1.0, start * _powers(decay, age))
     narrowing = _narrowing(start, decay)
-    scale: Float[np.ndarray, " k"] = robust_c * narrowing[np.minimum(age, len(narrowing) - 1)]
+    scale: Float[np.ndarray, " k"] = narrowing[np.minimum(age, len(narrowing) - 1)]
     return scale
 
 

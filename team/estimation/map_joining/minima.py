@@ -221,8 +221,8 @@ def _further(island: Island) -> Iterator[Island]:
         if alone is not None:  # none, where only inter-robot measurements tie the robots
             for found in _minima([replace(unseen, state=alone)]):
                 yield replace(island, state=found.island.state)
-    if guess is not None and island.settings.robust_c is None:
-        doubting = replace(island.settings, robust_c=1.0, robust_start=WIDE)
+    if guess is not None:
+        doubting = replace(island.settings, robust=True, robust_start=WIDE)
         for found in _minima([replace(island, state=guess, settings=doubting)]):
             yield replace(island, state=found.island.state)
 

@@ -82,7 +82,7 @@ def test_spoilt_measurements_go_and_the_others_stay(seed, spoilt):
     assert np.count_nonzero(~np.delete(taken, bad)) <= 2, "3 sigma in one of 40 is nothing special"
 
 
-def test_a_measurement_that_is_alone_is_not_taken_nor_are_two_that_disagree():
+def test_a_lone_measurement_of_another_landmark_is_not_taken_nor_are_two_that_disagree():
     window = drive(1)
     window.ids[3] = 99
     window.ids[[8, 21]] = 77
@@ -147,7 +147,7 @@ def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
     np.testing.assert_array_equal(other.judged(), taken[order])
 
 
-def test_a_window_without_measurements_or_with_one_has_nothing_to_take():
+def test_the_only_measurement_of_a_window_is_taken():
     window = drive(5)
     for count in (0, 1):
         few = Drive(
@@ -157,7 +157,7 @@ def test_a_window_without_measurements_or_with_one_has_nothing_to_take():
             window.measurements[:count],
         )
         for by in ("agreeing", "confirmed"):
-            assert not few.judged(by).any()
+            assert few.judged(by).tolist() == count * [True]
 
 
 def test_keyframes_without_measurements_change_nothing():
@@ -206,9 +206,9 @@ def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:
     ("name", "kind", "least_kept", "most_passed"),
     [
         ("thesis", "measurement", 0.94, 0.14),
-        ("thesis", "identity", 0.94, 0.04),
+        ("thesis", "identity", 0.94, 0.5),
         ("thesis-b", "measurement", 0.97, 0.02),
-        ("thesis-b", "identity", 0.97, 0.02),
+        ("thesis-b", "identity", 0.97, 0.2),
     ],
 )
 def test_of_three_tenths_outliers_few_pass_and_good_measurements_are_kept(

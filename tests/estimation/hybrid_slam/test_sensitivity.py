@@ -438,7 +438,7 @@ def test_a_contribution_keeps_its_columns_over_the_wire():
 
 def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_its_costs():
     world, submaps, _ = biased_team(1)
-    options = JoinSettings(bias_sigma=SIGMA, robust_c=1.0)
+    options = JoinSettings(bias_sigma=SIGMA)
     island = fold_of(world, submaps, options).main
     k = next(k for k, prior in enumerate(island.graph.priors) if len(prior.mean) == 1)
     prior = island.graph.priors[k]
@@ -450,7 +450,7 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
         return replace(island, state=state)
 
     assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
-    plain = replace(shifted(10.0 * sigma), settings=replace(options, robust_c=None))
+    plain = replace(shifted(10.0 * sigma), settings=replace(options, robust=False))
     assert plain.estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
     graph, h = island.graph, 1e-4 * sigma
     counts = len(graph.submaps), len(graph.sightings), len(graph.priors)

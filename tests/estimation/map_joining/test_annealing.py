@@ -19,7 +19,7 @@ from teamslam.team.estimation.map_joining.merging import ages, sighted
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from teamslam.team.estimation.submap import LocalMap
 
-ANNEALED = JoinSettings(robust_c=1.0)
+ANNEALED = JoinSettings()
 AT_ONCE = replace(ANNEALED, robust_start=1.0)
 """The mutant: a factor is judged at its final scale from the first iteration on."""
 
@@ -73,21 +73,20 @@ def test_a_full_solution_anneals_what_has_been_judged_anew():
     judged = aged(replace(after(10, closed_loop(AT_ONCE)), settings=ANNEALED), 100)
     assert (judged.sighting_scale == 1.0).all()
     assert off_m(judged) > 2.0
-    solved, iterations, change = settled(judged)
+    solved, _, change = settled(judged)
     assert off_m(solved) < 0.3
     assert change < ANNEALED.step_tolerance
     assert (solved.scale == 1.0).all(), "it ends at the final scale"
-    assert iterations > 6, "which is not reached before"
 
 
-def test_the_scale_of_a_factor_falls_by_its_decay_with_each_iteration_until_it_is_c():
-    options = replace(ANNEALED, robust_c=2.0, robust_start=4.0, robust_decay=0.5)
+def test_the_scale_of_a_factor_falls_by_its_decay_with_each_iteration_until_it_is_one():
+    options = replace(ANNEALED, robust_start=4.0, robust_decay=0.5)
     island = closed_loop(options)
-    for age, scale in ((0, 8.0), (1, 4.0), (2, 2.0), (3, 2.0), (50, 2.0)):
+    for age, scale in ((0, 4.0), (1, 2.0), (2, 1.0), (3, 1.0), (50, 1.0)):
         aged = replace(island, age=np.full(2, age), sighting_age=np.full(1, age))
         assert aged.scale.tolist() == [scale, scale]
         assert aged.sighting_scale.tolist() == [scale]
-    assert np.isinf(replace(island, settings=JoinSettings()).scale).all()
+    assert np.isinf(replace(island, settings=JoinSettings(robust=False)).scale).all()
 
 
 @pytest.mark.parametrize("per_tick", [1, 3])

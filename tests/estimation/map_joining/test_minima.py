@@ -24,7 +24,7 @@ from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import team, wrap
 
-OPTIONS = JoinSettings()
+OPTIONS = JoinSettings(robust=False)
 
 
 def island_of(world, sightings=()):

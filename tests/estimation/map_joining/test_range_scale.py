@@ -149,7 +149,7 @@ def test_an_outlier_does_not_grow_with_its_distance():
 
 def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
     submaps, starts, _ = carts(6, submaps=2, marker=MARKER)
-    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER}, robust_c=1.0)
+    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
     graph = fold_of(submaps, starts, options).main.graph
     assert sorted(graph.common) == [1, 2, 3, 4, 5]
     assert graph.name(graph.common[3]) == "the marker 3 of the team"
@@ -237,7 +237,8 @@ def test_what_a_robot_is_told_of_its_scale_is_its_own_error_and_the_teams():
 
 def test_islands_that_merge_have_one_common_error_and_its_prior_counts_once():
     submaps, starts, _ = carts(4, common=COMMON)
-    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"range_scale": COMMON})
+    common = {"range_scale": COMMON}
+    options = JoinSettings(robust=False, bias_sigma=SIGMA, common_bias_sigma=common)
     fold = fold_of(submaps, starts[:1], options)
     graph, agreement = fold.main.graph, marginals.joint_cost(fold)
     assert len(fold.islands) == len(graph.common) == 1

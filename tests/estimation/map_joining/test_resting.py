@@ -14,7 +14,7 @@ from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
 
-ROBUST = JoinSettings(robust_c=2.0)
+ROBUST = JoinSettings()
 NEVER = 1_000_000
 STREAMS = (("r0", 0), ("r1", 0))
 
@@ -43,7 +43,9 @@ def at_rest(fold):
     return set(landmark_view.resting_of(fold.main).ids.tolist())
 
 
-@pytest.mark.parametrize("settings", [JoinSettings(), ROBUST], ids=["squares", "robust"])
+@pytest.mark.parametrize(
+    "settings", [JoinSettings(robust=False), ROBUST], ids=["squares", "robust"]
+)
 def test_a_fold_whose_landmarks_rest_and_wake_is_the_fold_in_which_none_rests(settings):
     resting, woke = set(), 0
     for one, other in zip(

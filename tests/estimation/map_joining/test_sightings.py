@@ -53,9 +53,7 @@ def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distan
 
 def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised():
     world = meeting(3, robots=3, submaps=2)
-    island = joined_with(
-        world.submaps, world.starts, world.sightings, JoinSettings(robust_c=1.0)
-    ).main
+    island = joined_with(world.submaps, world.starts, world.sightings, JoinSettings()).main
     assert len(island.graph.sightings) == len(world.sightings) == 12
     gradient = island.estimate.gradient
     for k in range(0, len(island.state), 4):
@@ -134,7 +132,7 @@ def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
     starts = world.starts[:2]
     of_others = [s for s in world.sightings if "r2" not in (s.robot, s.teammate)]
     by_others = [s for s in world.sightings if s.robot != "r2"]
-    options = JoinSettings(robust_c=1.0)
+    options = JoinSettings()
     without, withdrawn = (
         converged(joined_with(submaps, starts, each, options), options)
         for each in (of_others, by_others)
@@ -146,7 +144,7 @@ def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
 
 def test_one_outlier_among_sightings_does_not_bend_the_robust_map():
     world = meeting(8, robots=3)
-    options = JoinSettings(robust_c=1.0)
+    options = JoinSettings()
     wrong = replace(world.sightings[4], measurement=np.array([25.0, 2.0]))
     clean, spoilt = (
         landmark_map(converged(joined_with(world.submaps, world.starts, s, options), options))

@@ -258,6 +258,7 @@ def test_a_scenario_of_a_log_with_former_names_is_read_with_todays() -> None:
     for name, now in former_names.FIELDS.items():
         former = former.replace(f'"{now}":', f'"{name}":')
     former = former.replace('"garbage_kind":"measurement"', '"garbage_kind":"reading"')
+    former = former.replace('"front_end":{', '"front_end":{"garbage":0.3,')
     assert former.count("garbage") == 2 + len(today.robots)
     assert loads(former) == today
 
@@ -265,7 +266,7 @@ def test_a_scenario_of_a_log_with_former_names_is_read_with_todays() -> None:
 def test_a_logs_configurations_with_former_names_are_read_with_todays() -> None:
     today = load("thesis").robots[0]
     text = msgspec.json.encode(today).decode()
-    former = text.replace('"outlier_share":', '"garbage":')
+    former = text.replace('"front_end":{', '"front_end":{"outlier_share":0.3,')
     assert former != text
     announced = build.configuration(node="robot/r1", configuration=former)
     recorded = Recorded(configured={announced.node: announced})

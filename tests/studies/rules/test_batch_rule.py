@@ -131,7 +131,9 @@ def test_errors_that_persist_are_taken_as_white_and_that_is_said_once():
 
 
 def test_a_robust_scale_is_that_of_the_configuration():
-    plain, robust = (heard(robots(), **options)[0].final for options in ({}, {"robust_c": 1.0}))
+    plain, robust = (
+        heard(robots(), **options)[0].final for options in ({}, {"batch_robust_c": 1.0})
+    )
     assert plain.chi2 != robust.chi2
     assert robust.reasons == ()
 

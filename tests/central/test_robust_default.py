@@ -1,0 +1,58 @@
+"""A team with default settings survives wrong measurements and a robot that is carried off."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from teamslam.central.desk.evaluation.errors import MapErrors, map_errors
+from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
+
+WORLD = StressWorld(seed=3, landmarks=20, half_m=14.0, seconds=150.0)
+FAULTS = {
+    "1 % outliers": replace(WORLD, outlier_share=0.01),
+    "5 % outliers": replace(WORLD, outlier_share=0.05),
+    "20 % outliers": replace(WORLD, outlier_share=0.2),
+    "moved by 2 m": replace(WORLD, moved=(MovedLandmark(7, (1.4, 1.4), 75.0),)),
+    "moved by 0.5 m": replace(WORLD, moved=(MovedLandmark(7, (0.35, 0.35), 75.0),)),
+    "one identity of two": replace(WORLD, same_id=((7, 9),)),
+    "carried off": replace(WORLD, carried_off=(CarriedOff("r2", 8.0, 2.0, 75.0),)),
+}
+WRONG = (7, 9)
+"""Landmarks that are left out of the comparison: only the rest of the map must be right."""
+
+
+def final(world: StressWorld, folder: Path) -> MapResult:
+    place = write(world, folder)
+    scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
+    found = evaluate(list(run_team(scenario, streams_of(scenario)))).map
+    assert found is not None
+    return found
+
+
+def errors_of_rest(found: MapResult) -> MapErrors:
+    kept = np.flatnonzero(found.known & ~np.isin(found.ids, WRONG))
+    rows = np.column_stack([2 * kept, 2 * kept + 1]).ravel()
+    return map_errors(found.means[kept], found.covariance[np.ix_(rows, rows)], found.truth[kept])
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> MapErrors:
+    return errors_of_rest(final(WORLD, tmp_path_factory.mktemp("clean")))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_rest_of_the_map_is_right(fault: str, clean: MapErrors, tmp_path: Path) -> None:
+    found = final(FAULTS[fault], tmp_path)
+    of_rest = errors_of_rest(found)
+    assert of_rest.count >= clean.count - 1
+    assert of_rest.nees_per_dof < 2.2
+    assert of_rest.aligned_rmse_m is not None
+    assert clean.aligned_rmse_m is not None
+    assert of_rest.aligned_rmse_m < 2.0 * clean.aligned_rmse_m
+    assert found.withdrawn == ()
