@@ -19,7 +19,7 @@ from teamslam.central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.contribution import Contribution, moment
+from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.gaussian import NotACovarianceError, information
 from teamslam.team.estimation.map_joining.alignment import Alignment, aligned
 from teamslam.team.estimation.map_joining.joining import Fold
@@ -51,7 +51,7 @@ class CarriedOff(NamedTuple):
     before, after: numbers of the last submap before it and of the first one after it. begin_ns,
     end_ns: their end and beginning, equal where no submap is between. by: the motion in the map's
     frame (x [m], y [m], turn [rad]). in_all: `by` includes the robot's own motion between the two,
-    since the submap between them is spoilt.
+    since the submap between them is spoilt. evidence: χ² of the open seams per degree of freedom.
     """
 
     robot: str
@@ -61,18 +61,7 @@ class CarriedOff(NamedTuple):
     end_ns: int
     by: tuple[float, float, float]
     in_all: bool
-
-    def __str__(self) -> str:
-        """Describe the motion."""
-        dx, dy, turn = self.by
-        begin, end = moment(self.begin_ns), moment(self.end_ns)
-        when = f"at t = {begin}" if begin == end else f"between t = {begin} and {end}"
-        own = ", its own way in that time included" if self.in_all else ""
-        return (
-            f"{self.robot} was carried off or slipped {when}, between its submaps {self.before} "
-            f"and {self.after}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
-            f"{own}; before and after that its submaps agree with the map without it"
-        )
+    evidence: float
 
 
 class _Placed(NamedTuple):
@@ -142,6 +131,7 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
         end_ns=chain[after - 1].end_ns,
         by=(float(by[0]), float(by[1]), wrapped(by[2])),
         in_all=bool(spoilt),
+        evidence=math.fsum(each.chi2 for each in opened) / (SEAM_DOF * len(opened)),
     )
 
 

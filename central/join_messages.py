@@ -25,7 +25,7 @@ from teamslam.team.estimation.map_joining.distinctness import (
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
-from teamslam.team.estimation.map_joining.misfits import worst_landmark
+from teamslam.team.estimation.map_joining.minima import RIVAL
 from teamslam.team.estimation.map_joining.refusal import refusals
 from teamslam.team.estimation.map_joining.repetition import Repetition, find_repetitions
 from teamslam.team.shapes import Float, UInt32
@@ -63,6 +63,7 @@ def team_map(
     covariance_scale: float,
     biases: Sequence[BiasEstimate],
     reasons: tuple[str, ...],
+    diagnosis: tuple[m.Diagnosis, ...],
     changes: tuple[m.LandmarkChange, ...] = (),
 ) -> m.FusedMap:
     """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
@@ -89,6 +90,7 @@ def team_map(
         chi2=cost[0],
         dof=round(cost[1]),
         reasons=reasons,
+        diagnosis=diagnosis,
         biases=tuple(
             m.BiasEstimate(
                 robot=b.stream[0],
@@ -170,17 +172,14 @@ def reasons(
     shown: Shown,
     biases: Sequence[BiasEstimate],
     landmark_submaps: int,
-    *,
-    final: bool,
 ) -> tuple[str, ...]:
     """List why robots and landmarks are not in the map, and warnings about it."""
     return (
         *_apart(fold),
         *_worded(refusals(fold)),
-        *fold.warnings,
+        *(words for words in fold.warnings if not words.startswith(RIVAL)),
         *_lost(shown),
         *_repeated(shown),
-        *(_misfitting(fold) if final else ()),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
@@ -191,15 +190,6 @@ def _lost(shown: Shown) -> Iterator[str]:
         yield (
             f"{named(stream)} was lost: its heading is known to {np.degrees(sigma):.0f}° at worst; "
             "its path there is not to be trusted"
-        )
-
-
-def _misfitting(fold: Fold) -> Iterator[str]:
-    found = worst_landmark(fold.main) if fold.contributions else None
-    if found is not None:
-        yield (
-            f"landmark {found.landmark} does not fit: cost {found.cost:.0f} per degree of freedom "
-            f"where landmarks have {found.median:.1f}; it was moved, or two have its number"
         )
 
 

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from teamslam.central.config import CentralConfig
+from teamslam.central.diagnosis import describe, diagnose
 from teamslam.central.fused import receivable
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
@@ -19,7 +20,7 @@ from teamslam.central.join_messages import (
     team_map,
     trajectories,
 )
-from teamslam.central.monitor import NOTHING, deviations, finding
+from teamslam.central.monitor import NOTHING, finding
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.tick_fold import TickFold
@@ -48,7 +49,7 @@ class SubmapFold:
     """Folds the stored set tick by tick and makes the messages of its maps.
 
     warnings: failures in words, the newest last. landmarks: number in the newest map. not_folded:
-    number of refused inputs. finding, reasons: of the newest map.
+    number of refused inputs. finding, diagnosis, reasons: of the newest map.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class SubmapFold:
         self.landmarks = 0
         self.not_folded = 0
         self.finding = NOTHING
+        self.diagnosis: tuple[m.Diagnosis, ...] = ()
         self.reasons: tuple[str, ...] = ()
         self._ticks = TickFold(config)
         self._ticks.convicts = self._ticks.convicts and convicts
@@ -157,7 +159,11 @@ class SubmapFold:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The monitor's warnings, reasons why robots are not joined, and warnings about the map."""
+        """Causes of misfit, reasons why robots are not joined, and warnings about the map."""
+        return (*map(describe, self.diagnosis), *self._warnings)
+
+    @property
+    def _warnings(self) -> tuple[str, ...]:
         suspended = (
             f"{robot} is left out of running maps: {why}"
             for robot, why in sorted(self.suspended.items())
@@ -174,7 +180,7 @@ class SubmapFold:
                 f"{', '.join(self._apart)} contradict each other: until it is determined which of "
                 "them is wrong, each one's prior is made of its own submaps"
             )
-        return (*self.finding.warnings, *suspended, *undecided, *raised, *self.reasons)
+        return (*suspended, *undecided, *raised, *self.reasons)
 
     def _messages(
         self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None
@@ -192,11 +198,16 @@ class SubmapFold:
         figures = self.finding.figures
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         shown = shown_landmarks(fold, self.config, tail)
-        self.reasons = (
-            *(map(str, ticks.find_carried_off(fold)) if final else ()),
-            *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
-            *map(str, deviations(biases, ticks.settings.bias_sigma, scale)),
+        self.diagnosis = diagnose(
+            fold,
+            biases,
+            ticks.find_carried_off(fold) if final else (),
+            ticks.submaps_of_convicted(),
+            self.config.normal_scale,
+            scale,
+            final=final,
         )
+        self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)
         store = self.store
         fused = team_map(
             fold,
@@ -210,7 +221,8 @@ class SubmapFold:
             cost=(0.0, 0.0) if agreement is None else (agreement.chi2, agreement.dof),
             covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
             biases=biases,
-            reasons=self.findings if final else self.reasons,
+            reasons=self._warnings if final else self.reasons,
+            diagnosis=self.diagnosis,
             changes=landmark_changes(fold, shown.ids) if final else (),
         )
         self._final = (fold, fused) if final else None

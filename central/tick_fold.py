@@ -43,7 +43,7 @@ from teamslam.central.withdrawal import (
 )
 from teamslam.team.config import BIASES
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.contribution import Contribution, Stream
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
@@ -446,6 +446,15 @@ class TickFold:
             for _, chain in sorted(self._inputs.chains(robot).items())
         )
         return [each for each in found if each is not None]
+
+    def submaps_of_convicted(self) -> Mapping[str, Sequence[Contribution]]:
+        """Return the submaps of each robot that the fold has withdrawn, in order."""
+        return {
+            robot: [
+                each for _, chain in sorted(self._inputs.chains(robot).items()) for each in chain
+            ]
+            for robot in sorted(self.convicted)
+        }
 
     @property
     def raised(self) -> Mapping[str, int]:

@@ -414,6 +414,17 @@ def examples() -> Iterator[m.Message]:
                 why="",
             ),
         ),
+        diagnosis=(
+            m.Diagnosis(
+                cause="landmark_moved",
+                landmark=7,
+                value=(2.0, 0.125),
+                sigma=(0.25, 0.25),
+                evidence=331.5,
+                remedy="remove the landmark",
+                at_ns=150 * 10**9,
+            ),
+        ),
         verdicts=(
             m.Judgement(
                 first=m.LocalLandmark(robot="alpha", incarnation=1, sequence=0, local=4),

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from teamslam.central.diagnosis import describe
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
@@ -96,7 +97,7 @@ def test_nothing_is_said_of_a_robot_whose_camera_and_gyro_are_mirrored() -> None
 def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large() -> None:
     final = final_map(list(team_run("odometry")))
     assert final.withdrawn == ("r3",)
-    assert not any("carried off" in each for each in final.reasons)
+    assert not any(each.cause == "carried_off" for each in final.diagnosis)
 
 
 def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_path: Path) -> None:
@@ -106,13 +107,12 @@ def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_pat
     of = with_options(load(folder / "scenario.toml"), dataset=folder)
     final = final_map(list(run_team(of, streams_of(of))))
     assert final.withdrawn == ("r2",)
-    (text,) = (each for each in final.reasons if "carried off" in each)
-    assert "r2 was carried off or slipped at t = 50.0 s, between its submaps 4 and 5" in text
+    (found,) = final.diagnosis
+    assert "r2 was carried off or slipped at 50.0 s by" in describe(found)
     rows = np.loadtxt(folder / "r2" / "truth.csv", delimiter=",", skiprows=1)
     (at,) = np.flatnonzero(np.abs(rows[:, 0] - off.at_s) < 0.01)
     before, after = rows[at - 1, 1:], rows[at, 1:]
-    x, y = (float(each) for each in text.split("by about (")[1].split(") m")[0].split(", "))
-    turn = float(text.split(" m and ")[1].split("°")[0])
+    x, y, turn = found.value
     dx, dy, _ = after - before
     assert math.hypot(x - dx, y - dy) < 0.5
-    assert math.radians(turn) == pytest.approx(float(inverse(before)[2] + after[2]), abs=0.1)
+    assert turn == pytest.approx(float(inverse(before)[2] + after[2]), abs=0.1)

@@ -1,6 +1,5 @@
 """The consistency monitor: quiet where covariances are true, and it names who claims too much."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -49,46 +48,31 @@ def test_a_team_with_true_covariances_is_near_one_and_warned_of_in_no_seed_of_te
     for seed in range(10):
         found = watched(seed)
         assert 0.8 < found.figures["joint_cost_per_dof"] < 1.2
-        assert found.warnings == ()
+        assert found.misscaled == ()
 
 
 def test_a_robot_that_halves_its_sigmas_is_named_in_every_seed_of_ten():
     overconfident = with_covariance_times(0.25, lambda c: c.robot == "r1")
     for seed in range(10):
         found = watched(seed, overconfident)
-        named = [w for w in found.warnings if "above 1.3" in w]
-        assert named
-        assert all(w.startswith("r1: ") for w in found.warnings)
+        assert [each.robot for each in found.misscaled] == ["r1"]
         assert found.figures["joint_cost_per_dof.r1"] > 2.0 > found.figures["joint_cost_per_dof.r2"]
-
-
-def test_one_submap_that_the_rest_contradicts_is_named():
-    shifted = with_landmarks_moved(3.0, lambda c: (c.robot, c.sequence) == ("r2", 12))
-    named = [w for w in watched(3, shifted).warnings if "disagrees" in w]
-    assert named[0].startswith("r2: submap 12 disagrees")
-    assert "% of its information" in named[0]
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROBUST])
 def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
     """Whatever the loss; the factors 25 are what the bounded cost takes for nearly right."""
     for seed in range(4):
-        for factor, words in (
-            (1.0, None),
-            (0.5, "too small by a factor of"),
-            (2.0, "too large by a factor of"),
-        ):
+        for factor in (1.0, 0.5, 2.0):
             found = watched(seed, with_covariance_times(factor, lambda _: True), settings)
             assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.25)
-            said = [w for w in found.warnings if "covariances are too" in w]
-            assert bool(said) == (words is not None), (seed, factor, found)
-            assert all(words in w and w.startswith("team: ") for w in said)
+            assert [each.robot for each in found.misscaled] == ([] if factor == 1.0 else [""])
 
 
 def test_covariances_that_are_too_large_are_reported_of_the_final_map_only():
     for factor, told in ((0.5, 1), (2.0, 0)):
         found = watched(0, with_covariance_times(factor, lambda _: True), final=False)
-        assert len([w for w in found.warnings if "covariances are too" in w]) == told
+        assert len(found.misscaled) == told
         assert "covariance_scale" in found.figures
 
 
@@ -96,11 +80,8 @@ def test_covariances_that_are_too_large_are_reported_of_the_final_map_only():
 def test_no_loss_bounds_the_covariance_scale(factor):
     found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
     assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
-    (said,) = (w for w in found.warnings if "covariances are too" in w)
-    assert "with ground truth learn them by `teamslam calibrate`" in said
-    by = re.search(r"multiply the sigmas of sensor and odometry by ([\d.]+)", said)
-    assert by is not None
-    assert float(by[1]) ** 2 == pytest.approx(1.0 / factor, rel=0.4)
+    (team,) = found.misscaled
+    assert (team.robot, team.value) == ("", found.figures["covariance_scale"])
 
 
 def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
@@ -108,14 +89,14 @@ def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
     clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
     of = "covariance_scale"
     assert spoilt.figures[of] == pytest.approx(clean.figures[of], rel=0.35)
-    assert not [w for w in spoilt.warnings if "covariances are too" in w]
+    assert not spoilt.misscaled
 
 
 def test_a_profile_says_which_scale_is_normal():
     small = with_covariance_times(2.0, lambda _: True)
     found = watched(0, small, normal=0.5)
     assert found.figures["covariance_scale"] == pytest.approx(1.0, rel=0.25)
-    assert not [w for w in found.warnings if "covariances are too" in w]
+    assert not found.misscaled
 
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])

@@ -8,7 +8,8 @@ measurements alone, never the truth. SI units, radians.
 """
 
 import argparse
-from collections.abc import Mapping
+import math
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from math import pi
 from pathlib import Path
@@ -17,8 +18,8 @@ import numpy as np
 
 STEP_S = 0.1
 """Time between two odometry intervals [s]."""
-SCAN_EVERY = 5
-"""Odometry intervals from one scan to the next."""
+SCAN_S = 0.5
+"""Time between two scans [s]."""
 SPEED = 1.0
 """Nominal speed [m/s]."""
 
@@ -51,7 +52,11 @@ class StressWorld:
     robot. mirrored: robots whose bearings have the wrong sign. same_id: pairs (a, b): landmark b
     is measured with the identity of a. noise: factor on the noise of odometry and sensor. grid:
     landmarks are a grid of so many by so many, 5 m apart; 0: spread at random. clutter: number of
-    false detections in each scan, without identities.
+    false detections in each scan, without identities. tails: degrees of freedom of Student's t of
+    the sensor's errors; 0: normal. correlated_s: time over which the sensor's errors are
+    correlated, half of their variance; 0: none. corridor: whether the landmarks are in the outer
+    fifths of the square alone. step_s: time between two odometry intervals; scans come every half
+    second, or with each interval where that is longer.
     """
 
     seed: int = 1
@@ -73,6 +78,15 @@ class StressWorld:
     noise: float = 1.0
     grid: int = 0
     clutter: int = 0
+    tails: float = 0.0
+    correlated_s: float = 0.0
+    corridor: bool = False
+    step_s: float = STEP_S
+
+    @property
+    def scan_every(self) -> int:
+        """Odometry intervals from one scan to the next."""
+        return max(1, round(SCAN_S / self.step_s))
 
 
 SCENARIO = """\
@@ -126,6 +140,8 @@ def _spread(world: StressWorld, rng: np.random.Generator) -> np.ndarray:
     while len(points) < world.landmarks:
         point = rng.uniform(-world.half_m, world.half_m, 2)
         tries += 1
+        if world.corridor and abs(point[0]) < 0.6 * world.half_m:
+            continue
         if tries > 10_000 or all(np.hypot(*(point - each)) > 3.0 for each in points):
             points.append(point)
     return np.array(points).reshape(-1, 2)
@@ -135,12 +151,13 @@ def _robot(
     world: StressWorld, name: str, points: np.ndarray, place: Path, rng: np.random.Generator
 ) -> None:
     place.mkdir(exist_ok=True)
-    count = round(world.seconds / STEP_S)
+    step_s = world.step_s
+    count = round(world.seconds / step_s)
     pose = np.array(
         [*rng.uniform(-0.4 * world.half_m, 0.4 * world.half_m, 2), rng.uniform(-pi, pi)]
     )
     start, path, speeds, logged = pose.copy(), [pose], [], []
-    off = {round(each.at_s / STEP_S): each for each in world.carried_off if each.robot == name}
+    off = {round(each.at_s / step_s): each for each in world.carried_off if each.robot == name}
     goal = rng.uniform(-0.8 * world.half_m, 0.8 * world.half_m, 2)
     for k in range(count):
         if k in off:
@@ -158,15 +175,15 @@ def _robot(
         turn = float(np.clip(0.8 * error, -0.6, 0.6))
         speed = SPEED * (1.0 if abs(error) < 1.0 else 0.4)
         speeds.append((speed, turn))
-        pose = _arc(pose, speed, turn, STEP_S)
+        pose = _arc(pose, speed, turn, step_s)
         path.append(pose)
-        way, angle = speed * STEP_S, turn * STEP_S
+        way, angle = speed * step_s, turn * step_s
         sigma_way = 0.03 * np.sqrt(way)
-        sigma_turn = np.sqrt(0.01**2 * way + 0.005**2 * STEP_S + 0.05**2 * abs(angle))
-        slip = world.noise * sigma_way * rng.standard_normal() / STEP_S
-        twist = world.noise * sigma_turn * rng.standard_normal() / STEP_S
+        sigma_turn = np.sqrt(0.01**2 * way + 0.005**2 * step_s + 0.05**2 * abs(angle))
+        slip = world.noise * sigma_way * rng.standard_normal() / step_s
+        twist = world.noise * sigma_turn * rng.standard_normal() / step_s
         logged.append((world.odometry_scale * (speed + slip), turn + twist))
-    times = STEP_S * np.arange(count + 1)
+    times = step_s * np.arange(count + 1)
     rows = [
         f"{t:.3f},{float(v)!r},{float(w)!r}" for t, (v, w) in zip(times[:-1], logged, strict=True)
     ]
@@ -204,19 +221,22 @@ def _scans(
     sign = -1.0 if name in world.mirrored else 1.0
     alias = {b: a for a, b in world.same_id}
     rows, labels = [], []
-    for k in range(SCAN_EVERY, len(path) - SCAN_EVERY - round(max(late, 0.0) / STEP_S), SCAN_EVERY):
-        stamp, pose = k * STEP_S + late, path[k]
+    every, drawn = world.scan_every, _errors(world, rng)
+    for k in range(every, len(path) - every - math.ceil(max(late, 0.0) / world.step_s), every):
+        stamp, pose = k * world.step_s + late, path[k]
+        next(drawn)
         now = points.copy()
         for each in world.moved:
-            if k * STEP_S >= each.from_s:
+            if k * world.step_s >= each.from_s:
                 now[each.landmark - 1] += each.shift
         away = now - pose[:2]
         ranges = np.hypot(*away.T)
         bearings = np.arctan2(away[:, 1], away[:, 0]) - pose[2]
         for i in np.flatnonzero(ranges < world.reach_m).tolist():
             sigma = np.hypot(0.05, 0.02 * ranges[i])
-            z = ranges[i] + world.noise * sigma * rng.standard_normal()
-            b = bearings[i] + world.noise * 0.02 * rng.standard_normal()
+            along, across = drawn.send(True)
+            z = ranges[i] + world.noise * sigma * along
+            b = bearings[i] + world.noise * 0.02 * across
             b = sign * (b + world.bearing_offset.get(name, 0.0))
             if rng.random() < world.outlier_share:
                 z, b = rng.uniform(0.5, world.reach_m), rng.uniform(-pi, pi)
@@ -236,6 +256,26 @@ def _scans(
         _table(place / "labels.csv", "landmark", labels)
     else:
         _table(place / "observations.csv", "t_s,landmark,range_m,bearing_rad", rows)
+
+
+def _errors(
+    world: StressWorld, rng: np.random.Generator
+) -> Generator[np.ndarray, bool | None, None]:
+    """Draw errors of range and bearing in standard deviations, one for each True that is sent.
+
+    None marks the next scan. Of correlated errors, half of the variance is an Ornstein-Uhlenbeck
+    process of the scans.
+    """
+    kept = rng.standard_normal(2) if world.correlated_s else np.zeros(2)
+    fade = np.exp(-SCAN_S / world.correlated_s) if world.correlated_s else 0.0
+    drawn = np.zeros(2)
+    while True:
+        if (yield drawn) is None:
+            if world.correlated_s:
+                kept = fade * kept + np.sqrt(1.0 - fade * fade) * rng.standard_normal(2)
+            continue
+        fresh = rng.standard_t(world.tails, 2) if world.tails else rng.standard_normal(2)
+        drawn = (kept + fresh) / np.sqrt(2.0) if world.correlated_s else fresh
 
 
 def _table(path: Path, head: str, rows: list[str]) -> None:

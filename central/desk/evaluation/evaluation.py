@@ -19,6 +19,7 @@ from teamslam.central.desk.evaluation.association import (
     association_json,
     association_result,
 )
+from teamslam.central.desk.evaluation.causes import absent_robots, warning_objects
 from teamslam.central.desk.evaluation.clocks import Timed, clock_warning, separate_times_warning
 from teamslam.central.desk.evaluation.errors import (
     MapErrors,
@@ -40,7 +41,7 @@ from teamslam.central.desk.evaluation.running import TruthFrames
 from teamslam.central.desk.evaluation.states import RobotState, not_in_the_map, robot_states
 from teamslam.central.desk.evaluation.verdicts import verdicts_given
 from teamslam.central.desk.names import data_set_name, in_order, not_joined, short
-from teamslam.central.monitor import TOO_LARGE
+from teamslam.central.diagnosis import describe, to_object
 from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, RobotConfig
@@ -70,7 +71,8 @@ class MapResult:
     cost_per_dof: χ² of the join. covariance_scale: factor by which the submap covariances should be
     multiplied; None: unknown. withdrawn: robots left out. lost: incomplete robots. gospa: of all
     landmarks after truth_from_map. matching: how unnamed landmarks got true positions; None: by
-    identity or label. changes: states of the landmarks against saved maps.
+    identity or label. changes: states of the landmarks against saved maps. diagnosis: causes of
+    misfit, the best one first.
     """
 
     rule: str
@@ -93,6 +95,7 @@ class MapResult:
     gospa: Gospa | None = None
     matching: Matching | None = None
     changes: tuple[m.LandmarkChange, ...] = ()
+    diagnosis: tuple[m.Diagnosis, ...] = ()
 
 
 USUAL = ("hybrid", "join")
@@ -170,12 +173,19 @@ class Evaluation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for every command that shows the result: robots missing from the map, the map's
-        own warnings, clock offsets.
+        """Warnings for every command that shows the result: robots missing from the map, causes of
+        misfit, the map's own warnings, clock offsets.
         """
+        causes = () if self.map is None else map(describe, self.map.diagnosis)
+        return (*not_in_the_map(self.states), *causes, *self.other_warnings)
+
+    @property
+    def other_warnings(self) -> tuple[str, ...]:
+        """Warnings beside missing robots and causes of misfit."""
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
-        return (*not_in_the_map(self.states), *of_map, *self.clocks)
+        lost = (f"{name} lost: {of.why}" for name, of in self.states.items() if of.state == "lost")
+        return (*lost, *of_map, *self.clocks)
 
     @property
     def title(self) -> str:
@@ -389,11 +399,12 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "peers_that_differ": list(evaluation.disagreement),
         "final_map_frame": None if fused is None else fused.frame,
         "frame_is_arbitrary": evaluation.arbitrary_frame,
-        "not_joined": [] if fused is None else list(fused.reasons),
-        "warnings": list(evaluation.warnings),
+        "diagnosis": [] if fused is None else [to_object(each) for each in fused.diagnosis],
+        "not_joined": absent_robots(evaluation.states, "not joined"),
+        "warnings": warning_objects(evaluation.other_warnings),
         "joined": [] if fused is None else list(fused.joined),
-        "withdrawn": [] if fused is None else list(fused.withdrawn),
         "changes": [] if fused is None else [change_json(each) for each in fused.changes],
+        "withdrawn": absent_robots(evaluation.states, "withdrawn"),
         "robot_states": {name: of._asdict() for name, of in evaluation.states.items()},
         "robots": {name: _robot_json(robot) for name, robot in evaluation.robots.items()},
         "peers": {name: peer_json(peer) for name, peer in evaluation.peers.items()},
@@ -548,7 +559,8 @@ def _map_result(
         known=known,
         errors=errors,
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
-        reasons=tuple(each for each in message.reasons if not _is_refuted(each, errors)),
+        reasons=message.reasons,
+        diagnosis=tuple(each for each in message.diagnosis if not _is_refuted(each, errors)),
         joined=message.joined,
         withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
@@ -559,11 +571,12 @@ def _map_result(
     )
 
 
-def _is_refuted(reason: str, errors: MapErrors | None) -> bool:
-    """Whether the truth refutes a too-large-covariance warning: an error common to all submaps,
+def _is_refuted(found: m.Diagnosis, errors: MapErrors | None) -> bool:
+    """Whether the truth refutes that covariances are too large: an error common to all submaps,
     such as a late clock, does not show in their differences.
     """
-    return TOO_LARGE in reason and errors is not None and errors.nees_per_dof > 1.0
+    is_small = found.cause == "noise_overestimated"
+    return is_small and errors is not None and errors.nees_per_dof > 1.0
 
 
 def _match_unnamed(

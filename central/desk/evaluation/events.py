@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from teamslam.central.desk.names import in_order, not_joined, short
+from teamslam.central.diagnosis import describe
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.channels import robot_node
 
@@ -153,7 +154,8 @@ class EventDetector:
         new = dict.fromkeys(apart[name] for name in in_order(apart.keys() - self._apart))
         events += [Event(now_ns, "warning", "central", words) for words in new]
         self._apart = {*apart}
-        reasons = {without_decimals(each): each for each in fused.reasons if not _is_apart(each)}
+        said = (*map(describe, fused.diagnosis), *fused.reasons)
+        reasons = {without_decimals(each): each for each in said if not _is_apart(each)}
         events += [
             Event(now_ns, "warning", "central", reasons[shape])
             for shape in sorted(reasons.keys() - self._reasons.keys())

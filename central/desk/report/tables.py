@@ -12,6 +12,7 @@ from rich.text import Text
 from teamslam.central.desk.evaluation.errors import MapErrors
 from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult
 from teamslam.central.desk.names import OUTSIDE, not_joined, short
+from teamslam.central.diagnosis import describe
 from teamslam.team.config import MAP
 from teamslam.team.wire import messages as m
 
@@ -133,6 +134,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows += _association_rows(evaluation)
     rows += [("changes", change_words(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
+    rows += [("cause of misfit", describe(each)) for each in fused.diagnosis]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("note", words) for words in evaluation.clocks]
     rows += [("verdict", words) for words in evaluation.verdicts]

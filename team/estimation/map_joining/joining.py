@@ -45,6 +45,7 @@ from teamslam.team.estimation.map_joining.merging import Merge, ages, merge, sig
 from teamslam.team.estimation.map_joining.minima import (
     Minimum,
     Search,
+    rival_distance,
     searched,
     suspicious,
     warnings,
@@ -155,7 +156,8 @@ class Fold:
 
     home: island (a key of `islands`) of each stream. reasons: why an island other than the main one
     is not merged, by its frame. joined: each merge and its certainty, by the former frame.
-    warnings: signs of another minimum of the full solution. waiting: inter-robot measurements
+    warnings: signs of another minimum of the full solution. rival_m: distance [m] of another
+    minimum that is about as likely; None without one. waiting: inter-robot measurements
     between two islands, in canonical order. judged: number of submaps of two islands at their last
     failed merge attempt, and its reason. searched_at: number of submaps of an island at its last
     failed search for a lower minimum. iterations, change: iterations and last step [m, rad] of the
@@ -177,6 +179,7 @@ class Fold:
     change: float = 0.0
     joined: Mapping[Stream, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    rival_m: float | None = None
     judged: Mapping[tuple[Stream, Stream], tuple[int, str]] = field(default_factory=dict)
     searched_at: Mapping[Stream, int] = field(default_factory=dict)
     refused: Mapping[Key, str] = field(default_factory=dict)
@@ -354,6 +357,7 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         iterations=last.best.iterations,
         change=last.best.change,
         warnings=(*warnings(last), *warn_of_unmarked(last.best.island)),
+        rival_m=rival_distance(last),
     )
 
 

@@ -50,6 +50,8 @@ MORE_SOLUTIONS = 4
 """Further solutions of the best start before it is reported as not settling."""
 FEW_LANDMARKS = 6
 """Most landmarks with which a chain may fold wrongly at an unsuspicious cost."""
+RIVAL = "another map fits about as well"
+"""First words of the warning about another minimum."""
 WIDE = 30.0
 """Cauchy's scale at which the annealed start begins."""
 
@@ -259,6 +261,21 @@ def _quadratic(island: Island, x: Values) -> float:
     return island.graph.pattern.quadratic(values, x)
 
 
+def rival_distance(search: Search) -> float | None:
+    """Return how far the second minimum is from the best one [m], at most, if it is about as likely
+    and some number of it is beyond its standard deviation.
+    """
+    if search.second is None or not search.ambiguous:
+        return None
+    island = search.best.island
+    away = _difference(search.second.island, island)
+    points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
+    sigma = np.sqrt(island.selected_covariance[island.graph.pattern.diagonal])
+    if not bool((np.abs(away) > sigma).any()):
+        return None
+    return float(core.hypot(away[points], away[points + 1]).max())
+
+
 def warnings(search: Search) -> list[str]:
     """Warn the map's user about its minimum; empty where it is the only one."""
     island, found = search.best.island, []
@@ -285,13 +302,10 @@ def warnings(search: Search) -> list[str]:
     ]
     with suppress(*UNSOLVABLE):  # a heading that cannot be moved bends nothing
         found += nonlinearity_warnings(island)
-    if search.second is not None and search.ambiguous:
-        away = _difference(search.second.island, island)
-        points = island.graph.offset[:-1][np.diff(island.graph.offset) > 1]
-        farthest = float(core.hypot(away[points], away[points + 1]).max())
+    if search.second is not None and (farthest := rival_distance(search)) is not None:
         found.append(
-            f"another map fits about as well: chi² {search.second.cost - search.best.cost:.1f} "
-            f"more, up to {farthest:.1f} m away"
+            f"{RIVAL}: chi² {search.second.cost - search.best.cost:.1f} more, "
+            f"up to {farthest:.1f} m away"
         )
     return found
 

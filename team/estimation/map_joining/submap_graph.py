@@ -248,7 +248,7 @@ class Graph:
             if node == at:
                 return f"the place of landmark {id_} in {named(stream)}"
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
-        return f"landmark {ids[0]}"
+        return f"landmark {ids[0]}" if ids else "a split node"
 
 
 EMPTY_GRAPH = Graph(

@@ -33,6 +33,8 @@ from teamslam.team.wire.messages.estimates import Rendezvous as Rendezvous
 from teamslam.team.wire.messages.maps import MOST_SAVED as MOST_SAVED
 from teamslam.team.wire.messages.maps import AssociationDecision as AssociationDecision
 from teamslam.team.wire.messages.maps import BiasEstimate as BiasEstimate
+from teamslam.team.wire.messages.maps import Cause as Cause
+from teamslam.team.wire.messages.maps import Diagnosis as Diagnosis
 from teamslam.team.wire.messages.maps import FusedMap as FusedMap
 from teamslam.team.wire.messages.maps import LandmarkChange as LandmarkChange
 from teamslam.team.wire.messages.maps import Membership as Membership

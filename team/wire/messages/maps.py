@@ -116,6 +116,39 @@ class LandmarkChange(msgspec.Struct, frozen=True, kw_only=True, array_like=True)
     expected: Real = 0.0
 
 
+Cause = Literal[
+    "landmark_moved",
+    "identity_shared",
+    "clock_offset",
+    "odometry_scale",
+    "bearing_offset",
+    "range_offset",
+    "mirrored",
+    "carried_off",
+    "wrong_minimum",
+    "noise_underestimated",
+    "noise_overestimated",
+]
+
+
+class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
+    """A cause of misfit: of a robot, of a landmark, or of the team (neither).
+
+    value, sigma: (dx, dy) [m] of a landmark's second place from its first; (dx, dy, dtheta) of a
+    robot that was carried off; else one number, and none where the cause has none. evidence: cost
+    that the cause removes, per degree of freedom. at_ns: team time of the change; 0: no time.
+    """
+
+    cause: Cause
+    robot: Text = ""
+    landmark: int | None = None
+    value: tuple[Real, ...] = ()
+    sigma: tuple[Real, ...] = ()
+    evidence: Real = 0.0
+    remedy: Text = ""
+    at_ns: StampNs = 0
+
+
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
@@ -134,7 +167,8 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     incarnation, if landmarks have no names; a landmark of one submap is tentative, and a running
     map names the first and last few members of each. decisions: the newest closures and merges of
     robots, then the waiting ones. verdicts: the operators' verdicts in the map. changes: in a final
-    map with a saved one, the state of each landmark, by number.
+    map with a saved one, the state of each landmark, by number. diagnosis: causes of misfit, the
+    best one first.
     """
 
     rule: Text
@@ -162,6 +196,7 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     decisions: tuple[AssociationDecision, ...] = ()
     verdicts: tuple[Judgement, ...] = ()
     changes: tuple[LandmarkChange, ...] = ()
+    diagnosis: tuple[Diagnosis, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         for each in self.memberships:

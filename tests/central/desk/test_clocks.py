@@ -61,7 +61,7 @@ def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(
     assert " s late against its odometry: " in warning
     assert "set clock_offset_s = 0.1" in warning
     assert warning in evaluation.warnings
-    assert warning in to_json(evaluation)["warnings"]
+    assert {"cause": "clocks", "text": warning} in to_json(evaluation)["warnings"]
     assert ("note", warning) in team_rows(evaluation)
 
 

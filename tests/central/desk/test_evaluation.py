@@ -19,7 +19,6 @@ from teamslam.central.desk.evaluation.errors import (
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
 from teamslam.central.desk.report.tables import robot_sheet, team_rows, title_of
-from teamslam.central.monitor import TOO_LARGE
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.config import FolderWorld
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
@@ -231,17 +230,17 @@ def test_covariances_are_not_called_too_large_where_the_errors_are_larger(
     shift: float, is_shown: bool
 ) -> None:
     """All submaps share the error, as of a late clock: their differences do not show it."""
-    too_large = f"r2: {TOO_LARGE} 2.5, by the differences between submaps"
+    too_large = m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,))
     log = []
     for sample in joined_log(scenario(robots=2), shift):
         payload = sample.payload
         if sample.key == ch.FINAL_MAP.key():
             final = decoded(payload, m.FusedMap)
-            payload = encoded(msgspec.structs.replace(final, reasons=(too_large, "another")))
+            payload = encoded(msgspec.structs.replace(final, diagnosis=(too_large,)))
         log.append(msgspec.structs.replace(sample, payload=payload))
     run = evaluate(log)
     assert run.map is not None
-    assert run.map.reasons == ((too_large, "another") if is_shown else ("another",))
+    assert run.map.diagnosis == ((too_large,) if is_shown else ())
 
 
 def own_map(shift: float, of: Scenario) -> Outgoing:

@@ -52,7 +52,8 @@ def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_
     assert summary_tables(result)
     figures = to_json(result)
     assert figures["robot_states"]["r3"] == {"state": "withdrawn", "why": state.why}
-    assert any(each.startswith("r3 withdrawn: by central") for each in figures["warnings"])
+    (of,) = figures["withdrawn"]
+    assert of == {"robot": "r3", "cause": "contradicts_the_rest", "text": state.why}
     write_report(Run(result, history(samples), {}), tmp_path, figures)
     assert "r3: by central: its submaps contradict" in (tmp_path / "report.html").read_text()
 

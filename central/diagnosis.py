@@ -1,0 +1,317 @@
+"""The diagnosis of a map: the causes of its misfit, the best one first, with remedies.
+
+A pure function of the fold and the withdrawn robots' submaps. Landmarks with two places and robots
+that were carried off are hypotheses that are solved (`map_joining.hypotheses`). Errors that all
+submaps of a robot share are states of the map. A mirrored robot's submaps fit the others' map by a
+reflection. The covariance scale is judged last, beside all accepted causes.
+"""
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from teamslam.central.carried_off import CarriedOff
+from teamslam.central.monitor import finding
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.contribution import Contribution, moment
+from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.map_joining.hypotheses import CARRIED_OFF, MOVED, SHARED, explain
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import points_of
+from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, terms
+from teamslam.team.wire import messages as m
+
+SIGMAS = 4.0
+"""Least size of a shared error in its standard deviations."""
+LEAST_SHARED = 3
+"""Least number of landmarks that a submap shares with the others' map to show a reflection."""
+LEAST_MIRRORED = 4
+"""Least number of such submaps."""
+MIRRORED = 0.8
+"""Least share of them that fit reflected, and not as they are."""
+
+
+class _SharedError(NamedTuple):
+    """An error that a robot's submaps share: cause, least size, unit, words, and remedy."""
+
+    cause: m.Cause
+    least: float
+    unit: str
+    positive: str
+    negative: str
+    remedy: str
+
+
+_ERRORS: Mapping[str, _SharedError] = {
+    "clock_offset": _SharedError(
+        "clock_offset", 0.02, " s", "late", "early", "add {value:.3g} to its clock_offset_s"
+    ),
+    "forward_scale": _SharedError(
+        "odometry_scale",
+        0.01,
+        "",
+        "too short",
+        "too long",
+        "multiply its motion.forward_scale by {factor:.4g}",
+    ),
+    "bearing": _SharedError(
+        "bearing_offset",
+        0.01,
+        " rad",
+        "to the left",
+        "to the right",
+        "add {value:.3g} to its sensor.bearing_offset",
+    ),
+    "range_offset": _SharedError(
+        "range_offset",
+        0.05,
+        " m",
+        "too long",
+        "too short",
+        "add {value:.3g} to its sensor.range_offset",
+    ),
+}
+"""By the bias's name. Below the least size a calibration is no better."""
+
+
+def diagnose(
+    fold: Fold,
+    biases: Sequence[BiasEstimate],
+    carried: Sequence[CarriedOff],
+    withdrawn: Mapping[str, Sequence[Contribution]],
+    normal: float,
+    scale: float,
+    *,
+    final: bool,
+) -> tuple[m.Diagnosis, ...]:
+    """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
+
+    carried: of the withdrawn robots; withdrawn: their submaps. normal: the covariance scale where
+    covariances are right; scale: the team's, or its cost per
+    degree of freedom. final: see `monitor.finding`.
+    """
+    if not fold.contributions or not fold.main.graph.submaps:
+        return ()
+    found = [
+        *_shared_errors(biases, scale),
+        *_mirrored(fold, withdrawn),
+        *map(_of_withdrawn, carried),
+    ]
+    mirrored = {each.robot for each in found if each.cause == "mirrored"}
+    noise: list[m.Diagnosis] = []
+    try:
+        accepted, island = explain(fold.main)
+    except UNSOLVABLE:
+        accepted = []
+    else:
+        found += [
+            m.Diagnosis(
+                cause=each.cause,
+                robot=each.subject if isinstance(each.subject, str) else "",
+                landmark=each.subject if isinstance(each.subject, int) else None,
+                value=each.value,
+                sigma=each.sigma,
+                evidence=each.evidence / each.dof,
+                remedy=_REMEDIES[each.cause],
+                at_ns=each.at_ns,
+            )
+            for each in accepted
+            if each.subject not in mirrored
+        ]
+        left = finding(Agreement(0.0, 0.0, {}, tuple(terms(island).submaps)), normal, final=final)
+        noise = [_noise(*each) for each in left.misscaled if each.robot not in mirrored]
+    found += _wrong_minimum(fold)
+    found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
+    return (*found, *noise)
+
+
+_REMEDIES: Mapping[str, str] = {
+    MOVED: "remove the landmark, or give it another number from that time on",
+    SHARED: "give each of the two landmarks a number of its own",
+    CARRIED_OFF: "leave the robot on the ground, or restart its process where it is put down",
+}
+
+
+def _shared_errors(biases: Sequence[BiasEstimate], scale: float) -> Iterator[m.Diagnosis]:
+    """Find errors that differ from the robot's configuration beyond doubt.
+
+    A covariance scale above 1 enlarges the standard deviations by its root.
+    """
+    for (robot, _), bias, value, stated in biases:
+        error, sigma = _ERRORS.get(bias), stated * math.sqrt(max(scale, 1.0))
+        if error is not None and abs(value) > max(error.least, SIGMAS * sigma) and sigma > 0.0:
+            yield m.Diagnosis(
+                cause=error.cause,
+                robot=robot,
+                value=(value,),
+                sigma=(sigma,),
+                evidence=(value / sigma) ** 2,
+                remedy=error.remedy.format(value=value, factor=1.0 + value),
+            )
+
+
+def _of_withdrawn(each: CarriedOff) -> m.Diagnosis:
+    return m.Diagnosis(
+        cause=CARRIED_OFF,
+        robot=each.robot,
+        value=each.by,
+        evidence=each.evidence,
+        remedy=_REMEDIES[CARRIED_OFF],
+        at_ns=each.begin_ns,
+    )
+
+
+def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> Iterator[m.Diagnosis]:
+    """Find robots whose submaps fit the others' landmarks reflected, and not as they are.
+
+    With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
+    leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
+    """
+    graph = fold.main.graph
+    seen_by: dict[int, set[str]] = {}
+    own: dict[str, list[Contribution]] = {}
+    for each in fold.contributions:
+        own.setdefault(each.robot, []).append(each)
+    for joined in graph.submaps:
+        for id_ in joined.contribution.local.ids.tolist():
+            seen_by.setdefault(id_, set()).add(joined.contribution.robot)
+    for robot, chain in sorted({**own, **withdrawn}.items()):
+        others = {i for i, robots in seen_by.items() if i < UNNAMED and robots - {robot}}
+        gains = [
+            gain for each in chain if (gain := _gain_of_reflection(fold, each, others)) is not None
+        ]
+        right = [gain for gain in gains if gain > 0.0]
+        if len(gains) >= LEAST_MIRRORED and len(right) >= MIRRORED * len(gains):
+            evidence = math.fsum(gains) / len(gains)
+            yield m.Diagnosis(
+                cause="mirrored",
+                robot=robot,
+                value=(-1.0,),
+                sigma=(0.0,),
+                evidence=evidence,
+                remedy="negate the robot's bearings (counter-clockwise is positive)",
+            )
+
+
+def _gain_of_reflection(fold: Fold, submap: Contribution, others: Collection[int]) -> float | None:
+    """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection."""
+    ids = submap.local.ids.tolist()
+    own = [k for k, id_ in enumerate(ids) if id_ in others]
+    if len(own) < LEAST_SHARED:
+        return None
+    points, local = points_of(fold.main, [ids[k] for k in own]), submap.local.landmarks[own]
+    x, y = (points - points.mean(axis=0)).T
+    u, v = (local - local.mean(axis=0)).T
+    rotated = core.hypot((x * u + y * v).sum(), (y * u - x * v).sum())
+    reflected = core.hypot((x * u - y * v).sum(), (y * u + x * v).sum())
+    variance = float(np.median(submap.factor.landmarks[own][:, [0, 2]]))
+    return float(2.0 * (reflected - rotated)) / variance
+
+
+def _wrong_minimum(fold: Fold) -> Iterator[m.Diagnosis]:
+    if fold.rival_m is not None:
+        yield m.Diagnosis(
+            cause="wrong_minimum",
+            value=(fold.rival_m,),
+            remedy="give the robots' initial poses, or measure more landmarks in common",
+        )
+
+
+def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
+    factor = math.sqrt(value)
+    return m.Diagnosis(
+        cause="noise_underestimated" if value > 1.0 else "noise_overestimated",
+        robot=robot,
+        value=(value,),
+        sigma=(value * log_sigma,),
+        evidence=(core.log(value) / log_sigma) ** 2,
+        remedy=f"multiply the sigmas of sensor and odometry by {factor:.2g}, or with ground truth "
+        "learn them by `teamslam calibrate`",
+    )
+
+
+def describe(found: m.Diagnosis) -> str:
+    """Describe a cause in a sentence, with its figures and the remedy."""
+    return f"{_statement(found)}: {found.remedy}"
+
+
+def _statement(found: m.Diagnosis) -> str:
+    value, sigma = found.value, found.sigma or (0.0,) * len(found.value)
+    when = f" at {moment(found.at_ns)}" if found.at_ns else ""
+    match found.cause:
+        case "landmark_moved":
+            by = f"({value[0]:.2f}, {value[1]:.2f}) ± {max(sigma):.2f} m"
+            return f"landmark {found.landmark} moved by {by}{when}"
+        case "identity_shared":
+            return (
+                f"two landmarks {math.hypot(*value):.1f} m apart have the number {found.landmark}"
+            )
+        case "carried_off":
+            dx, dy, turn = value
+            return (
+                f"{found.robot} was carried off or slipped{when} by ({dx:+.1f}, {dy:+.1f}) m and "
+                f"{math.degrees(turn):+.0f}°"
+            )
+        case "mirrored":
+            return f"{found.robot}'s bearings have the wrong sign"
+        case "wrong_minimum":
+            return f"another map, up to {value[0]:.1f} m away, fits about as well as this one"
+        case "noise_underestimated" | "noise_overestimated":
+            too, factor = ("small", value[0]) if value[0] > 1.0 else ("large", 1.0 / value[0])
+            return (
+                f"{found.robot or 'team'}: the reported covariances are too {too} by a factor of "
+                f"{factor:.1f}, by the differences between submaps"
+            )
+        case _:
+            return _describe_shared_error(found)
+
+
+_SUBJECTS: Mapping[str, str] = {
+    "clock_offset": "camera clock is",
+    "odometry_scale": "odometry is",
+    "bearing_offset": "bearings are",
+    "range_offset": "ranges are",
+}
+
+
+def _describe_shared_error(found: m.Diagnosis) -> str:
+    error = next(each for each in _ERRORS.values() if each.cause == found.cause)
+    (value,), (sigma,) = found.value, found.sigma
+    words = error.positive if value > 0.0 else error.negative
+    size = f"{abs(value):.3g} ± {sigma:.2g}{error.unit}"
+    if found.cause == "odometry_scale":
+        size = f"{100.0 * abs(value):.1f} ± {100.0 * sigma:.1f} %"
+    return f"{found.robot}'s {_SUBJECTS[found.cause]} {size} {words}"
+
+
+def to_object(found: m.Diagnosis) -> dict[str, object]:
+    """Make the JSON object of a cause; `value` is a number, or [dx, dy] of a moved landmark."""
+    values: list[object] = []
+    for numbers in (found.value, found.sigma):
+        if found.cause == MOVED:
+            values.append(list(numbers))
+        elif found.cause in (SHARED, CARRIED_OFF) and numbers:
+            values.append(math.hypot(*numbers[:2]))
+        else:
+            values.append(numbers[0] if numbers else None)
+    subject = (
+        {"landmark": found.landmark}
+        if found.landmark is not None
+        else {"robot": found.robot or None}
+    )
+    more = {"displacement": list(found.value)} if found.cause in (SHARED, CARRIED_OFF) else {}
+    at = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
+    return {
+        "cause": found.cause,
+        **subject,
+        "value": values[0],
+        "sigma": values[1],
+        "evidence": found.evidence,
+        "remedy": found.remedy,
+        "text": describe(found),
+        **at,
+        **more,
+    }

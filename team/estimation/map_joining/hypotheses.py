@@ -1,0 +1,438 @@
+"""Diagnosis: the causes of a misfit, each with its evidence, the best one first.
+
+A hypothesis adds unknowns θ to the graph of the team's map: a landmark has a second place, a robot
+jumps between two submaps. Its evidence is the cost that they remove,
+
+    e = min_x cost(x) − min_{x, θ} cost(x, θ),
+
+χ² with dim θ degrees of freedom where nothing is wrong. Both minima have the robust loss, so that
+one misfit does not hide another. Hypotheses are proposed by a scan of single submaps, then solved.
+The best one by evidence per degree of freedom is accepted and stays in the graph, and the others
+are tested again beside it: what it explains is not reported twice.
+
+Real data have errors beyond the model. The evidence is therefore divided by the covariance scale
+that the rest of the submaps shows (an F test but for the scatter of the scale), and an effect must
+also be larger than that which a single submap resolves.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import covariance_scale
+from teamslam.team.estimation.map_joining.gauss_newton import Island, final_cost, joint_marginal
+from teamslam.team.estimation.map_joining.marginals import terms
+from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
+from teamslam.team.estimation.se2 import compose, inverse, wrapped
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Bool, Float, Int64
+
+Values = Float[np.ndarray, " _"]
+Places = Int64[np.ndarray, " n"]
+Covariance = Float[np.ndarray, "k k"]
+
+CHANCE = 1e-3
+"""Probability that chance alone gives a hypothesis of any landmark or seam enough evidence."""
+SplitCause = Literal["landmark_moved", "identity_shared", "carried_off"]
+MOVED: Final = "landmark_moved"
+SHARED: Final = "identity_shared"
+CARRIED_OFF: Final = "carried_off"
+LEAST_SPOILT = 3
+"""Least number of submaps that one identity of two landmarks spoils."""
+SPOILT = 0.6
+"""Least share of them among the submaps that have a landmark elsewhere."""
+FAR = 50.0
+"""Most χ² of an observation in a scan: a wild one must not decide it."""
+STRAY = 0.1
+"""Least share of a landmark's observations at a second place. With fewer, misread ones are
+likelier: of markers that are misread easily up to 6 of 177 submaps are elsewhere (UTIAS set 2,
+landmark 15, whose place is right to 2 mm).
+"""
+ITERATIONS = 8
+"""Most rounds of the search for two places."""
+SIGMAS = 4.0
+"""Least size of an effect in its standard deviations."""
+JUMP_SIGMAS = 8.0
+"""Least size of a jump of a robot: a submap with misread landmarks shows a jump of 4 to 6."""
+RESOLVED = 1.5
+"""Least size of an effect in standard deviations of one submap."""
+ASSIGNED = 2.0 * math.log(2.0)
+"""Cost of each free assignment of an observation to one of two places."""
+LEAST_SIDE = 2
+"""Least number of submaps on each side of a split."""
+PROPOSED = 3
+"""Most hypotheses of a kind that are solved in a round, by their evidence in the scan."""
+ROUNDS = 6
+"""Most causes that are accepted."""
+
+
+class Sights(NamedTuple):
+    """Observations of one landmark, in order of time: the submap's place in the graph, position in
+    the map [m], and its covariance (xx, xy, yy) [m²] about the landmark's place.
+    """
+
+    places: Places
+    end_ns: Places
+    points: Float[np.ndarray, "n 2"]
+    spread: Float[np.ndarray, "n 3"]
+
+
+class Hypothesis(NamedTuple):
+    """A cause with the graph that has it, solved: what it removes, and its degrees of freedom."""
+
+    cause: SplitCause
+    subject: int | str
+    at_ns: int
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+    evidence: float
+    dof: int
+    island: Island
+
+
+def sights_of(island: Island) -> dict[int, Sights]:
+    """Tabulate the observations of each named landmark by the submaps of the graph."""
+    graph, state = island.graph, island.state
+    id_of = {node: id_ for id_, node in graph.landmarks.items() if id_ < UNNAMED}
+    rows: dict[int, list[tuple[int, int, int, float, float, float, float, float]]] = {}
+    order = sorted(range(len(graph.submaps)), key=lambda at: graph.submaps[at].contribution.key)
+    for at in order:
+        each = graph.submaps[at]
+        local, start = each.contribution.local, int(each.nodes[0])
+        count = len(local.ids)
+        if not count:
+            continue
+        mean = local.mean[-2 * count :].copy()
+        of_biases = each.nodes[len(each.nodes) - len(each.biases) :]
+        for row, node in zip(each.sensitivity, of_biases.tolist(), strict=True):
+            mean += state[graph.offset[node]] * row[-2 * count :]
+        x, y, heading = (float(n) for n in state[graph.offset[start] : graph.offset[start] + 3])
+        s, c = core.sin_and_cos(heading)
+        dx, dy = c * mean[::2] - s * mean[1::2], s * mean[::2] + c * mean[1::2]
+        own = each.contribution.factor.landmarks * island.settings.covariance_factor
+        xx = c * c * own[:, 0] - 2.0 * c * s * own[:, 1] + s * s * own[:, 2]
+        yy = s * s * own[:, 0] + 2.0 * c * s * own[:, 1] + c * c * own[:, 2]
+        xy = c * s * (own[:, 0] - own[:, 2]) + (c * c - s * s) * own[:, 1]
+        if not graph.fixed[start]:
+            P = graph.pattern.block(island.selected_covariance, start, start)
+            xx = xx + P[0, 0] - 2.0 * dy * P[0, 2] + dy * dy * P[2, 2]
+            yy = yy + P[1, 1] + 2.0 * dx * P[1, 2] + dx * dx * P[2, 2]
+            xy = xy + P[0, 1] + dx * P[0, 2] - dy * P[1, 2] - dx * dy * P[2, 2]
+        for k, node in enumerate(each.landmarks.tolist()):
+            if node in id_of:
+                rows.setdefault(id_of[node], []).append(
+                    (at, each.contribution.end_ns, k, x + dx[k], y + dy[k], xx[k], xy[k], yy[k])
+                )
+    return {
+        id_: Sights(
+            np.array([row[0] for row in found], np.int64),
+            np.array([row[1] for row in found], np.int64),
+            np.array([row[3:5] for row in found]),
+            np.array([row[5:8] for row in found]),
+        )
+        for id_, found in sorted(rows.items())
+    }
+
+
+class _Two(NamedTuple):
+    """A proposal: the observations that have the second place, and its evidence in the scan."""
+
+    second: Bool[np.ndarray, " n"]
+    evidence: float
+
+
+def _chi2_about(sights: Sights, point: Values) -> Values:
+    """Evaluate each observation's χ² about a place, at most FAR."""
+    x, y = (sights.points - point).T
+    xx, xy, yy = sights.spread.T
+    chi2: Values = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+    bounded: Values = np.minimum(chi2, FAR)
+    return bounded
+
+
+def _centre(sights: Sights, own: Bool[np.ndarray, " n"]) -> Values:
+    """Median place of some observations [m]."""
+    return np.array([float(np.median(sights.points[own, k])) for k in (0, 1)])
+
+
+def _is_shared(own: Bool[np.ndarray, " n"]) -> bool:
+    """Whether both sides have enough observations: a few misread ones are no second place."""
+    least = max(LEAST_SIDE, math.ceil(STRAY * len(own)))
+    return least <= int(own.sum()) <= len(own) - least
+
+
+def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _Two:
+    """Evaluate a split: χ² about one place, less χ² about two and the price of the choice."""
+    everything = np.ones(len(second), np.bool_)
+    one = float(_chi2_about(sights, _centre(sights, everything)).sum())
+    parts = (
+        float(_chi2_about(sights, _centre(sights, own))[own].sum()) for own in (~second, second)
+    )
+    return _Two(second, one - sum(parts) - price)
+
+
+def change_of(sights: Sights) -> _Two | None:
+    """Find the time at which a landmark's place changes most."""
+    n = len(sights.places)
+    sides = (np.arange(n) >= first for first in range(1, n))
+    found = (_split_by(sights, late, 0.0) for late in sides if _is_shared(late))
+    return max(found, key=lambda each: each.evidence, default=None)
+
+
+def clusters_of(sights: Sights) -> _Two | None:
+    """Find two places among a landmark's observations, whatever their order."""
+    n = len(sights.places)
+    one = _chi2_about(sights, _centre(sights, np.ones(n, np.bool_)))
+    gains = [float(np.maximum(one - _chi2_about(sights, at), 0.0).sum()) for at in sights.points]
+    second = _chi2_about(sights, sights.points[int(np.argmax(gains))]) < one
+    for _ in range(ITERATIONS):
+        if not _is_shared(second):
+            return None
+        places = [_centre(sights, own) for own in (~second, second)]
+        nearer = _chi2_about(sights, places[1]) < _chi2_about(sights, places[0])
+        if (nearer == second).all():
+            break
+        second = nearer
+    return _split_by(sights, second, ASSIGNED * n) if _is_shared(second) else None
+
+
+class _Solved(NamedTuple):
+    """The island in which all accepted causes are unknowns, its cost, and its covariance scale."""
+
+    island: Island
+    cost: float
+    scale: float
+
+
+def _solved(island: Island, cost: float) -> _Solved:
+    found = terms(island).submaps
+    scale = covariance_scale(
+        np.array([each.chi2 for each in found]), np.array([each.dof for each in found])
+    )
+    return _Solved(island, cost, 1.0 if scale is None else max(1.0, scale.value))
+
+
+def _difference(island: Island, before: int, after: int) -> tuple[Values, Covariance]:
+    """Return the difference of two nodes of one size, with its covariance."""
+    mean, P = joint_marginal(island, [before, after])
+    k = len(mean) // 2
+    difference = mean[k:] - mean[:k]
+    difference[2:] = wrapped(difference[2:])
+    return difference, P[:k, :k] + P[k:, k:] - P[:k, k:] - P[k:, :k]
+
+
+def _begin_ns(island: Island, place: int) -> int:
+    """Return when a submap began: the end of the one before it in its stream; 0 for the first."""
+    own = island.graph.submaps[place].contribution
+    ends = (
+        each.contribution.end_ns
+        for each in island.graph.submaps
+        if (each.contribution.stream, each.contribution.sequence + 1) == (own.stream, own.sequence)
+    )
+    return next(ends, 0)
+
+
+def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
+    """Solve the most likely hypotheses of a landmark with two places."""
+    sights = sights_of(base.island)
+    proposals: list[tuple[float, int, SplitCause, Bool[np.ndarray, " n"]]] = []
+    for id_, own in sights.items():
+        if len(own.places) >= 2 * LEAST_SIDE:
+            if (moved := change_of(own)) is not None:
+                proposals.append((moved.evidence, id_, MOVED, moved.second))
+            if (shared := clusters_of(own)) is not None:
+                proposals.append((shared.evidence, id_, SHARED, shared.second))
+    proposals = [each for each in proposals if each[0] > base.scale * level]
+    proposals.sort(key=lambda each: (-each[0], each[1], each[2]))
+    graph = base.island.graph
+    for _, id_, cause, second in proposals[: 2 * PROPOSED]:
+        own, node = sights[id_], graph.landmarks[id_]
+        late = set(own.places[second].tolist())
+        trial = split(base.island, node, late, _centre(own, second))
+        span = slice(int(graph.offset[node]), int(graph.offset[node]) + 2)
+        trial.state[span] = _centre(own, ~second)
+        found = resolved(trial)
+        if found is None:
+            continue
+        island, cost = found
+        shift, P = _difference(island, node, len(graph.fixed))
+        sigma = np.sqrt(np.diagonal(P) * base.scale)
+        own_sigma = math.sqrt(base.scale * float(np.median(own.spread[:, [0, 2]].max(axis=1))))
+        if float(core.hypot(*shift)) < RESOLVED * own_sigma and base.scale > 1.0:
+            continue
+        price = ASSIGNED * len(second) if cause == SHARED else 0.0
+        first = int(np.flatnonzero(second)[0])
+        yield Hypothesis(
+            cause,
+            id_,
+            _begin_ns(base.island, int(own.places[first])) if cause == MOVED else 0,
+            tuple(shift.tolist()),
+            tuple(sigma.tolist()),
+            base.cost - cost - price,
+            2,
+            island,
+        )
+
+
+def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
+    """Solve the hypotheses that a robot was carried off before, in or after a submap that disagrees
+    with the rest.
+    """
+    island, graph = base.island, base.island.graph
+    costs = terms(island).submaps
+    worst = sorted(
+        (-each.chi2 / each.dof, at)
+        for at, each in enumerate(costs)
+        if each.dof >= 1.0 and each.chi2 > base.scale * (each.dof + level)
+    )
+    for _, at in worst[:PROPOSED]:
+        joined = graph.submaps[at]
+        start, end = int(joined.nodes[0]), int(joined.nodes[1])
+        robot, stamp = joined.contribution.robot, joined.contribution.end_ns
+        own = joined.contribution.local
+        begin = island.state[graph.offset[start] : graph.offset[start] + 3]
+        finish = island.state[graph.offset[end] : graph.offset[end] + 3]
+        back = compose(finish, inverse(own.end_pose))
+        new = len(graph.fixed)
+        before = _begin_ns(island, at)
+        trials = [(split(island, end, {at}, compose(begin, own.end_pose)), stamp, 3)]
+        if before:
+            trials.append((split(island, start, {at}, back), before, 3))
+        trials.append((without(island, [at]), stamp, len(own.mean)))
+        for k, (trial, when, dof) in enumerate(trials):
+            found = resolved(trial)
+            if found is None:
+                continue
+            solved, cost = found
+            if dof == 3:
+                jump, P = (
+                    _difference(solved, new, end) if k == 0 else _difference(solved, start, new)
+                )
+            else:
+                jump, P = _motion_beyond(solved, start, end, own)
+            sigma = np.sqrt(np.diagonal(P) * base.scale)
+            yield Hypothesis(
+                CARRIED_OFF,
+                robot,
+                when,
+                tuple(jump.tolist()),
+                tuple(sigma.tolist()),
+                base.cost - cost,
+                dof,
+                solved,
+            )
+
+
+def _motion_beyond(
+    island: Island, start: int, end: int, own: LocalMap
+) -> tuple[Values, Covariance]:
+    """Return the motion from one pose to another less a submap's own, in the map's frame."""
+    mean, P = joint_marginal(island, [start, end])
+    predicted = compose(mean[:3], own.end_pose)
+    s, c = core.sin_and_cos(float(mean[2]))
+    J = np.zeros((3, 6))
+    J[:, 3:] = np.eye(3)
+    J[:, :3] = -np.eye(3)
+    J[0, 2], J[1, 2] = predicted[1] - mean[1], mean[0] - predicted[0]
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    jump = mean[3:] - predicted
+    jump[2:] = wrapped(jump[2:])
+    covariance = dense.product(dense.product(J, P), J.T)
+    return jump, covariance + dense.product(dense.product(R, own.covariance[:3, :3]), R.T)
+
+
+def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
+    """Propose that one number of two landmarks spoils submaps that observed both.
+
+    Such a submap has the landmark between the two and its path bent: of the submaps with a landmark
+    elsewhere, most have the same one worst. The second place has two numbers in each of them.
+    """
+    island, graph = base.island, base.island.graph
+    chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
+    worst: list[tuple[int, int]] = []
+    for at, joined in enumerate(graph.submaps):
+        of = chi2[int(graph.landmark_start[at]) : int(graph.landmark_start[at + 1])]
+        if len(of) and float(of.max()) > base.scale * FAR:
+            worst.append((at, int(joined.landmarks[int(np.argmax(of))])))
+    nodes = [node for _, node in worst]
+    id_of = {node: id_ for id_, node in graph.landmarks.items() if id_ < UNNAMED}
+    node = max(sorted(set(nodes)), key=nodes.count, default=-1)
+    count = nodes.count(node)
+    if node not in id_of or count < LEAST_SPOILT or count < SPOILT * len(nodes):
+        return
+    own = sights_of(island)[id_of[node]]
+    spoilt = [at for at, of in worst if of == node]
+    found = resolved(without(island, spoilt))
+    if found is None:
+        return
+    solved, cost = found
+    here = solved.state[graph.offset[node] : graph.offset[node] + 2]
+    away = own.points[np.isin(own.places, spoilt)] - here
+    farthest = away[int(np.argmax(core.hypot(away[:, 0], away[:, 1])))]
+    sigma = np.sqrt(np.diagonal(graph.pattern.block(island.selected_covariance, node, node)))
+    yield Hypothesis(
+        SHARED,
+        id_of[node],
+        0,
+        tuple(farthest.tolist()),
+        tuple(sigma.tolist()),
+        base.cost - cost,
+        2 * count,
+        solved,
+    )
+
+
+def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
+    """Whether the evidence is beyond chance, and the effect beyond its standard deviations."""
+    sizes = [(math.hypot(*each.value[:2]), max(each.sigma[:2]))]
+    sizes += [
+        (abs(turn), sigma) for turn, sigma in zip(each.value[2:], each.sigma[2:], strict=True)
+    ]
+    least = JUMP_SIGMAS if each.cause == CARRIED_OFF else SIGMAS
+    enough = scale * (level + 2.0 * each.dof)
+    return each.evidence > enough and any(size > least * sigma for size, sigma in sizes)
+
+
+def explain(island: Island) -> tuple[list[Hypothesis], Island]:
+    """Find landmarks with two places, and robots that were carried off; return also the island in
+    which these are unknowns.
+    """
+    first = robust(island)
+    base = _solved(first, final_cost(first))
+    tests = 2 * len(first.graph.submaps) + int(first.graph.landmark_start[-1])
+    level = -2.0 * core.log(CHANCE / max(tests, 1))
+    accepted: list[Hypothesis] = []
+    for _ in range(ROUNDS):
+        found = [
+            each
+            for propose in (_landmark_hypotheses, _spoilt_by_identity, _seam_hypotheses)
+            for each in propose(base, level)
+            if _is_beyond_doubt(each, base.scale, level)
+        ]
+        if not found:
+            break
+        best = max(found, key=lambda each: each.evidence / each.dof)
+        accepted.append(best)
+        base = _solved(best.island, final_cost(best.island))
+    return _told_apart(accepted), base.island
+
+
+def _told_apart(accepted: list[Hypothesis]) -> list[Hypothesis]:
+    """Drop repetitions, and the apparent jumps of a robot with another fault.
+
+    A robot that seems to have been carried off at several places, or beside one number of two
+    landmarks, which bends paths, was not.
+    """
+    jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
+    is_bent = any(each.cause == SHARED for each in accepted)
+    found: dict[int | str, Hypothesis] = {}
+    for each in accepted:
+        is_jump = each.cause == CARRIED_OFF
+        if not (is_jump and (is_bent or jumps.count(each.subject) > 1)):
+            found.setdefault(each.subject, each)
+    return list(found.values())

@@ -1,0 +1,92 @@
+"""Split a node of a graph between its submaps, and drop a submap: hypotheses about a misfit.
+
+A landmark that was moved is two landmarks, one of the submaps before and one of those after. A
+robot that was carried off at a seam ends one submap at another pose than that at which it starts
+the next. Where its own submap is spoilt, the graph is solved without it.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    FULL_AGE,
+    UNSOLVABLE,
+    Island,
+    aged,
+    final_cost,
+    is_solvable,
+    settled,
+    take_step,
+)
+from teamslam.team.shapes import Float
+
+ITERATIONS = 15
+"""Most steps after a split."""
+TOLERANCE = 1e-4
+"""Largest change [m, rad] of the last step."""
+ROBUST_C = 1.0
+"""Cauchy's scale where the settings have least squares: misfits must not spoil the rest."""
+
+
+def robust(island: Island) -> Island:
+    """Solve an island with a robust loss, from its state."""
+    settings = island.settings
+    if settings.robust_c is not None:
+        return aged(island, FULL_AGE)
+    solved, *_ = settled(replace(island, settings=replace(settings, robust_c=ROBUST_C)))
+    return aged(solved, FULL_AGE)
+
+
+def split(
+    island: Island, node: int, submaps: Collection[int], value: Float[np.ndarray, " k"]
+) -> Island:
+    """Give some submaps, by place in the graph, a node of their own in place of `node`, the last
+    one, at a value.
+    """
+    graph, new = island.graph, len(island.graph.fixed)
+    grown = replace(
+        graph,
+        offset=np.append(graph.offset, graph.offset[-1] + len(value)),
+        fixed=np.append(graph.fixed, False),
+        submaps=tuple(
+            each._replace(nodes=np.where(each.nodes == node, new, each.nodes))
+            if at in submaps
+            else each
+            for at, each in enumerate(graph.submaps)
+        ),
+    )
+    return replace(island, graph=grown, state=np.concatenate([island.state, value]))
+
+
+def without(island: Island, places: Collection[int]) -> Island:
+    """Drop the submaps at some places in the graph; a pose that nothing measures is fixed."""
+    graph = island.graph
+    keep = np.array([at not in places for at in range(len(graph.submaps))], np.bool_)
+    left = tuple(each for at, each in enumerate(graph.submaps) if keep[at])
+    measured = np.zeros(len(graph.fixed), np.bool_)
+    for each in left:
+        measured[each.nodes] = True
+    for seen in graph.sightings:
+        measured[[seen.observer, seen.teammate]] = True
+    measured[[each.node for each in graph.priors]] = True
+    if graph.condensed is not None:
+        measured[graph.condensed.nodes] = True
+    less = replace(graph, submaps=left, fixed=graph.fixed | ~measured)
+    return replace(island, graph=less, age=island.age[keep])
+
+
+def resolved(island: Island) -> tuple[Island, float] | None:
+    """Solve from the state, at final robust scales; return the solution and its cost; None without
+    one.
+    """
+    try:
+        damping = 0.0
+        for _ in range(ITERATIONS):
+            island, (damping, change) = take_step(island, damping)
+            if change < TOLERANCE or damping == np.inf:
+                break
+        return (island, final_cost(island)) if is_solvable(island) else None
+    except UNSOLVABLE:
+        return None

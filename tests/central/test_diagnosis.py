@@ -1,0 +1,95 @@
+"""The final map names the cause of its misfit, with its size; and none where nothing is wrong."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from teamslam.central.diagnosis import describe, to_object
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.wire import messages as m
+from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
+
+WORLD = StressWorld(robots=2, landmarks=12, half_m=10.0, seconds=120.0)
+TEAM = StressWorld(landmarks=15, half_m=12.0, seconds=100.0)
+
+
+def scenario(world: StressWorld, place: Path) -> Scenario:
+    folder = write(world, place)
+    return with_options(load(str(folder / "scenario.toml")), dataset=folder)
+
+
+def robust(of: Scenario) -> Scenario:
+    return msgspec.structs.replace(of, central=msgspec.structs.replace(of.central, robust_c=1.0))
+
+
+def diagnosed(of: Scenario) -> tuple[m.Diagnosis, ...]:
+    return final_map(list(run_team(of, streams_of(of)))).diagnosis
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_right_map_has_no_cause_of_misfit(tmp_path: Path, seed: int) -> None:
+    assert diagnosed(scenario(replace(WORLD, seed=seed), tmp_path)) == ()
+
+
+@pytest.mark.parametrize("is_robust", [False, True], ids=["least squares", "robust"])
+@pytest.mark.parametrize("by", [(0.5, 0.0), (1.4, 1.4)], ids=["half a metre", "two metres"])
+def test_a_landmark_that_was_moved_is_named_with_its_motion(
+    tmp_path: Path, by: tuple[float, float], is_robust: bool
+) -> None:
+    of = scenario(replace(WORLD, moved=(MovedLandmark(7, by, 60.0),)), tmp_path)
+    first, *_ = diagnosed(robust(of) if is_robust else of)
+    assert (first.cause, first.landmark) == ("landmark_moved", 7)
+    for value, sigma, true in zip(first.value, first.sigma, by, strict=True):
+        assert value == pytest.approx(true, abs=4.0 * sigma)
+        assert sigma < 0.1
+    assert first.at_ns * 1e-9 == pytest.approx(60.0, abs=10.0)
+    assert describe(first).startswith("landmark 7 moved by (")
+
+
+def test_one_number_of_two_landmarks_is_named(tmp_path: Path) -> None:
+    first, *_ = diagnosed(robust(scenario(replace(WORLD, same_id=((3, 9),)), tmp_path)))
+    assert (first.cause, first.landmark) == ("identity_shared", 3)
+
+
+@pytest.mark.parametrize("is_robust", [False, True], ids=["least squares", "robust"])
+def test_a_robot_that_was_carried_off_is_named_with_place_and_time(
+    tmp_path: Path, is_robust: bool
+) -> None:
+    off = CarriedOff("r2", 4.0, 0.6, 50.0)
+    of = scenario(replace(TEAM, carried_off=(off,)), tmp_path)
+    (found,) = diagnosed(robust(of) if is_robust else of)
+    assert (found.cause, found.robot) == ("carried_off", "r2")
+    if is_robust:  # a withdrawn robot's own motion in the spoilt submap is not told apart
+        assert math.hypot(*found.value[:2]) == pytest.approx(4.0, abs=0.5)
+    assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
+
+
+def test_a_mirrored_robot_is_named_as_mirrored(tmp_path: Path) -> None:
+    first, *rest = diagnosed(scenario(replace(TEAM, mirrored=("r2",)), tmp_path))
+    assert (first.cause, first.robot) == ("mirrored", "r2")
+    assert not rest
+
+
+@pytest.mark.parametrize(
+    ("noise", "cause"), [(2.0, "noise_underestimated"), (0.5, "noise_overestimated")]
+)
+def test_noise_that_is_stated_wrong_is_named_with_its_factor(
+    tmp_path: Path, noise: float, cause: str
+) -> None:
+    (found,) = diagnosed(scenario(replace(TEAM, noise=noise), tmp_path))
+    assert (found.cause, found.robot) == (cause, "")
+    assert found.value[0] == pytest.approx(noise**2, rel=0.35)
+
+
+def test_the_object_of_a_cause_has_a_number_or_the_two_of_a_motion() -> None:
+    moved = m.Diagnosis(
+        cause="landmark_moved", landmark=7, value=(2.0, 0.1), sigma=(0.1, 0.1), at_ns=10**9
+    )
+    scale = m.Diagnosis(cause="noise_underestimated", value=(4.0,), sigma=(0.5,))
+    assert to_object(moved).items() >= {"landmark": 7, "value": [2.0, 0.1], "at_s": 1.0}.items()
+    assert to_object(scale).items() >= {"robot": None, "value": 4.0, "sigma": 0.5}.items()

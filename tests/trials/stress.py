@@ -1,0 +1,192 @@
+"""Stress suite: worlds with a known fault, and whether the team's map is right or its cause named.
+
+    python -m tests.trials.stress [--only CASE …] [--seeds N] [--first SEED]
+
+Each case runs in memory through the import of a CSV folder whose scenario states the noise of
+sensor and odometry and nothing else (`stress_world`). A line gives the map's error as it lies, the
+worst landmark in its standard deviations, NEES per degree of freedom, and the causes reported.
+
+named: the right cause is among them. silent: the worst landmark is beyond 4 sigma (for many
+landmarks, beyond the same chance), and nothing is reported: neither a cause, nor a robot left out,
+nor a warning. The exit status is 1 if a map is silently wrong, or if the cause is named in less
+than 90 % of the runs in which it shifts the map by more than 2 sigma.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
+
+WORLD = StressWorld()
+ALL = ("r1", "r2", "r3")
+SHIFTED = 2.0
+WRONG = 4.0
+GOAL = 0.9
+HALF_S = 150.0
+
+
+class Case(NamedTuple):
+    """A world, and the causes of which one should be named; none where the estimator must cope."""
+
+    world: StressWorld
+    causes: frozenset[str] = frozenset()
+
+
+def _case(*causes: str, **fields: object) -> Case:
+    return Case(replace(WORLD, **fields), frozenset(causes))
+
+
+def _carried(metres: float, radians: float, **fields: object) -> Case:
+    off = (CarriedOff("r2", metres, radians, HALF_S),)
+    return _case("carried_off", carried_off=off, **fields)
+
+
+def _moved(by: float) -> Case:
+    return _case("landmark_moved", landmarks=20, moved=(MovedLandmark(7, (by, 0.0), HALF_S),))
+
+
+NOISE = ("noise_underestimated",)
+CASES: Mapping[str, Case] = {
+    "clean": _case(),
+    "outliers-1": _case(*NOISE, outlier_share=0.01),
+    "outliers-5": _case(*NOISE, outlier_share=0.05),
+    "outliers-20": _case(*NOISE, outlier_share=0.2),
+    "moved-0.5": _moved(0.5),
+    "moved-2": _moved(2.0),
+    "same-id": _case("identity_shared", same_id=((3, 9),)),
+    "clock-0.1": _case("clock_offset", late={"r2": 0.1}),
+    "clock-0.2": _case("clock_offset", late={"r2": 0.2}),
+    "clock-0.5": _case("clock_offset", late={"r2": 0.5}),
+    "odometry+5": _case("odometry_scale", odometry_scale=1.05),
+    "odometry-5": _case("odometry_scale", odometry_scale=0.95),
+    "bearing": _case("bearing_offset", bearing_offset=dict.fromkeys(ALL, 0.05)),
+    "mirrored": _case("mirrored", mirrored=("r2",)),
+    "carried-15": _carried(15.0, 2.0),
+    "carried-2": _carried(2.0, 0.5),
+    "carried-15-no-starts": _carried(15.0, 2.0, starts=False),
+    "carried-2-no-starts": _carried(2.0, 0.5, starts=False),
+    "carried-15-hidden": _carried(15.0, 2.0, hidden=True),
+    "carried-2-hidden": _carried(2.0, 0.5, hidden=True),
+    "carried-15-hidden-no-starts": _carried(15.0, 2.0, hidden=True, starts=False),
+    "noise-2": _case("noise_underestimated", noise=2.0),
+    "noise-0.5": _case("noise_overestimated", noise=0.5),
+    "heavy-tails": _case(*NOISE, tails=2.0),
+    "correlated": _case(*NOISE, correlated_s=20.0),
+    "corridor": _case(corridor=True),
+    "1-hz": _case(step_s=1.0),
+    "100-hz": _case(step_s=0.01, seconds=100.0),
+}
+
+
+class Outcome(NamedTuple):
+    """Errors of a run's map and the reported causes; `is_said`: anything at all is reported."""
+
+    rmse_m: float
+    worst_sigmas: float
+    nees: float
+    causes: tuple[str, ...]
+    is_said: bool
+
+    @property
+    def is_shifted(self) -> bool:
+        """Whether a landmark is beyond SHIFTED standard deviations more than chance."""
+        return self.worst_sigmas > SHIFTED
+
+    @property
+    def is_silently_wrong(self) -> bool:
+        """Whether a landmark is beyond WRONG standard deviations, and nothing is reported."""
+        return self.worst_sigmas > WRONG and not self.is_said
+
+
+def run(world: StressWorld) -> Outcome:
+    """Run a team in a world, in memory."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = write(world, folder)
+        scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
+        samples = list(run_team(scenario, streams_of(scenario)))
+    result = evaluate(samples)
+    causes = tuple(each.cause for each in final_map(samples).diagnosis)
+    if result.map is None or result.map.errors is None:
+        return Outcome(np.nan, np.inf, np.nan, causes, bool(result.warnings))
+    return Outcome(
+        result.map.errors.aligned_rmse_m if not world.starts else result.map.errors.rmse_m,
+        _worst_sigmas(result.map, aligned=not world.starts),
+        result.map.errors.nees_per_dof,
+        causes,
+        bool(result.warnings),
+    )
+
+
+def _worst_sigmas(found: MapResult, *, aligned: bool) -> float:
+    """Largest error of a landmark in the standard deviations of two numbers.
+
+    √χ² of the largest one, less the increase by chance of the largest of so many: a normal number
+    that is exceeded with the same probability.
+    """
+    error = (found.means - found.truth)[found.known]
+    if not len(error):
+        return float("nan")
+    if aligned:
+        error = _aligned(found.means[found.known], found.truth[found.known])
+    n, k = len(found.ids), np.flatnonzero(found.known)
+    P = np.asarray(found.covariance)
+    blocks = (
+        P if P.ndim == 3 else np.array([P[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(n)])
+    )
+    chi2 = np.array([e @ np.linalg.solve(P, e) for e, P in zip(error, blocks[k], strict=True)])
+    return float(np.sqrt(max(chi2.max() - 2.0 * np.log(len(chi2)), 0.0)))
+
+
+def _aligned(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    z, w = ((each - each.mean(axis=0)) @ np.array([1.0, 1.0j]) for each in (points, truth))
+    turn = (w * z.conj()).sum()
+    left = z * turn / abs(turn) - w
+    return np.column_stack([left.real, left.imag])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print a line for each case, and the totals."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", nargs="*", choices=[*CASES], default=[*CASES], metavar="CASE")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=1)
+    given = parser.parse_args(arguments)
+    print(
+        f"{'case':28} {'error [m]':>9} {'worst':>7} {'NEES':>8} {'shifted':>8} named silent  causes"
+    )
+    shifted = named = silent = 0
+    for name in given.only:
+        case = CASES[name]
+        seeds = range(given.first, given.first + given.seeds)
+        outcomes = [run(replace(case.world, seed=seed)) for seed in seeds]
+        moved = [each for each in outcomes if each.is_shifted and case.causes]
+        right = sum(bool(case.causes.intersection(each.causes)) for each in outcomes)
+        of_moved = sum(bool(case.causes.intersection(each.causes)) for each in moved)
+        quiet = sum(each.is_silently_wrong for each in outcomes)
+        told = {c: sum(c in each.causes for each in outcomes) for e in outcomes for c in e.causes}
+        figures = np.array([each[:3] for each in outcomes])
+        rmse, worst, nees = np.median(figures, axis=0)
+        print(
+            f"{name:28} {rmse:9.3f} {worst:7.1f} {nees:8.2f} "
+            f"{len(moved):8d} {right:5d} {quiet:6d}  "
+            + ", ".join(f"{cause} {count}" for cause, count in sorted(told.items())),
+            flush=True,
+        )
+        shifted, named, silent = shifted + len(moved), named + of_moved, silent + quiet
+    share = named / shifted if shifted else 1.0
+    print(f"silently wrong: {silent}; cause named where it shifts the map: {named} of {shifted}")
+    return int(silent > 0 or share < GOAL)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
