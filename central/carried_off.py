@@ -1,4 +1,7 @@
-"""Find where a withdrawn robot was carried off, or slipped, and by how much.
+"""Find where a robot was carried off, or slipped, and by how much.
+
+Without landmark names the fold has cut its stream there (`continuity`). A withdrawn robot with named
+landmarks is examined as follows.
 
 Each submap of the robot that shares enough named landmarks with the map of the others is aligned to
 it in the frame of its start pose and in that of its end pose. The end of one submap and the start
@@ -19,9 +22,10 @@ from teamslam.central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.contribution import Contribution, moment
+from teamslam.team.estimation.contribution import Contribution, Stream, moment, part_of
 from teamslam.team.estimation.gaussian import NotACovarianceError, information
 from teamslam.team.estimation.map_joining.alignment import Alignment, aligned
+from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known
 from teamslam.team.estimation.map_joining.marginals import landmark_blocks
@@ -51,7 +55,10 @@ class CarriedOff(NamedTuple):
     before, after: numbers of the last submap before it and of the first one after it. begin_ns,
     end_ns: their end and beginning, equal where no submap is between. by: the motion in the map's
     frame (x [m], y [m], turn [rad]). in_all: `by` includes the robot's own motion between the two,
-    since the submap between them is spoilt.
+    since the submap between them is spoilt. evidence: χ² of the open seams per degree of freedom,
+    or the log-likelihood ratio of a view that changed at once. place: (x, y) [m] in
+    the map; of a cut stream only. `by` is empty, where the stream was cut, until its later part has
+    a place in the map.
     """
 
     robot: str
@@ -59,19 +66,25 @@ class CarriedOff(NamedTuple):
     after: int
     begin_ns: int
     end_ns: int
-    by: tuple[float, float, float]
+    by: tuple[float, ...]
     in_all: bool
+    evidence: float
+    place: tuple[float, ...] = ()
 
     def __str__(self) -> str:
         """Describe the motion."""
-        dx, dy, turn = self.by
         begin, end = moment(self.begin_ns), moment(self.end_ns)
         when = f"at t = {begin}" if begin == end else f"between t = {begin} and {end}"
+        at = f" at ({self.place[0]:.1f}, {self.place[1]:.1f}) m" if self.place else ""
+        where = f"{at}, between its submaps {self.before} and {self.after}"
+        text = f"{self.robot} was carried off or slipped {when}{where}"
+        if not self.by:
+            return f"{text}: its view changes at once; from there on its submaps are a map of their own"
+        dx, dy, turn = self.by
         own = ", its own way in that time included" if self.in_all else ""
         return (
-            f"{self.robot} was carried off or slipped {when}, between its submaps {self.before} "
-            f"and {self.after}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
-            f"{own}; before and after that its submaps agree with the map without it"
+            f"{text}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°{own}; before "
+            "and after that its submaps agree with the map"
         )
 
 
@@ -142,7 +155,58 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
         end_ns=chain[after - 1].end_ns,
         by=(float(by[0]), float(by[1]), wrapped(by[2])),
         in_all=bool(spoilt),
+        evidence=math.fsum(each.chi2 for each in opened) / (SEAM_DOF * len(opened)),
     )
+
+
+def cuts_of(fold: Fold) -> list[CarriedOff]:
+    """Describe the seams at which a fold has cut streams, and the motion where both parts are in
+    one island.
+
+    Not carried off is a part that lies where the odometry puts it.
+    """
+    found = []
+    for cut in fold.cuts:
+        later = part_of(cut.stream, cut.after)
+        island = fold.island(*cut.stream)
+        place = island.state[island.graph.offset[island.graph.streams[cut.stream][-1]] :][:2]
+        by: tuple[float, ...] = ()
+        if fold.home.get(later, later) == fold.home[cut.stream]:
+            gap, chi2 = _gap(fold, cut.stream, later)
+            if cut.after == cut.before + 1 and cost_share(chi2, SEAM_DOF, SUSPICION) <= 1.0:
+                continue
+            if fold.island(*later).graph.first_sequence(later) == cut.after:
+                by = (float(gap[0]), float(gap[1]), wrapped(gap[2]))
+        found.append(
+            CarriedOff(
+                robot=cut.stream[0],
+                before=cut.before,
+                after=cut.after,
+                begin_ns=cut.begin_ns,
+                end_ns=cut.end_ns,
+                by=by,
+                in_all=cut.after > cut.before + 1,
+                evidence=cut.evidence,
+                place=(float(place[0]), float(place[1])),
+            )
+        )
+    return found
+
+
+def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
+    """Return the motion from the end of a part to the oldest start of the next one, and its χ²."""
+    island = fold.islands[fold.home[earlier]]
+    nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
+    mean, covariance = joint_marginal(island, nodes)
+    gap = mean[3:] - mean[:3]
+    gap[2] = wrapped(gap[2])
+    J = np.hstack([-np.eye(3), np.eye(3)])
+    spread = dense.product(dense.product(J, covariance), J.T)
+    try:
+        metric = information(spread, "a seam")
+    except NotACovarianceError:
+        return gap, math.inf
+    return gap, float(dense.product(dense.product(gap, metric), gap))
 
 
 def _placed(

@@ -8,6 +8,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from teamslam.central.carried_off import cuts_of
 from teamslam.central.config import CentralConfig
 from teamslam.central.fused import receivable
 from teamslam.central.join_messages import (
@@ -193,6 +194,7 @@ class SubmapFold:
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
+            *map(str, cuts_of(fold)),
             *(map(str, ticks.find_carried_off(fold)) if final else ()),
             *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
             *map(str, deviations(biases, ticks.settings.bias_sigma, scale)),
