@@ -1,7 +1,8 @@
 """Find where a robot was carried off, or slipped, and by how much.
 
-Without landmark names the fold has cut its stream there (`continuity`). A withdrawn robot with named
-landmarks is examined as follows.
+Without landmark names the fold cuts its stream there (`continuity`). A robot with named landmarks
+that contradicts the rest is examined as follows; its stream is cut at the seam that is found, and
+only where none is found is it withdrawn.
 
 Each submap of the robot that shares enough named landmarks with the map of the others is aligned to
 it in the frame of its start pose and in that of its end pose. The end of one submap and the start
@@ -25,6 +26,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, Stream, moment, part_of
 from teamslam.team.estimation.gaussian import NotACovarianceError, information
 from teamslam.team.estimation.map_joining.alignment import Alignment, aligned
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known
@@ -35,8 +37,8 @@ from teamslam.team.shapes import Float, Int64
 
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the map: two also fit their mirror image."""
-LEAST_SIDE = 2
-"""Least number of submaps that fit the map on each side of the open seam."""
+LEAST_BEFORE, LEAST_AFTER = 2, 1
+"""Least number of submaps that fit the map before and behind the open seam."""
 SEAM_DOF = 3.0
 """Degrees of freedom of a seam."""
 MOST_SHARED = 40
@@ -79,12 +81,12 @@ class CarriedOff(NamedTuple):
         where = f"{at}, between its submaps {self.before} and {self.after}"
         text = f"{self.robot} was carried off or slipped {when}{where}"
         if not self.by:
-            return f"{text}: its view changes at once; from there on its submaps are a map of their own"
+            return f"{text}: its view changes at once; its later submaps are a map of their own"
         dx, dy, turn = self.by
         own = ", its own way in that time included" if self.in_all else ""
         return (
-            f"{text}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°{own}; before "
-            "and after that its submaps agree with the map"
+            f"{text}: by about ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°{own}; "
+            "before and after that its submaps agree with the map"
         )
 
 
@@ -138,8 +140,8 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
     if (
         len(spoilt) > 1
         or any(not before < k < after for k in spoilt)
-        or sum(each.at <= before for each in placed) < LEAST_SIDE
-        or sum(each.at >= after for each in placed) < LEAST_SIDE
+        or sum(each.at <= before for each in placed) < LEAST_BEFORE
+        or sum(each.at >= after for each in placed) < LEAST_AFTER
         or cost_share(others, SEAM_DOF * len(closed), ACCORD) > AGREEING * limit
         or others > max(each.chi2 for each in opened)
     ):
@@ -157,6 +159,13 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
         in_all=bool(spoilt),
         evidence=math.fsum(each.chi2 for each in opened) / (SEAM_DOF * len(opened)),
     )
+
+
+def seam_of(chain: Sequence[Contribution], found: CarriedOff) -> Seam:
+    """Return the seam at which a stream is cut for its later submaps to keep their own place."""
+    stream, before, after = chain[0].stream, found.before, found.after
+    evidence = 0.5 * SEAM_DOF * found.evidence
+    return Seam(stream, before, after, found.begin_ns, found.end_ns, evidence)
 
 
 def cuts_of(fold: Fold) -> list[CarriedOff]:

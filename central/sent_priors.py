@@ -79,7 +79,11 @@ class SentPriors:
             each
             for each in inside
             if self.is_worth(
-                each, last_pose(fold, fold.latest_part(each)), blocks, newest.get(each[0], NEVER), fold.frame
+                each,
+                last_pose(fold, fold.latest_part(each)),
+                blocks,
+                newest.get(each[0], NEVER),
+                fold.frame,
             )
         ]
 

@@ -195,7 +195,6 @@ class SubmapFold:
         shown = shown_landmarks(fold, self.config, tail)
         self.reasons = (
             *map(str, cuts_of(fold)),
-            *(map(str, ticks.find_carried_off(fold)) if final else ()),
             *reasons(fold, shown, biases, self.config.landmark_submaps, final=final),
             *map(str, deviations(biases, ticks.settings.bias_sigma, scale)),
         )

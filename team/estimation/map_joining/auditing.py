@@ -39,6 +39,8 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 def _first_seam(fold: Fold, tick: Tick) -> Seam | None:
     """Find the first seam that the submaps of a tick show."""
+    if not fold.landmarks.are_there:
+        return None
     for each in tick.contributions:
         if each.key not in fold.refused:
             island = fold.islands[fold.home[each.stream]]

@@ -38,17 +38,15 @@ LEAST_BEFORE = 2
 AROUND = math.pi
 """Gap between the directions of neighbouring landmarks above which a view does not close round."""
 
-Points = Float[np.ndarray, "n 2"]
 Indices = Int64[np.ndarray, " _"]
 
 
 class Seam(NamedTuple):
-    """A place at which a stream's view changes at once.
+    """A place at which a stream is cut.
 
-    before, after: numbers of the last submap before it and of the first one behind it; the one
-    between is spoilt. begin_ns, end_ns: the end of the former and the beginning of the latter.
-    place: (x, y) [m] of the robot before it, in its island's frame. absent, present: counts of
-    landmarks. evidence: their log-likelihood ratio.
+    before, after: numbers of the last submap before it and of the first one behind it; one between
+    is spoilt. begin_ns, end_ns: the end of the former and the beginning of the latter. evidence:
+    log-likelihood ratio.
     """
 
     stream: Stream
@@ -56,14 +54,7 @@ class Seam(NamedTuple):
     after: int
     begin_ns: int
     end_ns: int
-    place: tuple[float, float]
-    absent: int
-    present: int
-
-    @property
-    def evidence(self) -> float:
-        """The log-likelihood ratio."""
-        return ABSENT * self.absent - PRESENT * self.present
+    evidence: float
 
 
 def find_seam(
@@ -79,34 +70,48 @@ def find_seam(
     pair = [
         each
         for each in island.graph.submaps
-        if each.contribution.stream == stream and sequence - 1 <= each.contribution.sequence <= sequence
+        if each.contribution.stream == stream
+        and sequence - 1 <= each.contribution.sequence <= sequence
     ]
     if len(pair) < 2:
         return None
     one, two = pair
     begin_ns, end_ns = one.contribution.end_ns, two.contribution.end_ns
-    place = _place(island, two, 0.0)
-    sides = _seen(one, slice(-SCANS, None)), _seen(two, slice(0, SCANS))
-    counts = _compare_sides(island, *sides, place)
-    at = (float(place[0]), float(place[1]))
-    between = Seam(stream, sequence - 1, sequence, begin_ns, begin_ns, at, *counts)
-    if between.evidence >= least:
-        return between
-    counts = _compare_inside(island, two)
-    inside = Seam(stream, sequence - 1, sequence + 1, begin_ns, end_ns, at, *counts)
-    return inside if inside.evidence >= least else None
+    sides = (
+        _Side.of(one, slice(-SCANS, None), slice(None)),
+        _Side.of(two, slice(SCANS), slice(None)),
+    )
+    evidence = _compare_sides(island, *sides, _place(island, two, 0.0))
+    if evidence >= least:
+        return Seam(stream, sequence - 1, sequence, begin_ns, begin_ns, evidence)
+    evidence = _compare_inside(island, two)
+    if evidence >= least:
+        return Seam(stream, sequence - 1, sequence + 1, begin_ns, end_ns, evidence)
+    return None
 
 
-def _compare_inside(island: Island, submap: Joined) -> tuple[int, int]:
+def _compare_inside(island: Island, submap: Joined) -> float:
     """Compare the scans before and behind each scan of a submap, SCANS or more from its ends;
-    return the counts of most evidence.
+    return the most evidence.
     """
     scans = submap.contribution.local.unnamed.seen.shape[1]
-    found = [(0, 0)]
+    found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):
-        sides = _seen(submap, slice(k - SCANS, k)), _seen(submap, slice(k, k + SCANS))
-        found.append(_compare_sides(island, *sides, _place(island, submap, k / scans)))
-    return max(found, key=lambda each: ABSENT * each[0] - PRESENT * each[1])
+        before = _Side.of(submap, slice(k - SCANS, k), slice(k))
+        after = _Side.of(submap, slice(k, k + SCANS), slice(k, None))
+        found.append(_compare_sides(island, before, after, _place(island, submap, k / scans)))
+    return max(found)
+
+
+class _Side(NamedTuple):
+    """The nodes of the landmarks in the scans beside a place, and in all scans of that side."""
+
+    beside: Indices
+    all: Indices
+
+    @classmethod
+    def of(cls, submap: Joined, beside: slice, of_side: slice) -> "_Side":
+        return cls(_seen(submap, beside), _seen(submap, of_side))
 
 
 def _seen(submap: Joined, scans: slice) -> Indices:
@@ -125,15 +130,12 @@ def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2
 
 
 def _compare_sides(
-    island: Island, one: Indices, two: Indices, place: Float[np.ndarray, "2"]
-) -> tuple[int, int]:
-    """Count the landmarks of two sides absent on the other one, and those that may be there.
-
-    Two common landmarks settle it: nothing is absent.
-    """
-    common = np.intersect1d(one, two)
-    if not len(one) or not len(two) or len(common) > 1:
-        return 0, 2 * len(common)
+    island: Island, before: _Side, after: _Side, place: Float[np.ndarray, "2"]
+) -> float:
+    """Compute the evidence of a seam between two sides; two common landmarks settle it: none."""
+    one, two = before.beside, after.beside
+    if not len(one) or not len(two) or len(np.intersect1d(before.all, after.all)) > 1:
+        return 0.0
     nodes = np.union1d(one, two)
     a, b = np.searchsorted(nodes, one), np.searchsorted(nodes, two)
     points, possible = _mark_possible(island, nodes, a, b)
@@ -143,12 +145,12 @@ def _compare_sides(
         in_view = _mark_in_sector(points[own] - place, points[other] - place, reach)
         absent += int((in_view & ~found).sum())
         present += int(found.sum())
-    return absent, present
+    return ABSENT * absent - PRESENT * present
 
 
 def _mark_possible(
     island: Island, nodes: Indices, one: Indices, two: Indices
-) -> tuple[Points, Bool[np.ndarray, "a b"]]:
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "a b"]]:
     """Return the nodes' positions, and which landmarks of two sides may be one."""
     mean, covariance = joint_marginal(island, nodes.tolist())
     points = mean.reshape(-1, 2)
@@ -161,7 +163,9 @@ def _mark_possible(
     return points, possible
 
 
-def _mark_in_sector(points: Points, of: Points, reach: float) -> Bool[np.ndarray, " n"]:
+def _mark_in_sector(
+    points: Float[np.ndarray, "n 2"], of: Float[np.ndarray, "m 2"], reach: float
+) -> Bool[np.ndarray, " n"]:
     """Mark the points within reach of the origin, in the sector of other points' directions."""
     directions = np.sort(core.atan2(of[:, 1], of[:, 0]))
     gaps = np.diff(np.append(directions, directions[0] + 2.0 * math.pi))
