@@ -27,6 +27,8 @@ from teamslam.team.estimation.map_joining.submap_graph import Joined
 
 SCANS = 3
 """Number of scans with detections of a side."""
+LEAST_SCANS = 2 * SCANS
+"""Least number of scans of a submap: with fewer the last ones are not beside its end."""
 LEAST_COUNT = 2
 """Least number of measurements of a landmark: single ones may be clutter."""
 ABSENT, PRESENT = 1.5, 2.0
@@ -73,7 +75,7 @@ def find_seam(
         if each.contribution.stream == stream
         and sequence - 1 <= each.contribution.sequence <= sequence
     ]
-    if len(pair) < 2:
+    if len(pair) < 2 or min(map(_count_scans, pair)) < LEAST_SCANS:
         return None
     one, two = pair
     begin_ns, end_ns = one.contribution.end_ns, two.contribution.end_ns
@@ -94,13 +96,17 @@ def _compare_inside(island: Island, submap: Joined) -> float:
     """Compare the scans before and behind each scan of a submap, SCANS or more from its ends;
     return the most evidence.
     """
-    scans = submap.contribution.local.unnamed.seen.shape[1]
+    scans = _count_scans(submap)
     found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):
         before = _Side.of(submap, slice(k - SCANS, k), slice(k))
         after = _Side.of(submap, slice(k, k + SCANS), slice(k, None))
         found.append(_compare_sides(island, before, after, _place(island, submap, k / scans)))
     return max(found)
+
+
+def _count_scans(submap: Joined) -> int:
+    return submap.contribution.local.unnamed.seen.shape[1]
 
 
 class _Side(NamedTuple):
