@@ -61,7 +61,7 @@ def first_of(stream: Stream) -> int:
 
 
 def named(stream: Stream) -> str:
-    """Name a stream: `r3 (incarnation 2)`, a part, `…, from submap 12 on`, or `the saved map site`."""
+    """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
     if is_map(stream):
         return f"the saved map {stream[0].removeprefix(MAP)}"
     first = first_of(stream)

@@ -33,8 +33,8 @@ LEAST_COUNT = 2
 """Least number of measurements of a landmark: single ones may be clutter."""
 ABSENT, PRESENT = 1.5, 2.0
 """−ln P(overlooked), and ln of P(seen) over P(another landmark is within the gate)."""
-EVIDENCE = 7.5
-"""Least evidence of a seam: five absent landmarks."""
+EVIDENCE = 6.0
+"""Least evidence of a seam: four absent landmarks."""
 LEAST_BEFORE = 2
 """Least number of submaps of a stream or part before a seam."""
 AROUND = math.pi
