@@ -106,7 +106,7 @@ def _compare_inside(island: Island, submap: Joined) -> float:
 
 
 def _count_scans(submap: Joined) -> int:
-    return submap.contribution.local.unnamed.seen.shape[1]
+    return int(submap.contribution.local.unnamed.seen.shape[1])
 
 
 class _Side(NamedTuple):
