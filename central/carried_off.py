@@ -1,4 +1,8 @@
-"""Find where a withdrawn robot was carried off, or slipped, and by how much.
+"""Find where a robot was carried off, or slipped, and by how much.
+
+Without landmark names the fold cuts its stream there (`continuity`). A robot with named landmarks
+that contradicts the rest is examined as follows; its stream is cut at the seam that is found, and
+only where none is found is it withdrawn.
 
 Each submap of the robot that shares enough named landmarks with the map of the others is aligned to
 it in the frame of its start pose and in that of its end pose. The end of one submap and the start
@@ -19,9 +23,11 @@ from teamslam.central.withdrawal import ACCORD, AGREEING, SUSPICION, cost_share
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.contribution import Contribution, Stream, part_of
 from teamslam.team.estimation.gaussian import NotACovarianceError, information
 from teamslam.team.estimation.map_joining.alignment import Alignment, aligned
+from teamslam.team.estimation.map_joining.continuity import Seam
+from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known
 from teamslam.team.estimation.map_joining.marginals import landmark_blocks
@@ -31,8 +37,8 @@ from teamslam.team.shapes import Float, Int64
 
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the map: two also fit their mirror image."""
-LEAST_SIDE = 2
-"""Least number of submaps that fit the map on each side of the open seam."""
+LEAST_BEFORE, LEAST_AFTER = 2, 1
+"""Least number of submaps that fit the map before and behind the open seam."""
 SEAM_DOF = 3.0
 """Degrees of freedom of a seam."""
 MOST_SHARED = 40
@@ -51,7 +57,10 @@ class CarriedOff(NamedTuple):
     before, after: numbers of the last submap before it and of the first one after it. begin_ns,
     end_ns: their end and beginning, equal where no submap is between. by: the motion in the map's
     frame (x [m], y [m], turn [rad]). in_all: `by` includes the robot's own motion between the two,
-    since the submap between them is spoilt. evidence: χ² of the open seams per degree of freedom.
+    since the submap between them is spoilt. evidence: χ² of the open seams per degree of freedom,
+    or the log-likelihood ratio of a view that changed at once. place: (x, y) [m] in
+    the map; of a cut stream only. `by` is empty, where the stream was cut, until its later part has
+    a place in the map.
     """
 
     robot: str
@@ -59,9 +68,10 @@ class CarriedOff(NamedTuple):
     after: int
     begin_ns: int
     end_ns: int
-    by: tuple[float, float, float]
+    by: tuple[float, ...]
     in_all: bool
     evidence: float
+    place: tuple[float, ...] = ()
 
 
 class _Placed(NamedTuple):
@@ -114,8 +124,8 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
     if (
         len(spoilt) > 1
         or any(not before < k < after for k in spoilt)
-        or sum(each.at <= before for each in placed) < LEAST_SIDE
-        or sum(each.at >= after for each in placed) < LEAST_SIDE
+        or sum(each.at <= before for each in placed) < LEAST_BEFORE
+        or sum(each.at >= after for each in placed) < LEAST_AFTER
         or cost_share(others, SEAM_DOF * len(closed), ACCORD) > AGREEING * limit
         or others > max(each.chi2 for each in opened)
     ):
@@ -133,6 +143,63 @@ def carried_off(rest: Fold, chain: Sequence[Contribution], limit: float) -> Carr
         in_all=bool(spoilt),
         evidence=math.fsum(each.chi2 for each in opened) / (SEAM_DOF * len(opened)),
     )
+
+
+def seam_of(chain: Sequence[Contribution], found: CarriedOff) -> Seam:
+    """Return the seam at which a stream is cut for its later submaps to keep their own place."""
+    stream, before, after = chain[0].stream, found.before, found.after
+    evidence = 0.5 * SEAM_DOF * found.evidence
+    return Seam(stream, before, after, found.begin_ns, found.end_ns, evidence)
+
+
+def cuts_of(fold: Fold) -> list[CarriedOff]:
+    """Describe the seams at which a fold has cut streams, and the motion where both parts are in
+    one island.
+
+    Not carried off is a part that lies where the odometry puts it.
+    """
+    found = []
+    for cut in fold.cuts:
+        later = part_of(cut.stream, cut.after)
+        island = fold.island(*cut.stream)
+        place = island.state[island.graph.offset[island.graph.streams[cut.stream][-1]] :][:2]
+        by: tuple[float, ...] = ()
+        if fold.home.get(later, later) == fold.home[cut.stream]:
+            gap, chi2 = _gap(fold, cut.stream, later)
+            if cut.after == cut.before + 1 and cost_share(chi2, SEAM_DOF, SUSPICION) <= 1.0:
+                continue
+            if fold.island(*later).graph.first_sequence(later) == cut.after:
+                by = (float(gap[0]), float(gap[1]), wrapped(gap[2]))
+        found.append(
+            CarriedOff(
+                robot=cut.stream[0],
+                before=cut.before,
+                after=cut.after,
+                begin_ns=cut.begin_ns,
+                end_ns=cut.end_ns,
+                by=by,
+                in_all=cut.after > cut.before + 1,
+                evidence=cut.evidence,
+                place=(float(place[0]), float(place[1])),
+            )
+        )
+    return found
+
+
+def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
+    """Return the motion from the end of a part to the oldest start of the next one, and its χ²."""
+    island = fold.islands[fold.home[earlier]]
+    nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
+    mean, covariance = joint_marginal(island, nodes)
+    gap = mean[3:] - mean[:3]
+    gap[2] = wrapped(gap[2])
+    J = np.hstack([-np.eye(3), np.eye(3)])
+    spread = dense.product(dense.product(J, covariance), J.T)
+    try:
+        metric = information(spread, "a seam")
+    except NotACovarianceError:
+        return gap, math.inf
+    return gap, float(dense.product(dense.product(gap, metric), gap))
 
 
 def _placed(

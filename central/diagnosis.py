@@ -89,7 +89,7 @@ def diagnose(
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
-    carried: of the withdrawn robots; withdrawn: their submaps. normal: the covariance scale where
+    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the covariance scale where
     covariances are right; scale: the team's, or its cost per
     degree of freedom. final: see `monitor.finding`.
     """
@@ -98,7 +98,7 @@ def diagnose(
     found = [
         *_shared_errors(biases, scale),
         *_mirrored(fold, withdrawn),
-        *map(_of_withdrawn, carried),
+        *map(_of_cut, carried),
     ]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
@@ -153,7 +153,7 @@ def _shared_errors(biases: Sequence[BiasEstimate], scale: float) -> Iterator[m.D
             )
 
 
-def _of_withdrawn(each: CarriedOff) -> m.Diagnosis:
+def _of_cut(each: CarriedOff) -> m.Diagnosis:
     return m.Diagnosis(
         cause=CARRIED_OFF,
         robot=each.robot,
@@ -161,6 +161,7 @@ def _of_withdrawn(each: CarriedOff) -> m.Diagnosis:
         evidence=each.evidence,
         remedy=_REMEDIES[CARRIED_OFF],
         at_ns=each.begin_ns,
+        place=each.place,
     )
 
 
@@ -250,11 +251,12 @@ def _statement(found: m.Diagnosis) -> str:
                 f"two landmarks {math.hypot(*value):.1f} m apart have the number {found.landmark}"
             )
         case "carried_off":
+            at = f" at ({found.place[0]:.1f}, {found.place[1]:.1f}) m" if found.place else ""
+            text = f"{found.robot} was carried off or slipped{when}{at}"
+            if not value:
+                return f"{text}, to an unknown place; its later submaps are a map of their own"
             dx, dy, turn = value
-            return (
-                f"{found.robot} was carried off or slipped{when} by ({dx:+.1f}, {dy:+.1f}) m and "
-                f"{math.degrees(turn):+.0f}°"
-            )
+            return f"{text} by ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
         case "mirrored":
             return f"{found.robot}'s bearings have the wrong sign"
         case "wrong_minimum":
@@ -304,6 +306,7 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
     )
     more = {"displacement": list(found.value)} if found.cause in (SHARED, CARRIED_OFF) else {}
     at = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
+    at |= {"place": list(found.place)} if found.place else {}
     return {
         "cause": found.cause,
         **subject,

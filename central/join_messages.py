@@ -10,11 +10,12 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.central.fused import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
+from teamslam.central.sent_priors import in_main_island
 from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.verification import find_possible_duplicates
-from teamslam.team.estimation.contribution import Stream, is_map, named
+from teamslam.team.estimation.contribution import Stream, first_of, is_map, named, whole_of
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.alignment import SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
@@ -94,12 +95,13 @@ def team_map(
         biases=tuple(
             m.BiasEstimate(
                 robot=b.stream[0],
-                incarnation=b.stream[1],
+                incarnation=whole_of(b.stream)[1],
                 bias=b.bias,
                 value=b.value,
                 sigma=b.sigma,
             )
             for b in biases
+            if b.stream == fold.latest_part(whole_of(b.stream))
         ),
         joined=tuple(fold.joined[k] for k in sorted(fold.joined)),
         withdrawn=withdrawn,
@@ -242,16 +244,18 @@ def priors(
     After the final map robots need no estimate: those named are withdrawn.
     """
     given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
-    found = marginals.main_priors(fold, given, PRIOR_LANDMARKS, shown) if given else {}
+    parts = [fold.latest_part(stream) for stream in given]
+    found = marginals.main_priors(fold, parts, PRIOR_LANDMARKS, shown) if given else {}
     out = []
     for stream in sorted(requested):
-        if stream in found:
+        part = fold.latest_part(stream)
+        if part in found:
             message = translate.prior_message(
                 fused.stamp_ns,
                 *stream,
-                fold.next_sequence(stream) - 1,
+                fold.next_sequence(part) - 1,
                 fused.digest,
-                found[stream],
+                found[part],
                 frame=fused.frame,
                 members=fused.members,
                 received=fused.heard,
@@ -261,11 +265,6 @@ def priors(
             message = _withdrawn_prior(stream, fused)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
-
-
-def in_main_island(fold: Fold, stream: Stream) -> bool:
-    """Whether the stream has submaps in the team's map."""
-    return stream in fold.home and fold.home[stream] == fold.main_key
 
 
 def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
@@ -289,14 +288,18 @@ def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
 def trajectories(
     fold: Fold, digest: bytes, submaps: Mapping[Stream, Sequence[m.Submap]]
 ) -> list[Outgoing]:
-    """Make the path of every stream in the team's frame: the end poses of its submaps."""
+    """Make the path of every stream, or part of one, in the team's frame: the end poses of its
+    submaps.
+    """
     paths = []
-    for robot, incarnation in sorted(stream for stream in fold.home if not is_map(stream)):
-        if fold.home[(robot, incarnation)] != fold.main_key:
+    for part in sorted(stream for stream in fold.home if not is_map(stream)):
+        if fold.home[part] != fold.main_key:
             continue
-        found = marginals.trajectory(fold, robot, incarnation)
+        found = marginals.trajectory(fold, *part)
         poses, covariances = found.poses, found.covariances
-        ends = [s.stamp_ns for s in submaps[(robot, incarnation)]][: len(poses)]
+        robot, incarnation = whole_of(part)
+        own = submaps[robot, incarnation][first_of(part) :]
+        ends = [s.stamp_ns for s in own][: len(poses)]
         message = translate.trajectory_message(
             ends[-1], robot, incarnation, digest, ends, poses, covariances
         )

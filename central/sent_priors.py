@@ -35,8 +35,6 @@ SURER = 0.8
 """Share to which a landmark's variance must have fallen for a new prior."""
 NEVER = -1
 """Stamp of no inter-robot measurement, before all team time."""
-NOWHERE: Stream = ("", 0)
-"""The island of a stream without submaps."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +52,11 @@ class _Sent:
     frame: Stream | None = None
 
 
+def in_main_island(fold: Fold, stream: Stream) -> bool:
+    """Whether the newest part of the stream is in the team's map."""
+    return fold.main_key is not None and fold.home.get(fold.latest_part(stream)) == fold.main_key
+
+
 class SentPriors:
     """The last prior of each stream; depends on the broadcasts before, not on the set alone."""
 
@@ -67,7 +70,7 @@ class SentPriors:
 
         Streams that left the team's map are selected once, to withdraw their priors.
         """
-        inside = [each for each in streams if fold.home.get(each, NOWHERE) == fold.main_key]
+        inside = [each for each in streams if in_main_island(fold, each)]
         out = self._withdrawn({*streams} - {*inside})
         if not inside:
             return out
@@ -76,7 +79,11 @@ class SentPriors:
             each
             for each in inside
             if self.is_worth(
-                each, last_pose(fold, each), blocks, newest.get(each[0], NEVER), fold.frame
+                each,
+                last_pose(fold, fold.latest_part(each)),
+                blocks,
+                newest.get(each[0], NEVER),
+                fold.frame,
             )
         ]
 
@@ -86,7 +93,7 @@ class SentPriors:
         for stream in streams:
             old = self._sent.get(stream)
             is_in_another_frame = old is not None and old.frame != fold.frame
-            if is_in_another_frame or fold.home.get(stream, NOWHERE) != fold.main_key:
+            if is_in_another_frame or not in_main_island(fold, stream):
                 outside.append(stream)
         return self._withdrawn(outside)
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from teamslam.central.carried_off import cuts_of
 from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose
 from teamslam.central.fused import receivable
@@ -201,7 +202,7 @@ class SubmapFold:
         self.diagnosis = diagnose(
             fold,
             biases,
-            ticks.find_carried_off(fold) if final else (),
+            cuts_of(fold),
             ticks.submaps_of_convicted(),
             self.config.normal_scale,
             scale,

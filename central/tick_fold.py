@@ -27,8 +27,9 @@ condensed (but see FULL_UNNAMED).
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
-from teamslam.central.carried_off import CarriedOff, carried_off
+from teamslam.central.carried_off import carried_off, seam_of
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
 from teamslam.central.fold_inputs import FoldInputs
@@ -43,10 +44,11 @@ from teamslam.central.withdrawal import (
 )
 from teamslam.team.config import BIASES
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Contribution, Stream
+from teamslam.team.estimation.contribution import Contribution, Stream, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -108,6 +110,7 @@ class TickFold:
         self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
         self.settings = join_settings(config)
         self.convicts = config.withdraw_above is not None
+        self._tries = True
         self._ordered: frozenset[str] = frozenset()
         self._agreed: tuple[Fold, Agreement] | None = None
         self._accused: Mapping[str, str] = {}
@@ -118,7 +121,7 @@ class TickFold:
     def _restart(self, conviction: Conviction) -> None:
         self._conviction = conviction
         self._retried = 0.0
-        self.checkpoints = Checkpoints()
+        self.checkpoints = Checkpoints(replace(EMPTY_FOLD, cuts=conviction.cuts))
 
     # Inputs.
 
@@ -279,14 +282,14 @@ class TickFold:
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Withdraw or suspend the robot that a trial of the fold finds, from the first tick on;
-        return whether there is one.
+        """Cut, withdraw or suspend the robot that a trial of the fold finds, from the first tick
+        on; return whether there is one.
 
         at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
         of the map, so a fold that withdraws no robot computes it, too.
         """
         self.undecided = ""
-        if not self.convicts and math.isfinite(at):
+        if not self._tries and math.isfinite(at):
             return False
         wrong = contradiction(fold.main) if fold.contributions else None
         if wrong is not None and self.convicts:
@@ -299,7 +302,13 @@ class TickFold:
         if fold is self.fold:
             self.checkpoints.note_tested(fold.size)
         self.undecided = found.undecided
-        if found.robot is None or not self.convicts:
+        if found.robot is None:
+            return False
+        rest = self.leave_out({found.robot}, self._until_ns).fold
+        if (seam := self._find_seam(rest, found.robot)) is not None:
+            self._restart(self._conviction.cut(seam, at))
+            return True
+        if not self.convicts:
             return False
         own = sum(n + 1 for stream, n in self.members(fold).items() if stream[0] == found.robot)
         if math.isinf(at) or own >= LEAST_SUBMAPS:
@@ -308,6 +317,29 @@ class TickFold:
             suspension = Suspension(found.reason, GROWTH * self._size_until(at))
             self._restart(self._conviction.suspend(found.robot, suspension, at))
         return True
+
+    def _find_seam(self, rest: Fold, robot: str) -> Seam | None:
+        """Find where a robot that contradicts the rest was carried off, by its submaps so far.
+
+        A stream is cut once by this.
+        """
+        limit = self._config.withdraw_above
+        done = {seam.stream for seam in self._conviction.cuts}
+        for stream, submaps in sorted(self._inputs.chains(robot).items()):
+            chain = [each for each in submaps if each.end_ns <= self._until_ns]
+            if limit is not None and stream not in done and chain:
+                found = carried_off(rest, chain, limit)
+                if found is not None:
+                    return seam_of(chain, found)
+        return None
+
+    def _cut_withdrawn(self, rest: Fold) -> bool:
+        """Cut the stream of a withdrawn robot instead, where all its submaps show the seam."""
+        for robot in sorted(self.convicted):
+            if (seam := self._find_seam(rest, robot)) is not None:
+                self._restart(self._conviction.cut(seam, math.inf))
+                return True
+        return False
 
     def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
         limit = self._config.withdraw_above
@@ -345,7 +377,8 @@ class TickFold:
         self, robots: Collection[str], until_ns: float, limits: Limits | None
     ) -> "TickFold":
         other = TickFold(self._config, limits, self._inputs)
-        other.convicts = False
+        other.convicts = other._tries = False
+        other._restart(Conviction(cuts=self._conviction.cuts))
         other._ordered = self._gone.union(robots)
         other.fold_until(until_ns)
         return other
@@ -419,7 +452,9 @@ class TickFold:
             if not fold.contributions:
                 return fold
             fold = converged(fold, self.settings)
-            if not self._convict(fold, math.inf) and not self.suspended:
+            if self._convict(fold, math.inf) or self.suspended:
+                continue
+            if not self._cut_withdrawn(fold):
                 return fold
 
     def _fold_raw(self) -> Fold:
@@ -431,21 +466,6 @@ class TickFold:
             if not fold.condensed_count:
                 return fold
         return self._fold_others((), math.inf, None).fold
-
-    def find_carried_off(self, fold: Fold) -> list[CarriedOff]:
-        """Find where the withdrawn robots were carried off, as far as their submaps show it.
-
-        fold: one without them.
-        """
-        limit = self._config.withdraw_above
-        if limit is None:
-            return []
-        found = (
-            carried_off(fold, chain, limit)
-            for robot in sorted(self.convicted)
-            for _, chain in sorted(self._inputs.chains(robot).items())
-        )
-        return [each for each in found if each is not None]
 
     def submaps_of_convicted(self) -> Mapping[str, Sequence[Contribution]]:
         """Return the submaps of each robot that the fold has withdrawn, in order."""
@@ -469,7 +489,10 @@ class TickFold:
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """Return the version vector: the last sequence of each stream, folded or refused."""
-        last = {stream: fold.next_sequence(stream) - 1 for stream in fold.home}
-        for _, robot, incarnation, sequence in fold.refused:
-            last[robot, incarnation] = max(last.get((robot, incarnation), -1), sequence)
+        last: dict[Stream, int] = {}
+        parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]
+        parts += [(key[1:3], key[3]) for key in fold.refused]
+        for part, sequence in parts:
+            stream = whole_of(part)
+            last[stream] = max(last.get(stream, -1), sequence)
         return {stream: last[stream] for stream in sorted(last)}

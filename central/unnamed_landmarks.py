@@ -15,6 +15,7 @@ from teamslam.team.estimation.association.member_log import (
     MemberRecord,
     record_of,
 )
+from teamslam.team.estimation.contribution import PART
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 
@@ -41,7 +42,7 @@ def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membersh
         table.append(
             m.Membership(
                 robot=robot,
-                incarnation=incarnation,
+                incarnation=incarnation % PART,
                 sequences=from_ids(np.array([each.sequence for each, *_ in of], np.uint32)),
                 locals=from_ids(np.array([each.local for each, *_ in of], np.uint32)),
                 identities=from_ids(np.array([id_ for _, id_, *_ in of], np.uint32)),
@@ -99,5 +100,8 @@ def verdict_of(judgement: m.Judgement) -> Verdict:
 
 def judgement_of(verdict: Verdict) -> m.Judgement:
     """Convert the fold's verdict to the judgement of a map."""
-    first, second = (m.LocalLandmark(**each._asdict()) for each in verdict[:2])
+    first, second = (
+        m.LocalLandmark(**each._replace(incarnation=each.incarnation % PART)._asdict())
+        for each in verdict[:2]
+    )
     return m.Judgement(first=first, second=second, same=verdict.same)

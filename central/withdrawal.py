@@ -18,6 +18,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
@@ -73,13 +74,15 @@ class Conviction:
     """The robots that a fold leaves out by itself.
 
     withdrawn: the reason by robot, in words. suspended: left out until tested again. at: the last
-    tick that this is based on. tested_from: the first tick tested under it.
+    tick that this is based on. tested_from: the first tick tested under it. cuts: seams at which
+    robots that contradicted the rest were carried off; their streams are cut there.
     """
 
     withdrawn: Mapping[str, str] = field(default_factory=dict)
     suspended: Mapping[str, Suspension] = field(default_factory=dict)
     at: float = -math.inf
     tested_from: float = -math.inf
+    cuts: tuple[Seam, ...] = ()
 
     def withdraw(self, robot: str, reason: str, at: float) -> "Conviction":
         """Withdraw one more robot."""
@@ -89,12 +92,19 @@ class Conviction:
     def suspend(self, robot: str, suspension: Suspension, at: float) -> "Conviction":
         """Suspend one more robot."""
         suspended = {**self.suspended, robot: suspension}
-        return Conviction(self.withdrawn, suspended, max(self.at, at))
+        return replace(self, suspended=suspended, at=max(self.at, at), tested_from=-math.inf)
 
     def acquit(self, robot: str, at: float, tested_from: float) -> "Conviction":
         """Restore a suspended robot, to be tested."""
         suspended = {each: why for each, why in self.suspended.items() if each != robot}
-        return Conviction(self.withdrawn, suspended, max(self.at, at), tested_from)
+        return replace(self, suspended=suspended, at=max(self.at, at), tested_from=tested_from)
+
+    def cut(self, seam: Seam, at: float) -> "Conviction":
+        """Cut the stream of one more robot, which is not withdrawn then."""
+        robot = seam.stream[0]
+        withdrawn = {each: why for each, why in self.withdrawn.items() if each != robot}
+        without = self.acquit(robot, at, -math.inf)
+        return replace(without, withdrawn=withdrawn, cuts=(*self.cuts, seam))
 
 
 def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:

@@ -19,7 +19,7 @@ from teamslam.team.robot.node import robot_node
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.arrays import floats, stamps
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,13 @@ def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
     """Path of every robot in the final map; `progress` receives each robot's name."""
-    last: dict[tuple[str, int], m.Trajectory] = {}
+    last: dict[tuple[str, int, int], m.Trajectory] = {}
     for message in found.of(ch.TRAJECTORY):
         if isinstance(message, m.Trajectory):
-            last[message.robot, message.incarnation] = message
+            begin = int(stamps(message.stamps, "stamps")[0])
+            last[message.robot, message.incarnation, begin] = message
     by_robot: dict[str, list[SmoothedPath]] = {}
-    for (robot, incarnation), message in sorted(last.items()):
+    for (robot, incarnation, _), message in sorted(last.items()):
         progress(robot)
         windows = _windows(found, robot, incarnation) if message.crosses else {}
         by_robot.setdefault(robot, []).append(_between_ends(found, message, windows))

@@ -37,11 +37,36 @@ def is_map(stream: Stream) -> bool:
     return stream[0].startswith(MAP)
 
 
+PART = 1 << 64
+"""Step of the incarnation number from which a part of a cut stream is numbered."""
+
+
+def part_of(stream: Stream, first: int) -> Stream:
+    """Name the part of a stream from submap `first` on, after a cut (`continuity`).
+
+    A fold treats it as an incarnation of its own: the stream is broken there. Submaps keep their
+    sequence numbers.
+    """
+    return stream[0], stream[1] % PART + first * PART
+
+
+def whole_of(stream: Stream) -> Stream:
+    """Name the stream of a part."""
+    return stream[0], stream[1] % PART
+
+
+def first_of(stream: Stream) -> int:
+    """Sequence number of the first submap of a stream or part."""
+    return stream[1] // PART
+
+
 def named(stream: Stream) -> str:
-    """Name a stream: `r3 (incarnation 2)`, or `the saved map site`."""
+    """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
     if is_map(stream):
         return f"the saved map {stream[0].removeprefix(MAP)}"
-    return f"{stream[0]} (incarnation {stream[1]})"
+    first = first_of(stream)
+    part = f", from submap {first} on" if first else ""
+    return f"{stream[0]} (incarnation {whole_of(stream)[1]}{part})"
 
 
 def moment(stamp_ns: int) -> str:

@@ -1,4 +1,7 @@
-"""Fold a tick, and undo a closure that later submaps contradict.
+"""Fold a tick, cut streams at its seams, and undo a closure that later submaps contradict.
+
+A stream whose view changes at once (`continuity`) is cut there, and the tick is folded again with
+the later part as an island of its own, which merges like one with an unknown initial pose.
 
 For some ticks after a closure, or a merge of robots, the matched share of the landmarks near its
 places that both sides observed is computed again. Where it falls below the bound of the settings,
@@ -13,6 +16,8 @@ import numpy as np
 from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.landmark_sets import OPEN, Opened
 from teamslam.team.estimation.association.verification import overlap_share
+from teamslam.team.estimation.map_joining.continuity import Seam, find_seam
+from teamslam.team.estimation.map_joining.cutting import cut_tick
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
 from teamslam.team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
 from teamslam.team.estimation.map_joining.refusal import add_members
@@ -23,7 +28,26 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
-    return _audit_closures(fold, add_members(fold, tick, settings), tick, settings)
+    while True:
+        parts = cut_tick(tick, fold.cuts)
+        after = add_members(fold, parts, settings)
+        seam = _first_seam(after, parts)
+        if seam is None:
+            return _audit_closures(fold, after, tick, settings)
+        fold = replace(fold, cuts=(*fold.cuts, seam))
+
+
+def _first_seam(fold: Fold, tick: Tick) -> Seam | None:
+    """Find the first seam that the submaps of a tick show."""
+    if not fold.landmarks.are_there:
+        return None
+    for each in tick.contributions:
+        if each.key not in fold.refused:
+            island = fold.islands[fold.home[each.stream]]
+            seam = find_seam(island, each.stream, each.sequence)
+            if seam is not None:
+                return seam
+    return None
 
 
 def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings) -> Fold:

@@ -26,7 +26,7 @@ from teamslam.team.estimation.association.landmark_sets import (
 )
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from teamslam.team.estimation.association.verification import Closure, is_ambiguous
-from teamslam.team.estimation.contribution import Contribution, Stream
+from teamslam.team.estimation.contribution import Contribution, Stream, first_of
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -287,6 +287,6 @@ def _merge_islands(
     views = _IslandViews()
     step = patch_step(fold.islands[stays].settings.association)
     for stream in streams:
-        for last in range(fold.next_sequence(stream) - 1, -1, -step):
+        for last in range(fold.next_sequence(stream) - 1, first_of(stream) - 1, -step):
             fold = _close_loop(fold, stream, last, views)
     return fold

@@ -27,11 +27,14 @@ from teamslam.team.estimation.contribution import (
     InitialPoseFactor,
     Key,
     Stream,
+    first_of,
     is_map,
     moment,
     named,
+    whole_of,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor, SightingKey
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
@@ -167,6 +170,8 @@ class Fold:
     in words. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
     still be undone (`auditing`). ambiguous: number of submaps of a stream's island and another one
     at their last attempt that several alignments passed.
+    cuts: seams at which streams are cut into parts, each a stream of
+    its own here (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -189,6 +194,7 @@ class Fold:
     landmarks: Landmarks = NO_LANDMARKS
     audits: tuple[Audit, ...] = ()
     ambiguous: Mapping[tuple[Stream, Stream], int] = field(default_factory=dict)
+    cuts: tuple[Seam, ...] = ()
 
     @property
     def condensed_count(self) -> int:
@@ -238,8 +244,12 @@ class Fold:
     def next_sequence(self, stream: Stream) -> int:
         """Sequence number of a stream's next submap in the fold."""
         if stream not in self.home:
-            return 0
+            return first_of(stream)
         return self.islands[self.home[stream]].graph.next_sequence(stream)
+
+    def latest_part(self, stream: Stream) -> Stream:
+        """Return the newest part of a stream in the fold, the stream itself unless it is cut."""
+        return max((each for each in self.home if whole_of(each) == stream), default=stream)
 
 
 EMPTY_FOLD = Fold((), {}, {}, {}, {})

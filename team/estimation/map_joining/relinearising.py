@@ -14,6 +14,7 @@ from teamslam.team.estimation.contribution import Contribution, Key, Stream
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
 from teamslam.team.estimation.map_joining.condensing import LIMITS
+from teamslam.team.estimation.map_joining.cutting import cut_members
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
@@ -70,6 +71,8 @@ def restore_submaps(
     contributions, sightings: all members of the fold in canonical order, refused ones included. An
     island without a solution then is unchanged.
     """
+    contributions = cut_members(contributions, fold.cuts)
+    sightings = cut_members(sightings, fold.cuts)
     for key, island in fold.islands.items():
         old = island.graph.condensed
         if old is not None:

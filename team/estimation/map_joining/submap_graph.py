@@ -22,6 +22,7 @@ from teamslam.team.estimation.contribution import (
     InitialPoseFactor,
     Key,
     Stream,
+    first_of,
     is_map,
     named,
 )
@@ -135,7 +136,7 @@ class Graph:
     these and `biases` have one number. offset: index in the state of each node's first number; the
     last entry is the state's length. fixed: nodes that are constants (exactly known initial poses,
     the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
-    replaces older submaps, if any (`condensing`). gone: number of a stream's submaps in
+    replaces older submaps, if any (`condensing`). gone: sequence behind a stream's submaps in
     `condensed`; `streams` begins after them. former: the node of a moved landmark's old place, by
     (saved map, id); the id is that of its present place. memory: observations of the condensed
     submaps for data association, where landmarks have no names.
@@ -215,7 +216,11 @@ class Graph:
 
     def next_sequence(self, stream: Stream) -> int:
         """Sequence number of a stream's next submap."""
-        return self.gone.get(stream, 0) + len(self.streams[stream]) - 1
+        return self.first_sequence(stream) + len(self.streams[stream]) - 1
+
+    def first_sequence(self, stream: Stream) -> int:
+        """Sequence number of a stream's first submap that is not condensed."""
+        return self.gone.get(stream, first_of(stream))
 
     @property
     def size(self) -> int:
@@ -233,7 +238,7 @@ class Graph:
             if node == nodes[0]:
                 return f"the start of {named(stream)}"
             if node in nodes:
-                sequence = self.gone.get(stream, 0) + nodes.index(node) - 1
+                sequence = self.first_sequence(stream) + nodes.index(node) - 1
                 return f"the end of submap {sequence} of {named(stream)}"
         for (stream, stamp_ns), at in self.poses.items():
             if node == at:
@@ -417,7 +422,7 @@ def without_nodes(
     for stream, nodes in graph.streams.items():
         first = int(eliminated[list(nodes)].sum())
         streams[stream] = nodes[first:]
-        gone[stream] = gone.get(stream, 0) + first
+        gone[stream] = graph.first_sequence(stream) + first
     left = replace(
         graph,
         streams=streams,

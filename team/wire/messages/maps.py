@@ -136,7 +136,8 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
     value, sigma: (dx, dy) [m] of a landmark's second place from its first; (dx, dy, dtheta) of a
     robot that was carried off; else one number, and none where the cause has none. evidence: cost
-    that the cause removes, per degree of freedom. at_ns: team time of the change; 0: no time.
+    that the cause removes, per degree of freedom, or the log-likelihood ratio of a view that
+    changed at once. at_ns: team time of the change; 0: no time. place: (x, y) [m] of it, if known.
     """
 
     cause: Cause
@@ -147,6 +148,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     evidence: Real = 0.0
     remedy: Text = ""
     at_ns: StampNs = 0
+    place: tuple[Real, ...] = ()
 
 
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):

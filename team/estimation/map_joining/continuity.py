@@ -1,0 +1,184 @@
+"""Seams: places where a robot's view changes at once although its odometry measures no motion.
+
+The landmarks of the last scans before a place and of the first scans behind it are seen from about
+one pose. Where a robot was carried off, or its odometry slips by metres, all of them are replaced:
+each landmark of one side in the view of the other one is absent there. The evidence for a seam is
+
+    ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there),
+
+the log-likelihood ratio of a robot elsewhere against one that overlooks landmarks; a landmark may
+be another one within the gate of association. The view of a side is the sector of its landmarks, by
+direction and to the greatest distance of both sides. A seam is between two submaps, or inside one,
+which then is spoilt. Landmarks with identities have a test of their own (`central.carried_off`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.gating import Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation.contribution import Stream, first_of
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.submap_graph import Joined
+
+SCANS = 3
+"""Number of scans with detections of a side."""
+LEAST_SCANS = 2 * SCANS
+"""Least number of scans of a submap: with fewer the last ones are not beside its end."""
+LEAST_COUNT = 2
+"""Least number of measurements of a landmark: single ones may be clutter."""
+ABSENT, PRESENT = 1.5, 2.0
+"""−ln P(overlooked), and ln of P(seen) over P(another landmark is within the gate)."""
+EVIDENCE = 6.0
+"""Least evidence of a seam: four absent landmarks."""
+LEAST_BEFORE = 2
+"""Least number of submaps of a stream or part before a seam."""
+AROUND = math.pi
+"""Gap between the directions of neighbouring landmarks above which a view does not close round."""
+
+Indices = Int64[np.ndarray, " _"]
+
+
+class Seam(NamedTuple):
+    """A place at which a stream is cut.
+
+    before, after: numbers of the last submap before it and of the first one behind it; one between
+    is spoilt. begin_ns, end_ns: the end of the former and the beginning of the latter. evidence:
+    log-likelihood ratio.
+    """
+
+    stream: Stream
+    before: int
+    after: int
+    begin_ns: int
+    end_ns: int
+    evidence: float
+
+
+def find_seam(
+    island: Island, stream: Stream, sequence: int, least: float = EVIDENCE
+) -> Seam | None:
+    """Find a seam of at least this evidence before a submap of a stream, or inside it.
+
+    A stream or part must have LEAST_BEFORE submaps before it: a sensor whose views often change at
+    once shows no seams.
+    """
+    if sequence - first_of(stream) < LEAST_BEFORE:
+        return None
+    pair = [
+        each
+        for each in island.graph.submaps
+        if each.contribution.stream == stream
+        and sequence - 1 <= each.contribution.sequence <= sequence
+    ]
+    if len(pair) < 2 or min(map(_count_scans, pair)) < LEAST_SCANS:
+        return None
+    one, two = pair
+    begin_ns, end_ns = one.contribution.end_ns, two.contribution.end_ns
+    sides = (
+        _Side.of(one, slice(-SCANS, None), slice(None)),
+        _Side.of(two, slice(SCANS), slice(None)),
+    )
+    evidence = _compare_sides(island, *sides, _place(island, two, 0.0))
+    if evidence >= least:
+        return Seam(stream, sequence - 1, sequence, begin_ns, begin_ns, evidence)
+    evidence = _compare_inside(island, two)
+    if evidence >= least:
+        return Seam(stream, sequence - 1, sequence + 1, begin_ns, end_ns, evidence)
+    return None
+
+
+def _compare_inside(island: Island, submap: Joined) -> float:
+    """Compare the scans before and behind each scan of a submap, SCANS or more from its ends;
+    return the most evidence.
+    """
+    scans = _count_scans(submap)
+    found = [0.0]
+    for k in range(SCANS, scans - SCANS + 1):
+        before = _Side.of(submap, slice(k - SCANS, k), slice(k))
+        after = _Side.of(submap, slice(k, k + SCANS), slice(k, None))
+        found.append(_compare_sides(island, before, after, _place(island, submap, k / scans)))
+    return max(found)
+
+
+def _count_scans(submap: Joined) -> int:
+    return int(submap.contribution.local.unnamed.seen.shape[1])
+
+
+class _Side(NamedTuple):
+    """The nodes of the landmarks in the scans beside a place, and in all scans of that side."""
+
+    beside: Indices
+    all: Indices
+
+    @classmethod
+    def of(cls, submap: Joined, beside: slice, of_side: slice) -> "_Side":
+        return cls(_seen(submap, beside), _seen(submap, of_side))
+
+
+def _seen(submap: Joined, scans: slice) -> Indices:
+    """Return the nodes of the unnamed landmarks in some scans of a submap."""
+    local = submap.contribution.local
+    unnamed = local.unnamed
+    seen = unnamed.seen[:, scans].any(axis=1) & (unnamed.counts >= LEAST_COUNT)
+    nodes = submap.landmarks[local.ids >= UNNAMED][seen]
+    return np.unique(nodes[nodes >= 0])
+
+
+def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2"]:
+    """Interpolate the robot's place between the start and the end of a submap."""
+    start, end = (island.state[island.graph.offset[node] :][:2] for node in submap.nodes[:2])
+    return np.asarray((1.0 - share) * start + share * end)
+
+
+def _compare_sides(
+    island: Island, before: _Side, after: _Side, place: Float[np.ndarray, "2"]
+) -> float:
+    """Compute the evidence of a seam between two sides; two common landmarks settle it: none."""
+    one, two = before.beside, after.beside
+    if not len(one) or not len(two) or len(np.intersect1d(before.all, after.all)) > 1:
+        return 0.0
+    nodes = np.union1d(one, two)
+    a, b = np.searchsorted(nodes, one), np.searchsorted(nodes, two)
+    points, possible = _mark_possible(island, nodes, a, b)
+    reach = float(core.hypot(*(points - place).T).max())
+    absent = present = 0
+    for own, other, found in ((a, b, possible.any(axis=1)), (b, a, possible.any(axis=0))):
+        in_view = _mark_in_sector(points[own] - place, points[other] - place, reach)
+        absent += int((in_view & ~found).sum())
+        present += int(found.sum())
+    return ABSENT * absent - PRESENT * present
+
+
+def _mark_possible(
+    island: Island, nodes: Indices, one: Indices, two: Indices
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "a b"]]:
+    """Return the nodes' positions, and which landmarks of two sides may be one."""
+    mean, covariance = joint_marginal(island, nodes.tolist())
+    points = mean.reshape(-1, 2)
+    joint = Joint(points, covariance, np.zeros((len(nodes), len(nodes)), np.bool_))
+    first, second = list_pairs(one, two)
+    profile = island.settings.association
+    fits = evaluate_pairs(joint, first, second, profile).chi2 < profile.gate
+    possible = np.equal.outer(one, two)
+    possible[~possible] = fits
+    return points, possible
+
+
+def _mark_in_sector(
+    points: Float[np.ndarray, "n 2"], of: Float[np.ndarray, "m 2"], reach: float
+) -> Bool[np.ndarray, " n"]:
+    """Mark the points within reach of the origin, in the sector of other points' directions."""
+    directions = np.sort(core.atan2(of[:, 1], of[:, 0]))
+    gaps = np.diff(np.append(directions, directions[0] + 2.0 * math.pi))
+    near = core.hypot(*points.T) <= reach
+    widest = int(gaps.argmax())
+    if gaps[widest] <= AROUND:
+        return np.asarray(near)
+    begin = directions[(widest + 1) % len(directions)]
+    turned = np.mod(core.atan2(points[:, 1], points[:, 0]) - begin, 2.0 * math.pi)
+    return np.asarray(near & (turned <= 2.0 * math.pi - gaps[widest]))
