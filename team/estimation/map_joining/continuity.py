@@ -16,7 +16,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
@@ -24,6 +23,7 @@ from teamslam.team.estimation.association.gating import Joint, evaluate_pairs, l
 from teamslam.team.estimation.contribution import Stream, first_of
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import Joined
+from teamslam.team.shapes import Bool, Float, Int64
 
 SCANS = 3
 """Number of scans with detections of a side."""
