@@ -89,9 +89,9 @@ def diagnose(
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
-    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the covariance scale where
-    covariances are right; scale: the team's, or its cost per
-    degree of freedom. final: see `monitor.finding`.
+    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the covariance
+    scale where covariances are right; scale: the team's, or its cost per degree of freedom. final:
+    see `monitor.finding`.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
