@@ -63,7 +63,7 @@ def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong: str) -> None:
 
 def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_are_not() -> None:
     for robot, apart in (("", False), ("r2", True)):
-        samples = mirrored_run(robot, None)
+        samples = mirrored_run(robot)
         ticks = of_set(samples)
         ticks.fold_until(10e9)
         folds = ticks.fold_apart(ticks.fold, ahead=False)
@@ -87,7 +87,7 @@ def test_too_small_covariances_by_themselves_are_no_contradiction() -> None:
 
 
 def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path: Path) -> None:
-    result = verify(written(tmp_path / "log.mcap", mirrored_run("r2", None)))
+    result = verify(written(tmp_path / "log.mcap", mirrored_run("r2")))
     assert result.first is None, str(result.first)
     assert {c.channel for c in result.channels if c.equal} >= {"prior", "final_map"}
 
@@ -98,7 +98,7 @@ def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch: pytest.MonkeyP
     """
     counts = []
     for robot in ("", "r2"):
-        samples, ticks = mirrored_run(robot, None), []
+        samples, ticks = mirrored_run(robot), []
         fold = tick_fold.fold_tick
         monkeypatch.setattr(
             tick_fold, "fold_tick", lambda *given, f=fold, n=ticks: n.append(1) or f(*given)
