@@ -88,24 +88,18 @@ def miss_probabilities(
 
 
 def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
-    """Mark the landmarks that nearly all submaps miss which look at their place: a landmark of n <
-    WELL_KNOWN submaps, if each well-known landmark beside it there has WELL_KNOWN n of them.
+    """Mark the landmarks that later submaps miss: a landmark of n < WELL_KNOWN submaps, if each
+    well-known landmark beside it in its last one is in WELL_KNOWN n submaps since.
 
-    sees: landmarks of each submap. At least half of the landmark's submaps have a well-known one.
+    sees: landmarks of each submap, in the order of time.
     """
     counts = sees.sum(axis=0)
-    beside = np.where(sees & (counts >= WELL_KNOWN), counts, len(sees) + 1).min(
-        axis=1, initial=len(sees) + 1
-    )
-    has_known = beside <= len(sees)
-    knowing = sees[has_known].sum(axis=0)
-    fewest = np.where(sees & has_known[:, None], beside[:, None], len(sees) + 1).min(
-        axis=0, initial=len(sees) + 1
-    )
-    missed: Bool[np.ndarray, " n"] = (
-        (counts > 0)
-        & (counts < WELL_KNOWN)
-        & (fewest >= WELL_KNOWN * counts)
-        & (2 * knowing >= counts)
-    )
+    beside = sees & (counts >= WELL_KNOWN)
+    since = sees[::-1].cumsum(axis=0)[::-1] - sees
+    fewest = np.where(beside, since, len(sees)).min(axis=1, initial=len(sees))
+    fewest[~beside.any(axis=1)] = 0
+    missed = np.zeros(sees.shape[1], np.bool_)
+    if len(sees):
+        last = len(sees) - 1 - sees[::-1].argmax(axis=0)
+        missed = (counts > 0) & (counts < WELL_KNOWN) & (fewest[last] >= WELL_KNOWN * counts)
     return missed

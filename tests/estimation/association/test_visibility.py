@@ -41,11 +41,11 @@ def test_views_lose_landmarks_that_are_left_out_and_views_of_fewer_than_three_go
     assert renumber_views(views, to).tolist() == [[10, 11, 12, -1]]
 
 
-def test_a_landmark_of_one_submap_among_well_known_ones_is_missed() -> None:
-    """Five submaps look at landmarks 0 and 1; 2 is false. 3 is where no other submap looks."""
-    sees = np.zeros((6, 4), np.bool_)
-    sees[:5, :2] = True
-    sees[2, 2] = sees[5, 3] = True
-    assert mark_missed(sees).tolist() == [False, False, True, False]
+def test_a_landmark_that_later_submaps_miss_is_missed_and_a_new_one_is_not() -> None:
+    """All but the last submap look at landmarks 0 and 1; 2 is false, 3 elsewhere, 4 new."""
+    sees = np.zeros((7, 5), np.bool_)
+    sees[:6, :2] = True
+    sees[1, 2] = sees[6, 3] = sees[5, 4] = True
+    assert mark_missed(sees).tolist() == [False, False, True, False, False]
     assert not mark_missed(sees[:3]).any(), "three submaps are no evidence"
     assert mark_missed(np.zeros((0, 3), np.bool_)).tolist() == [False] * 3
