@@ -305,7 +305,7 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
         else {"robot": found.robot or None}
     )
     more = {"displacement": list(found.value)} if found.cause in (SHARED, CARRIED_OFF) else {}
-    at = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
+    at: dict[str, object] = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
     at |= {"place": list(found.place)} if found.place else {}
     return {
         "cause": found.cause,
