@@ -55,7 +55,7 @@ def _folded(
 
 def _not_joined(fold: Fold) -> list[str]:
     """What a map says of the robots that are not in it."""
-    return [text for text in reasons(fold, Shown(), (), 1, final=False) if "not joined" in text]
+    return [text for text in reasons(fold, Shown(), (), 1) if "not joined" in text]
 
 
 @pytest.fixture(scope="module")

@@ -44,8 +44,7 @@ def test_the_submap_of_a_mounted_sensor_is_the_bases() -> None:
     assert np.all(np.abs(local.mean - truth) < 3.0 * sigmas + 1e-3)
     assert sigmas.max() < 0.1
     wrong, _ = closed(sensor_mount=(0.0, 0.0, 0.0))
-    d = wrong.mean - truth
-    assert d @ np.linalg.solve(wrong.covariance, d) > 100.0, "without its mount it is not"
+    assert not len(wrong.ids), "without the mount the window rejects them: they contradict its path"
 
 
 def test_the_sensors_motion_is_the_bases_seen_from_the_sensor_and_back() -> None:

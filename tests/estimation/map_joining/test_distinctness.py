@@ -69,7 +69,7 @@ def test_what_may_be_either_of_two_neighbours_is_no_third_landmark() -> None:
     assert {*shown.ids} == {one, two}
     assert [*shown.undecided] == [third]
     assert shown.undecided[third] in (one, two)
-    (why,) = reasons(fold, shown, (), 1, final=True)
+    (why,) = reasons(fold, shown, (), 1)
     assert why.startswith(f"left out, may be one with another landmark: 1 of 3 landmarks ({third} ")
     running = shown_landmarks(fold, CentralConfig(), "closed")
     assert {*running.ids} == {one, two, third}, "running maps show it, as tentative"
@@ -99,7 +99,7 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(
     shown = shown_landmarks(fold, CentralConfig(), "final")
     assert (third in shown.ids) != is_lost
     assert [*shown.weak] == [third] * is_lost
-    words = reasons(fold, shown, (), 1, final=True)
+    words = reasons(fold, shown, (), 1)
     assert len(words) == 2 * is_lost
     assert not is_lost or words[0].startswith("r1 (incarnation 1) was lost: its heading is known")
     assert not is_lost or words[1] == "left out, seen by robots that were lost: 1 of 3 landmarks"
@@ -126,7 +126,7 @@ def test_what_fewer_than_one_submap_in_eight_finds_that_look_there_is_left_out(
     shown, is_missed = shown_landmarks(fold, CentralConfig(), "final"), times >= MOST * found
     assert (third in shown.ids) != is_missed
     assert [*shown.missed] == [third] * is_missed
-    words = reasons(fold, shown, (), 1, final=True)
+    words = reasons(fold, shown, (), 1)
     left_out = "left out, missed by nearly all that looked there: 1 of 3 landmarks"
     assert words == (left_out,) * is_missed
     assert third in shown_landmarks(fold, CentralConfig(), "closed").ids

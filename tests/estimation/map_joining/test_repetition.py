@@ -45,7 +45,7 @@ def folded(*parts: list[Contribution]) -> Fold:
 def said(fold: Fold) -> list[str]:
     config = CentralConfig()
     shown = shown_landmarks(fold, config, "final")
-    return [each for each in reasons(fold, shown, (), 1, final=True) if "look alike" in each]
+    return [each for each in reasons(fold, shown, (), 1) if "look alike" in each]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
