@@ -18,7 +18,7 @@ from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
 from tests.studies.test_experiment_runs import short
 
-OPTIONS = JoinSettings()
+OPTIONS = JoinSettings(robust=False)
 
 
 def world(
