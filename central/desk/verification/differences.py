@@ -31,6 +31,7 @@ _FLOATS = (
     "means",
     "covariance",
     "covariances",
+    "classes",
     "sensitivity",
     "weights",
     "start",

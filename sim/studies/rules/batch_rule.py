@@ -14,7 +14,7 @@ from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
 from teamslam.team import translate
-from teamslam.team.config import RobotConfig
+from teamslam.team.config import FrontEnd, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
 from teamslam.team.estimation.mount import moved_by
 from teamslam.team.estimation.se2 import Pose, inverse
@@ -150,6 +150,7 @@ def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
     declared = defaultdict(list)
     for name, config in sorted(robots.items()):
         sensor, biases = config.sensor, config.front_end.biases
+        biases = () if biases == FrontEnd().biases else biases  # small where nothing is stated
         shares = {"range_white": sensor.range_white, "bearing_white": sensor.bearing_white}
         lasting = [f"{each} = {share:g}" for each, share in shares.items() if share < 1.0]
         if lasting or biases:
