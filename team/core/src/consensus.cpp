@@ -14,7 +14,7 @@ namespace {
 constexpr double EVIDENCE = 4.605170185988092;
 constexpr double JITTER[3] = {1e-6, 1e-6, 1e-8};  // added to each motion's variances [m², m², rad²]
 constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 100;
-constexpr double MOST_REJECTED = 0.1;
+constexpr double MOST_REJECTED = 0.05;
 constexpr int ROUNDS = 5;                         // of classifying and smoothing; it comes to rest in two or three
 
 // A symmetric 2 × 2 covariance of range and bearing.
@@ -82,13 +82,16 @@ double log_likelihood(const Reading& z, const Reading& other, const motion::Incr
   return log_density(e0, e1, {S.rr + rr, S.rb + rb, S.bb + bb});
 }
 
+// That a measurement is good if this share of them are outliers.
+double log_odds(double share) { return elementary::log((1.0 - share) / share); }
+
 }  // namespace
 
 Consensus::Consensus(const Noise& sensor, double max_range, double field_of_view, double share)
     : sensor_(sensor),
       max_range_(max_range),
       field_of_view_(field_of_view),
-      prior_(elementary::log((1.0 - share) / share)) {}
+      prior_(log_odds(share)) {}
 
 // Added to log p(z): gives the log odds that the measurement is good.
 double Consensus::odds() const {
@@ -146,7 +149,7 @@ std::vector<bool> Consensus::agreeing() const {
   const double odds = this->odds();
   for (const auto& [id, landmark] : landmarks_) {
     const auto [best, total] = support_of(landmark, odds);
-    if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = true;
+    if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = accepts_lone_;
     if (!(total > EVIDENCE - prior_)) continue;
     for (std::size_t j = 0; j < landmark.measurements.size(); j++)
       taken[landmark.measurements[j]] = j == best || landmark.logs[best][j] + odds > 0.0;
@@ -217,15 +220,16 @@ Consensus::Smoothed Consensus::started() const {
 }
 
 std::vector<bool> Consensus::confirmed() const {
-  std::vector<bool> taken = confirmed_by_others();
+  const std::vector<bool> taken = confirmed_by_others();
   double compared = 0.0, rejected = 0.0;
   for (const auto& [id, landmark] : landmarks_)
     for (const std::size_t n : landmark.measurements)
       if (landmark.measurements.size() > 1) compared += 1.0, rejected += taken[n] ? 0.0 : 1.0;
-  if (rejected > MOST_REJECTED * compared)
-    for (const auto& [id, landmark] : landmarks_)
-      if (landmark.measurements.size() == 1) taken[landmark.measurements[0]] = false;
-  return taken;
+  if (rejected <= MOST_REJECTED * compared) return taken;
+  Consensus with_share = *this;
+  with_share.prior_ = log_odds(std::min(rejected / compared, 0.5));
+  with_share.accepts_lone_ = false;
+  return with_share.confirmed_by_others();
 }
 
 std::vector<bool> Consensus::confirmed_by_others() const {
@@ -340,7 +344,7 @@ std::vector<bool> Consensus::judged(const Smoothed& window, std::span<const doub
   for (std::size_t n = 0; n < logs.size(); n++) {
     const std::size_t l = window.slots[n];
     const bool has_evidence = count[l] >= 2.0 && prior_ + total[l] * (count[l] - 1.0) / count[l] > EVIDENCE;
-    taken[n] = all[l] == 1.0 || (taken[n] && has_evidence);
+    taken[n] = all[l] == 1.0 ? accepts_lone_ : taken[n] && has_evidence;
   }
   return taken;
 }

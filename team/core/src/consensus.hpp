@@ -41,8 +41,9 @@ class Consensus {
   // The smoother estimates poses and landmarks by least squares over the odometry and the accepted
   // measurements; then every measurement is compared with its prediction from the others. Where the
   // normal equations have no solution in floating point or the window has more than MOST_SMOOTHED
-  // scans, nothing more is rejected. Where more than a tenth of the measurements that others could
-  // confirm are rejected, the only measurement of a landmark is rejected too.
+  // scans, nothing more is rejected. Where more than a twentieth of the measurements that others could
+  // confirm are rejected, ε is that share, at most ½, in a second pass, which rejects the only
+  // measurement of a landmark too.
   std::vector<bool> confirmed() const;
 
  private:
@@ -75,6 +76,7 @@ class Consensus {
   Noise sensor_;
   double max_range_, field_of_view_;
   double prior_;           // log odds that a measurement is good
+  bool accepts_lone_ = true;  // whether the only measurement of a landmark is accepted
   double farthest_ = 0.0;  // the largest range so far [m]
   motion::Increment since_;                 // since the last scan
   std::vector<motion::Increment> motions_;  // between the scans, the first one zero

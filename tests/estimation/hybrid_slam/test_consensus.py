@@ -206,9 +206,9 @@ def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:
     ("name", "kind", "least_kept", "most_passed"),
     [
         ("thesis", "measurement", 0.94, 0.14),
-        ("thesis", "identity", 0.94, 0.5),
+        ("thesis", "identity", 0.94, 0.04),
         ("thesis-b", "measurement", 0.97, 0.02),
-        ("thesis-b", "identity", 0.97, 0.2),
+        ("thesis-b", "identity", 0.97, 0.02),
     ],
 )
 def test_of_three_tenths_outliers_few_pass_and_good_measurements_are_kept(

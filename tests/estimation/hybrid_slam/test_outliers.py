@@ -127,12 +127,7 @@ def clean_rmse() -> float:
     return aligned_rmse(world_with("drop"))
 
 
-LONE = pytest.mark.xfail(
-    reason="wrong identities that a window measures once pass it; with three in ten the map is lost"
-)
-
-
-@pytest.mark.parametrize("kind", ["measurement", pytest.param("identity", marks=LONE)])
+@pytest.mark.parametrize("kind", ["measurement", "identity"])
 def test_with_outliers_the_map_is_nearly_that_of_the_good_measurements(
     kind: str, clean_rmse: float
 ) -> None:
