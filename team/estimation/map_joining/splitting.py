@@ -26,16 +26,13 @@ ITERATIONS = 15
 """Most steps after a split."""
 TOLERANCE = 1e-4
 """Largest change [m, rad] of the last step."""
-ROBUST_C = 1.0
-"""Cauchy's scale where the settings have least squares: misfits must not spoil the rest."""
-
 
 def robust(island: Island) -> Island:
     """Solve an island with a robust loss, from its state."""
     settings = island.settings
-    if settings.robust_c is not None:
+    if settings.robust:
         return aged(island, FULL_AGE)
-    solved, *_ = settled(replace(island, settings=replace(settings, robust_c=ROBUST_C)))
+    solved, *_ = settled(replace(island, settings=replace(settings, robust=True)))
     return aged(solved, FULL_AGE)
 
 
