@@ -32,6 +32,7 @@ _FLOATS = (
     "covariance",
     "covariances",
     "sensitivity",
+    "curvature",
     "weights",
     "start",
     "start_covariance",
