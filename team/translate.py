@@ -149,6 +149,9 @@ def submap_message(
         sightings=sightings,
         biases=local.biases,
         sensitivity=from_derivatives(local.sensitivity),
+        curvature=from_derivatives(local.curvature[local.biases.index("clock_offset")])
+        if "clock_offset" in local.biases
+        else b"",
         gated=gated,
         counts=from_ids(local.unnamed.counts),
         seen=np.packbits(local.unnamed.seen, axis=1, bitorder="little").tobytes(),
@@ -168,6 +171,7 @@ def local_map_of(message: m.Submap) -> LocalMap:
         message.biases,
         _sensitivity_of(message),
         _unnamed_of(message),
+        _curvature_of(message),
     )
 
 
@@ -190,6 +194,13 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
     count = len(message.biases) * len(message.mean) // 8
     rows = derivatives(message.sensitivity, count, "sensitivity")
     return rows.reshape(len(message.biases), -1)
+
+
+def _curvature_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
+    if not message.curvature:
+        return NO_COLUMNS
+    row = derivatives(message.curvature, len(message.mean) // 8, "curvature")
+    return np.array([row * (bias == "clock_offset") for bias in message.biases])
 
 
 def association_message(

@@ -138,6 +138,7 @@ class Contribution:
             local.sensitivity,
             np.array([RANGE_POWER[each] for each in local.biases], np.int64),
             is_measured=not is_map(self.stream),
+            curvature=local.curvature,
         )
 
 

@@ -28,7 +28,8 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
     if np.abs(local.mean[angles]).max() > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(local.mean[~angles], bounds.extent_m, "of its start")
-    if why is None and np.abs(local.sensitivity).max(initial=0.0) > bounds.sensitivity:
+    rows = (local.sensitivity, local.curvature)
+    if why is None and max(np.abs(each).max(initial=0.0) for each in rows) > bounds.sensitivity:
         why = f"a sensitivity beyond {bounds.sensitivity:g}"
     return why or _spread(local.covariance, angles, bounds)
 

@@ -88,8 +88,9 @@ class LocalMap:
     end pose and of K further poses of the robot, then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
     covariance: symmetric positive definite, [m², m·rad, rad²]. node_stamps: team time of the K pose
     nodes [ns], strictly ascending. biases, sensitivity: errors b that the robot's submaps share,
-    ascending, and a row ∂mean/∂b of each: given b the mean is mean + bᵀ sensitivity. unnamed: of
-    the unnamed landmarks, those from number 2³¹ on. The start pose is exactly zero with zero
+    ascending, and a row S = ∂mean/∂b of each. curvature: rows D = ∂²mean/∂b², zero but for the
+    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the unnamed landmarks, those from
+    number 2³¹ on. The start pose is exactly zero with zero
     uncertainty: the submap contains no information from outside the window.
     """
 
@@ -100,6 +101,12 @@ class LocalMap:
     biases: tuple[Bias, ...] = ()
     sensitivity: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
     unnamed: Unnamed = NONE_UNNAMED
+    curvature: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
+
+    def __post_init__(self) -> None:
+        """Make the curvature's zeros."""
+        if self.curvature.shape != self.sensitivity.shape:
+            object.__setattr__(self, "curvature", np.zeros_like(self.sensitivity))
 
     @property
     def end_pose(self) -> Float[np.ndarray, "3"]:
@@ -150,6 +157,7 @@ class LocalMap:
             mean=self.mean[:size],
             covariance=self.covariance[:size, :size],
             sensitivity=self.sensitivity[:, :size] if self.biases else NO_COLUMNS,
+            curvature=self.curvature[:, :size] if self.biases else NO_COLUMNS,
             unnamed=NONE_UNNAMED,
         )
 
@@ -178,5 +186,6 @@ class LocalMap:
             self.covariance[np.ix_(numbers, numbers)],
             biases=self.biases,
             sensitivity=self.sensitivity[:, numbers] if self.biases else NO_COLUMNS,
+            curvature=self.curvature[:, numbers] if self.biases else NO_COLUMNS,
             unnamed=self.unnamed,
         )

@@ -33,6 +33,7 @@ _FLOATS = (
     "covariances",
     "classes",
     "sensitivity",
+    "curvature",
     "weights",
     "start",
     "start_covariance",

@@ -1,4 +1,5 @@
 // Bindings of the submap graph and its estimate.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/vector.h>
 
@@ -34,24 +35,29 @@ graph::Values state_of(const Graph& graph, const Numbers& state) {
 
 MadeNumbers made_copy(const std::vector<double>& numbers) { return made_numbers(std::vector<double>(numbers)); }
 
-void set_errors(Submap& submap, const Table& sensitivity, const IndexArray& range_power) {
+using Rows = std::optional<Table>;
+
+void set_errors(Submap& submap, const Table& sensitivity, const IndexArray& range_power, const Rows& curvature) {
   check(sensitivity.shape(0) == range_power.size() && (range_power.size() == 0 || sensitivity.shape(1) == submap.size()),
         "a sensitivity has a row of the mean's size for each bias");
   for (std::size_t b = 0; b < range_power.size(); b++)
     check(range_power(b) >= graph::NO_POWER && range_power(b) <= 1, "the power of a range is 0, 1 or -1 for none");
   submap.sensitivity = dense::Matrix(matrix_of(sensitivity));
   submap.range_power = listed(range_power);
+  check(!curvature || (curvature->shape(0) == range_power.size() && curvature->shape(1) == sensitivity.shape(1)),
+        "a curvature has the shape of the sensitivity");
+  submap.curvature = curvature ? dense::Matrix(matrix_of(*curvature)) : dense::Matrix();
 }
 
 Submap made_submap(const Numbers& mean, const Table& information, const Table& landmarks, const Table& sensitivity,
-                   const IndexArray& range_power) {
+                   const IndexArray& range_power, const Rows& curvature) {
   const std::size_t n = mean.size(), L = landmarks.shape(0);
   check(landmarks.shape(1) == 3, "a landmark's covariance is (xx, xy, yy)");
   check(n >= 3 + 2 * L && (n - 2 * L) % 3 == 0, "a submap has poses of three numbers, then landmarks of two");
   check(information.shape(0) == n && information.shape(1) == n, "the information matrix must have the mean's size");
-  Submap submap{listed(mean), dense::Matrix(matrix_of(information)), {}, {}, {}};
+  Submap submap{listed(mean), dense::Matrix(matrix_of(information)), {}, {}, {}, {}};
   for (std::size_t l = 0; l < L; l++) submap.landmarks.push_back({landmarks(l, 0), landmarks(l, 1), landmarks(l, 2)});
-  set_errors(submap, sensitivity, range_power);
+  set_errors(submap, sensitivity, range_power, curvature);
   return submap;
 }
 
@@ -108,23 +114,23 @@ void bind_graph(nb::module_& m) {
                      "A submap as a factor between its start pose, its other poses, its landmarks and its biases.\n\n"
                      "mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).\n"
                      "sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with\n"
-                     "which the bias moves it, 0 or 1; -1 for none. is_measured: False for a saved map, whose errors belong\n"
-                     "to no range. A state is additive; `at` has the index in it of the first number of each member.")
+                     "which the bias moves it, 0 or 1; -1 for none. curvature: ∂²mean/∂b², a row per bias.\n"
+                     "is_measured: False for a saved map, whose errors belong to no range. A state is additive; `at` has the index in it of the first number of each member.")
       .def("__init__",
            [](Submap* self, const Numbers& mean, const Table& information, const Table& landmarks, const Table& sensitivity,
-              const IndexArray& range_power, bool is_measured) {
-             new (self) Submap(made_submap(mean, information, landmarks, sensitivity, range_power));
+              const IndexArray& range_power, bool is_measured, const Rows& curvature) {
+             new (self) Submap(made_submap(mean, information, landmarks, sensitivity, range_power, curvature));
              self->is_measured = is_measured;
            },
            "mean"_a, "information"_a, "landmarks"_a, "sensitivity"_a, nb::arg("range_power").noconvert(),
-           "is_measured"_a = true)
+           "is_measured"_a = true, "curvature"_a = nb::none())
       .def("with_errors",
-           [](const Submap& self, const Table& sensitivity, const IndexArray& range_power) {
+           [](const Submap& self, const Table& sensitivity, const IndexArray& range_power, const Rows& curvature) {
              Submap made = self;
-             set_errors(made, sensitivity, range_power);
+             set_errors(made, sensitivity, range_power, curvature);
              return made;
            },
-           "sensitivity"_a, nb::arg("range_power").noconvert(), "Make the same submap with other biases.")
+           "sensitivity"_a, nb::arg("range_power").noconvert(), "curvature"_a = nb::none(), "Make the same submap with other biases.")
       .def("normal",
            [](const Submap& self, const Numbers& state, const IndexArray& at) {
              graph::Normal normal = self.normal({state.data(), state.size()}, members_of(self, state, at));

@@ -334,12 +334,12 @@ void bind_window(nb::module_& m) {
             const std::size_t nodes = with_nodes ? self.nodes().size() : 0;
             check(mean.size() == 3 + 3 * nodes + 2 * self.particles().landmarks(), "mean must be of this window");
             window::Sensitivity found = window::sensitivity_of(self, finite(mean, "mean"), with_nodes);
-            return std::tuple(made_matrix(std::move(found.rows)), int(found.fault));
+            return std::tuple(made_matrix(std::move(found.rows)), made_matrix(std::move(found.curvature)), int(found.fault));
           },
           "mean"_a, "with_nodes"_a,
           "Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.\n\n"
           "Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother\n"
-          "about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.")
+          "about the particles' mean path; rows of second derivatives, that of clock_offset with nodes, else zero; and the index in `gaussian.FAULTS` of why there are none.")
       .def_prop_ro(
           "has_shifts",
           [](const Window& self) {

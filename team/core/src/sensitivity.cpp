@@ -16,6 +16,10 @@ constexpr double TWIST_S = 0.25;
 // Added to each motion's variances [m², m², rad²].
 constexpr double JITTER[3] = {1e-7, 1e-7, 1e-9};
 
+// The clock offset [s], to each side, by which the answer to it is displaced to see how it changes: a
+// large one, as it is where it matters.
+constexpr double LATE_S = 0.2;
+
 using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
 
 // Range or bearing of a measurement: ∂h by the pose's error and by the landmark, its variance, and its
@@ -30,6 +34,18 @@ struct Line {
 struct Sight {
   std::size_t keyframe, landmark;
   Line range, bearing;
+};
+
+// The path and the landmarks of a window, of the sensor.
+struct Solution {
+  std::vector<Pose<double>> path;
+  std::vector<Point<double>> landmarks;
+};
+
+// How a solution answers each bias, a column each: errors ξ of the poses, shifts of the landmarks.
+struct Answer {
+  dense::Matrix path, landmarks;
+  Fault fault = Fault::NONE;
 };
 
 // The twist (forward, left, turn per second) of each pose but the end: of the motion from TWIST_S before
@@ -49,8 +65,11 @@ std::vector<se2::Motion> twists_of(const std::vector<Pose<double>>& path, std::s
   return found;
 }
 
-Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& pose, const Point<double>& at,
-               const Noise& noise, const se2::Motion& twist) {
+// delay: by so much the measurement was made before its stamp, at pose ∘ Exp(−delay · twist).
+Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& stamped, const Point<double>& at,
+               const Noise& noise, const se2::Motion& twist, double delay) {
+  const Pose<double> since = se2::exponential({delay * twist.forward, delay * twist.left, delay * twist.turn});
+  const Pose<double> pose = delay == 0.0 ? stamped : se2::compose(stamped, se2::inverse(since));
   const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
   const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
   const auto of_landmark = models::landmark_jacobian(d, direction);
@@ -74,8 +93,13 @@ Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<doub
   sight.bearing.shifts[BEARING] = 1.0;
   sight.bearing.shifts[RANGE_OFFSET] = -slope;
   sight.bearing.shifts[RANGE_SCALE] = -slope * d;
-  for (Line* line : {&sight.range, &sight.bearing})
+  const Matrix3 Ad = se2::adjoint(since);
+  for (Line* line : {&sight.range, &sight.bearing}) {
     line->shifts[CLOCK_OFFSET] = -(line->H[0] * twist.forward + line->H[1] * twist.left + line->H[2] * twist.turn);
+    if (delay == 0.0) continue;
+    const std::array<double, 3> of_pose{line->H[0], line->H[1], line->H[2]};
+    for (std::size_t j = 0; j < 3; j++) line->H[j] = of_pose[0] * Ad[0][j] + of_pose[1] * Ad[1][j] + of_pose[2] * Ad[2][j];
+  }
   return sight;
 }
 
@@ -150,6 +174,12 @@ GivenPath landmark_given(dense::Const xi, std::span<const Sight> sights, std::si
   return sums;
 }
 
+std::vector<std::uint32_t> sorted_ids(const Window& window) {
+  std::vector<std::uint32_t> ids = window.particles().ids;
+  std::sort(ids.begin(), ids.end());
+  return ids;
+}
+
 // The poses at the keyframes, and at the window's end where the robot moved after the last of them.
 std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window) {
   std::vector<Pose<double>> path = window.mean_path();
@@ -157,62 +187,104 @@ std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window)
   return path;
 }
 
+// The solution's answer where measurements were made `delay` before their stamps.
+Answer answer_of(const Window& window, const Solution& at, double delay) {
+  const Noise& noise = window.settings().noise;
+  const std::vector<std::uint32_t> ids = sorted_ids(window);
+  const std::size_t chain = 3 * at.path.size(), L = ids.size();
+  dense::Matrix A(chain + 2 * L, chain + 2 * L), B(chain + 2 * L, BIASES);
+  const std::vector<se2::Motion> twists = twists_of(at.path, window.motions());
+  std::vector<Sight> sights;
+  for (const WindowMeasurement& z : window.measurements()) {
+    const std::size_t landmark = std::size_t(std::lower_bound(ids.begin(), ids.end(), z.id) - ids.begin());
+    sights.push_back(
+        sight_of(z, landmark, at.path[z.keyframe], at.landmarks[landmark], noise, twists[z.keyframe], delay));
+  }
+  for (std::size_t k = 0; k < at.path.size(); k++) {
+    const WindowMotion& motion = window.motions()[k];
+    const std::optional<Matrix3> metric = metric_of(motion.covariance, JITTER);
+    if (!metric) return {{}, {}, Fault::NOT_POSITIVE};
+    add_motion(A.view(), B.view(), FORWARD_SCALE, k, k ? at.path[k - 1] : Pose<double>{}, at.path[k], *metric, motion.shift);
+  }
+  for (const Sight& z : sights) add_sight(A.view(), B.view(), z, chain);
+  if (const Fault fault = solve_arrow(A, B.view(), at.path.size()); fault != Fault::NONE) return {{}, {}, fault};
+  dense::Matrix landmarks(2 * L, BIASES);
+  for (std::size_t landmark = 0; landmark < L; landmark++) {
+    const GivenPath sums = landmark_given(B, sights, landmark, noise);
+    for (std::size_t b = 0; b < BIASES; b++) {
+      const auto [x, y] = sums.solved(b);
+      landmarks[2 * landmark][b] = x;
+      landmarks[2 * landmark + 1][b] = y;
+    }
+  }
+  return {std::move(B), std::move(landmarks)};
+}
+
+// The solution where a bias is `by` more.
+Solution displaced(const Solution& at, const Answer& answer, Bias bias, double by) {
+  Solution moved = at;
+  for (std::size_t k = 0; k < at.path.size(); k++) {
+    const auto xi = [&](std::size_t i) { return by * answer.path[3 * k + i][bias]; };
+    moved.path[k] = se2::compose(at.path[k], se2::exponential({xi(0), xi(1), xi(2)}));
+  }
+  for (std::size_t l = 0; l < at.landmarks.size(); l++) {
+    moved.landmarks[l].x += by * answer.landmarks[2 * l][bias];
+    moved.landmarks[l].y += by * answer.landmarks[2 * l + 1][bias];
+  }
+  return moved;
+}
+
+// An answer as a row over (end pose, pose nodes, landmarks), in the base's frame.
+void set_row(double* row, const Solution& at, const Answer& answer, Bias bias, std::span<const std::size_t> nodes,
+             const se2::Mount& mount) {
+  const auto set_pose = [&](double* to, std::size_t k) {
+    const auto [s, c] = elementary::sin_cos(at.path[k].heading);
+    const double x = answer.path[3 * k][bias], y = answer.path[3 * k + 1][bias];
+    const Pose<double> shift{c * x - s * y, s * x + c * y, answer.path[3 * k + 2][bias]};
+    const auto [dx, dy, turn] = mount.is_mounted() ? mount.base_shift(shift, at.path[k]) : shift;
+    to[0] = dx;
+    to[1] = dy;
+    to[2] = turn;
+  };
+  if (!at.path.empty()) set_pose(row, at.path.size() - 1);
+  for (std::size_t k = 0; k < nodes.size(); k++) set_pose(row + 3 + 3 * k, nodes[k]);
+  for (std::size_t l = 0; l < at.landmarks.size(); l++) {
+    const Point<double> shift{answer.landmarks[2 * l][bias], answer.landmarks[2 * l + 1][bias]};
+    const auto [x, y] = mount.is_mounted() ? mount.base_vector(shift) : shift;
+    row[3 + 3 * nodes.size() + 2 * l] = x + 0.0;  // a zero is positive
+    row[3 + 3 * nodes.size() + 2 * l + 1] = y + 0.0;
+  }
+}
+
 }  // namespace
 
 Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes) {
   window.check_of_sensor();
-  const Noise& noise = window.settings().noise;
   const se2::Mount& mount = window.settings().mount;
   const se2::Mount away = mount.inverse();
   const std::span<const std::size_t> nodes = with_nodes ? window.nodes() : std::span<const std::size_t>();
-  std::vector<std::uint32_t> ids = window.particles().ids;
-  std::sort(ids.begin(), ids.end());
-  const std::size_t first = 3 + 3 * nodes.size(), L = ids.size();
+  const std::size_t first = 3 + 3 * nodes.size();
   const Pose<double> end{mean[0], mean[1], mean[2]};
-  const std::vector<Pose<double>> path = path_to(mount.is_mounted() ? away.base_pose(end) : end, window);
-
-  const std::size_t chain = 3 * path.size();
-  dense::Matrix A(chain + 2 * L, chain + 2 * L), B(chain + 2 * L, BIASES);
-  const std::vector<se2::Motion> twists = twists_of(path, window.motions());
-  std::vector<Sight> sights;
-  for (const WindowMeasurement& z : window.measurements()) {
-    const std::size_t landmark = std::size_t(std::lower_bound(ids.begin(), ids.end(), z.id) - ids.begin());
-    const Point<double> at{mean[first + 2 * landmark], mean[first + 2 * landmark + 1]};
-    sights.push_back(sight_of(z, landmark, path[z.keyframe], mount.is_mounted() ? away.base_point(at) : at, noise,
-                              twists[z.keyframe]));
+  Solution at{path_to(mount.is_mounted() ? away.base_pose(end) : end, window), {}};
+  for (std::size_t i = first; i < mean.size(); i += 2) {
+    const Point<double> landmark{mean[i], mean[i + 1]};
+    at.landmarks.push_back(mount.is_mounted() ? away.base_point(landmark) : landmark);
   }
-  for (std::size_t k = 0; k < path.size(); k++) {
-    const WindowMotion& motion = window.motions()[k];
-    const std::optional<Matrix3> metric = metric_of(motion.covariance, JITTER);
-    if (!metric) return {{}, Fault::NOT_POSITIVE};
-    add_motion(A.view(), B.view(), FORWARD_SCALE, k, k ? path[k - 1] : Pose<double>{}, path[k], *metric, motion.shift);
+  const Answer answer = answer_of(window, at, 0.0);
+  if (answer.fault != Fault::NONE) return {{}, {}, answer.fault};
+  Sensitivity found{dense::Matrix(BIASES, mean.size()), dense::Matrix(BIASES, mean.size())};
+  for (std::size_t b = 0; b < BIASES; b++) set_row(found.rows[b], at, answer, Bias(b), nodes, mount);
+  if (!with_nodes) return found;
+  dense::Matrix rows(2, mean.size());  // later, earlier
+  for (std::size_t side = 0; side < 2; side++) {
+    const double by = side ? -LATE_S : LATE_S;
+    const Solution there = displaced(at, answer, CLOCK_OFFSET, by);
+    const Answer changed = answer_of(window, there, by);
+    if (changed.fault != Fault::NONE) return {{}, {}, changed.fault};
+    set_row(rows[side], there, changed, CLOCK_OFFSET, nodes, mount);
   }
-  for (const Sight& z : sights) add_sight(A.view(), B.view(), z, chain);
-  if (const Fault fault = solve_arrow(A, B.view(), path.size()); fault != Fault::NONE) return {{}, fault};
-
-  Sensitivity found{dense::Matrix(BIASES, first + 2 * L)};
-  const auto set_pose = [&](std::size_t at, std::size_t k) {
-    const auto [s, c] = elementary::sin_cos(path[k].heading);
-    for (std::size_t b = 0; b < BIASES; b++) {
-      const double x = B[3 * k][b], y = B[3 * k + 1][b];
-      const Pose<double> shift{c * x - s * y, s * x + c * y, B[3 * k + 2][b]};
-      const auto [dx, dy, turn] = mount.is_mounted() ? mount.base_shift(shift, path[k]) : shift;
-      double* row = found.rows[b] + at;
-      row[0] = dx;
-      row[1] = dy;
-      row[2] = turn;
-    }
-  };
-  if (!path.empty()) set_pose(0, path.size() - 1);
-  for (std::size_t k = 0; k < nodes.size(); k++) set_pose(3 + 3 * k, nodes[k]);
-  for (std::size_t landmark = 0; landmark < L; landmark++) {
-    const GivenPath sums = landmark_given(B, sights, landmark, noise);
-    for (std::size_t b = 0; b < BIASES; b++) {
-      const auto [x, y] = mount.is_mounted() ? mount.base_vector(sums.solved(b)) : sums.solved(b);
-      found.rows[b][first + 2 * landmark] = x + 0.0;  // a zero is positive
-      found.rows[b][first + 2 * landmark + 1] = y + 0.0;
-    }
-  }
+  for (std::size_t i = 0; i < mean.size(); i++)
+    found.curvature[CLOCK_OFFSET][i] = (rows[0][i] - rows[1][i]) / (2.0 * LATE_S);
   return found;
 }
 

@@ -5,7 +5,8 @@
 // particles has no derivative in closed form; S is that of the window's smoother, linearised about the
 // particles' mean path: with J, W over the motions and the measurements and g the derivative of their
 // residuals, S = −(JᵀWJ)⁻¹ Jᵀ W g. As in the window itself the path takes the measurements as
-// independent, and the landmarks are solved for given the path.
+// independent, and the landmarks are solved for given the path. The clock's derivative changes with b: D is
+// its difference between the solutions S b later and earlier.
 #pragma once
 
 #include "window.hpp"
@@ -17,9 +18,11 @@ namespace teamslam::window {
 // a range reads b too much, or (1 + b) times itself.
 enum Bias : std::size_t { BEARING, CLOCK_OFFSET, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE, BIASES };
 
-// A row for each Bias over (end pose, pose nodes, landmarks by ascending id), in the base's frame.
+// A row for each Bias over (end pose, pose nodes, landmarks by ascending id), in the base's frame: the
+// first derivative, and the second of the clock's offset alone, of a window that is closed. The others
+// are as good as linear where robots are calibrated.
 struct Sensitivity {
-  dense::Matrix rows;
+  dense::Matrix rows, curvature;
   gaussian::Fault fault = gaussian::Fault::NONE;  // of the smoother; there are no rows then
 };
 

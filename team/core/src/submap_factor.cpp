@@ -62,10 +62,19 @@ void discount(dense::Matrix& A, std::size_t at, const se2::Spread<double>& P, do
 Numbers Submap::shifted_mean(Values state, Indices at) const {
   Numbers shifted = mean;
   for (std::size_t b = 0; b < biases(); b++) {
-    const double value = state[at[1 + points() + b]];
+    const double value = bias(state, at, b);
     for (std::size_t i = 0; i < size(); i++) shifted[i] += value * sensitivity[b][i];
+    if (!curvature.rows()) continue;
+    for (std::size_t i = 0; i < size(); i++) shifted[i] += 0.5 * value * value * curvature[b][i];
   }
   return shifted;
+}
+
+dense::Matrix Submap::sensitivity_at(Values state, Indices at) const {
+  dense::Matrix rows = sensitivity;
+  for (std::size_t b = 0; b < curvature.rows(); b++)
+    for (std::size_t i = 0; i < size(); i++) rows[b][i] += bias(state, at, b) * curvature[b][i];
+  return rows;
 }
 
 Residual Submap::residual_of(const Numbers& shifted, Values state, Indices at) const {
@@ -130,7 +139,7 @@ Normal Submap::normal(Values state, Indices at) const {
   dense::Matrix& H = found.hessian;
   const std::size_t n = size(), first = n + 3;
   const auto [s, c] = elementary::sin_cos(state[at[0] + 2]);
-  dense::Matrix turned = sensitivity;
+  dense::Matrix turned = sensitivity_at(state, at);
   for (std::size_t b = 0; b < biases(); b++) {
     double* row = turned[b];
     each_point(*this, [&, s = s, c = c](std::size_t i) { turn(row[i], row[i + 1], c, s); });
@@ -211,7 +220,8 @@ Submap Submap::at_joined_ranges(Values state, Indices at) const {
       turn_and_stretch(moved.information[k][row], moved.information[k][row + 1], c, s, 1.0 / q);
     for (std::size_t b = 0; b < biases(); b++)
       if (range_power[b] != NO_POWER)
-        turn_and_stretch(moved.sensitivity[b][row], moved.sensitivity[b][row + 1], c, s, range_power[b] ? q : 1.0);
+        for (dense::Matrix* each : {&moved.sensitivity, &moved.curvature})
+          if (each->rows()) turn_and_stretch((*each)[b][row], (*each)[b][row + 1], c, s, range_power[b] ? q : 1.0);
   }
   return moved;
 }

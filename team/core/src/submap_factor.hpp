@@ -12,8 +12,9 @@
 //
 // for s, and its metric is M = T P⁻¹ Tᵀ. The state is additive in (x, y, θ).
 //
-// A submap with sensitivities S (a row per bias) has the mean mean + Sᵀ b; the Jacobian of r' for a
-// bias is −T S_b. Its biases, one number each, follow the other members.
+// A submap with sensitivities S and curvatures D (a row per bias) has the mean
+// mean + Σ_b (S_b b + ½ D_b b²); the Jacobian of r' for a bias is −T (S_b + D_b b). Its biases, one number
+// each, follow the other members.
 #pragma once
 
 #include <cstdint>
@@ -59,6 +60,7 @@ struct Submap {
   std::vector<se2::Spread<double>> landmarks;  // each one's own covariance
   dense::Matrix sensitivity;                   // a row per bias
   std::vector<Index> range_power;              // of each row, the power of a landmark's range, 0, 1 or NO_POWER
+  dense::Matrix curvature;                     // a row per bias; no rows where all are zero
   bool is_measured = true;                     // false: a saved map, whose errors belong to no range
 
   std::size_t size() const { return mean.size(); }
@@ -95,7 +97,10 @@ struct Submap {
   Submap discounted(Values weights) const;
 
  private:
+  double bias(Values state, Indices at, std::size_t b) const { return state[at[1 + points() + b]]; }
   Numbers shifted_mean(Values state, Indices at) const;
+  // S + D b, with which the mean answers each bias at a state.
+  dense::Matrix sensitivity_at(Values state, Indices at) const;
   Residual residual_of(const Numbers& shifted, Values state, Indices at) const;
   Normal unbiased_normal(const Numbers& shifted, Values state, Indices at) const;
 };

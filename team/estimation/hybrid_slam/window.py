@@ -169,8 +169,9 @@ def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     stamps = window.node_stamps[: len(nodes)]
     if not window.front_end.biases:
         return LocalMap(ids, mean, covariance, stamps)
-    biases, sensitivity = _sensitivity(window, mean, running)
-    return LocalMap(ids, mean, covariance, stamps, biases, sensitivity)
+    biases, *answers = _sensitivity(window, mean, running)
+    sensitivity, curvature = answers
+    return LocalMap(ids, mean, covariance, stamps, biases, sensitivity, curvature=curvature)
 
 
 def of_base(window: Window) -> Window:
@@ -189,15 +190,17 @@ def motion_alone(motion: Increment) -> LocalMap:
 
 def _sensitivity(
     window: Window, mean: Float[np.ndarray, " n"], running: bool
-) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"]]:
-    """The biases, and the derivatives of the window's mean by them, as precise as in a message.
+) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"], Float[np.ndarray, "b n"]]:
+    """The biases, and the first and second derivatives of the window's mean by them, as precise as
+    in a message.
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
     uncalibrated = window.core.has_shifts
     biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
-    rows, fault = window.core.sensitivity(mean, not running)
+    *answers, fault = window.core.sensitivity(mean, not running)
     if fault:
         raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    chosen = rows[[BIASES.index(bias) for bias in biases]]
-    return biases, chosen.astype(np.float32).astype(np.float64)
+    chosen = [BIASES.index(bias) for bias in biases]
+    rows, curvature = (each[chosen].astype(np.float32).astype(np.float64) for each in answers)
+    return biases, rows, curvature

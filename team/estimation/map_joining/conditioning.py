@@ -69,7 +69,8 @@ class SubmapCorrection(NamedTuple):
     biases: tuple[tuple[Bias, float, float], ...] = ()
 
     def taken(self, local: LocalMap) -> LocalMap:
-        """Correct a submap: N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S) with the submap's sensitivity S.
+        """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D, with the
+        submap's sensitivity S and curvature D.
 
         The remaining uncertainty of b is taken as independent of the map; the true correlation
         makes this covariance rather too large than too small. A bias without an estimate is zero.
@@ -77,12 +78,15 @@ class SubmapCorrection(NamedTuple):
         if self.covariance_factor == 1.0 and not local.biases:
             return local
         known = [each for each in self.biases if each[0] in local.biases]
+        errors = np.array([(value, sigma) for _, value, sigma in known]).reshape(-1, 2)
+        rows = [local.biases.index(name) for name, _, _ in known]
+        bent = errors[:, :1] * local.curvature[rows]
         mean, covariance = core.corrected(
-            local.mean,
+            local.mean - 0.5 * (errors[:, :1] * bent).sum(axis=0),
             local.covariance,
             self.covariance_factor,
-            local.sensitivity[[local.biases.index(name) for name, _, _ in known]],
-            np.array([(value, sigma) for _, value, sigma in known]).reshape(-1, 2),
+            local.sensitivity[rows] + bent,
+            errors,
         )
         return LocalMap(local.ids, mean, covariance, local.node_stamps)
 

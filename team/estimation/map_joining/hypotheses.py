@@ -109,8 +109,11 @@ def sights_of(island: Island) -> dict[int, Sights]:
             continue
         mean = local.mean[-2 * count :].copy()
         of_biases = each.nodes[len(each.nodes) - len(each.biases) :]
-        for row, node in zip(each.sensitivity, of_biases.tolist(), strict=True):
-            mean += state[graph.offset[node]] * row[-2 * count :]
+        for row, bent, node in zip(
+            each.sensitivity, each.curvature, of_biases.tolist(), strict=True
+        ):
+            value = state[graph.offset[node]]
+            mean += value * (row + 0.5 * value * bent)[-2 * count :]
         x, y, heading = (float(n) for n in state[graph.offset[start] : graph.offset[start] + 3])
         s, c = core.sin_and_cos(heading)
         dx, dy = c * mean[::2] - s * mean[1::2], s * mean[::2] + c * mean[1::2]

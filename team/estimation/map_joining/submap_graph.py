@@ -92,7 +92,16 @@ class Joined(NamedTuple):
         if self.biases == self.contribution.local.biases:
             return factor
         powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
-        return factor.with_errors(self.sensitivity, np.array(powers, np.int64))
+        return factor.with_errors(self.sensitivity, np.array(powers, np.int64), self.curvature)
+
+    @property
+    def curvature(self) -> Float[np.ndarray, "B _"]:
+        """∂²mean/∂b² of each bias; zero of errors that the team has in common."""
+        local, rows = self.contribution.local, np.zeros_like(self.sensitivity)
+        for at, error in enumerate(self.biases):
+            if error in local.biases and self.biases.count(error) == 1:
+                rows[at] = local.curvature[local.biases.index(error)]
+        return rows
 
     @property
     def landmarks(self) -> Indices:

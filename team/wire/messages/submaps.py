@@ -29,7 +29,8 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     number of its SightingFactor messages. biases: errors that the robot's submaps share, B of them,
     ascending; sensitivity: B × n float32 (float64 in older logs), the mean's derivative by each:
     given the error b of the bearings [rad], of the detections' clock [s], of the scale of the
-    ranges or of the speed, the mean is mean + b · sensitivity.
+    ranges or of the speed, the mean is mean + b · sensitivity. curvature: n of them, the second
+    derivative by the clock's error, which adds ½ b² · curvature; empty where there is none.
     gated: number of rejected landmark measurements, which no others of the window confirmed.
 
     ids from 2³¹ on are unnamed landmarks, associated in the window: 2³¹ + a local index. counts:
@@ -53,6 +54,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     sightings: Count = 0
     biases: tuple[Bias, ...] = ()
     sensitivity: bytes = b""
+    curvature: bytes = b""
     gated: Count = 0
     counts: Ids = b""
     seen: bytes = b""
@@ -66,6 +68,10 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
         derivatives(self.sensitivity, n * len(self.biases), "sensitivity")
+        if self.curvature:
+            derivatives(self.curvature, n, "curvature")
+            if "clock_offset" not in self.biases:
+                raise ValueError("out of bounds: a curvature without the bias clock_offset")
         if any(a >= b for a, b in pairwise(self.biases)):
             raise ValueError("not ascending: biases")
         if not (times[1:] > times[:-1]).all():
