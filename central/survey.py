@@ -11,9 +11,9 @@ import numpy as np
 
 from teamslam.central.config import SurveyedLandmark
 from teamslam.team.config import SURVEY, UNNAMED
-from teamslam.team.estimation.contribution import InitialPoseFactor, is_survey
+from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.saved_maps import displacements, maps_of
+from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
 from teamslam.team.saved_map import member_of
 from teamslam.team.wire.arrays import from_ids
 from teamslam.team.wire.messages import Submap
@@ -47,15 +47,10 @@ def contradicted_landmarks(fold: Fold) -> Iterator[str]:
     """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance."""
     if not fold.contributions:
         return
-    for saved in maps_of(fold.main.graph):
-        if not is_survey(saved.contribution.stream):
-            continue
-        for each in displacements(fold.main, saved):
-            if each.is_apart:
-                dx, dy = each.by
-                yield (
-                    f"the surveyed landmark {each.landmark} is ({dx:+.2f}, {dy:+.2f}) m from its "
-                    f"surveyed place, with a standard deviation of {each.sigma_m:.2g} m (chi² "
-                    f"{each.chi2:.0f}): it is left out of the survey; check its number and place "
-                    "in central.surveyed"
-                )
+    for each in displacements_apart(fold.main, (SURVEY, 0)):
+        yield (
+            f"the surveyed landmark {each.landmark} is ({each.by[0]:+.2f}, {each.by[1]:+.2f}) m "
+            f"from its surveyed place, with a standard deviation of {each.sigma_m:.2g} m (chi² "
+            f"{each.chi2:.0f}): it is left out of the survey; check its number and place in "
+            "central.surveyed"
+        )
