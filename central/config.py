@@ -43,13 +43,13 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A landmark ~ N((x, y), P) in the team's frame [m].
 
-    landmark: its number; absent: it has no identity and is found by the constellation. sigma_m:
-    standard deviation of each coordinate. covariance: xx, xy, yy of P [m²] instead.
+    landmark: its number. sigma_m: standard deviation of each coordinate. covariance: xx, xy, yy of
+    P [m²] instead.
     """
 
+    landmark: Annotated[int, Meta(ge=0, lt=UNNAMED)]
     x: float
     y: float
-    landmark: Annotated[int, Meta(ge=0, lt=UNNAMED)] | None = None
     sigma_m: Positive = 0.02
     covariance: tuple[Positive, float, Positive] | None = None
 
@@ -115,8 +115,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     surveyed: Annotated[tuple[SurveyedLandmark, ...], Meta(max_length=1000)] = ()
 
     def __post_init__(self) -> None:
-        named = [each.landmark for each in self.surveyed if each.landmark is not None]
-        if len(set(named)) < len(named):
+        if len({each.landmark for each in self.surveyed}) < len(self.surveyed):
             raise ValueError("surveyed names each landmark once")
         if self.surveyed and self.fusion != "join":
             raise ValueError("surveyed landmarks need the rule join")

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from teamslam.central.config import SurveyedLandmark
-from teamslam.team.config import SURVEY, UNNAMED
-from teamslam.team.estimation.contribution import InitialPoseFactor
+from teamslam.team.config import SURVEY
+from teamslam.team.estimation.contribution import SURVEYED, InitialPoseFactor, is_map, named
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
 from teamslam.team.saved_map import member_of
@@ -24,9 +24,7 @@ DIGEST = bytes(8)
 
 def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPoseFactor]:
     """Make the submap of surveyed landmarks about their centroid, and its exact start there."""
-    order = sorted(surveyed, key=lambda each: (each.landmark is None, each.landmark or 0))
-    numbers = [each.landmark for each in order if each.landmark is not None]
-    unnamed = len(order) - len(numbers)
+    order = sorted(surveyed, key=lambda each: each.landmark)
     points = np.array([[each.x, each.y] for each in order])
     origin = points.mean(axis=0)
     covariance = np.zeros((2 * len(order), 2 * len(order)))
@@ -34,20 +32,28 @@ def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPose
         covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = each.matrix
     submap = member_of(
         SURVEY,
-        from_ids([*numbers, *range(UNNAMED, UNNAMED + unnamed)]),
+        from_ids([each.landmark for each in order]),
         (points - origin).ravel(),
         covariance,
         from_ids([1] * len(order)),
         config=DIGEST,
     )
-    return submap, InitialPoseFactor(SURVEY, 0, np.array([*origin, 0.0]))
+    return submap, InitialPoseFactor(*SURVEYED, np.array([*origin, 0.0]))
 
 
-def contradicted_landmarks(fold: Fold) -> Iterator[str]:
-    """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance."""
+def survey_warnings(fold: Fold) -> Iterator[str]:
+    """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance, and saved
+    maps that contain a survey already.
+    """
     if not fold.contributions:
         return
-    for each in displacements_apart(fold.main, (SURVEY, 0)):
+    for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):
+        if stream != SURVEYED:
+            yield (
+                f"{named(stream)} contains a survey, which central.surveyed counts a second time: "
+                "leave that out"
+            )
+    for each in displacements_apart(fold.main, SURVEYED):
         yield (
             f"the surveyed landmark {each.landmark} is ({each.by[0]:+.2f}, {each.by[1]:+.2f}) m "
             f"from its surveyed place, with a standard deviation of {each.sigma_m:.2g} m (chi² "

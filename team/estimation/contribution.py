@@ -37,9 +37,13 @@ def is_map(stream: Stream) -> bool:
     return stream[0].startswith(MAP)
 
 
+SURVEYED: Stream = (SURVEY, 0)
+"""The stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
+
+
 def is_survey(stream: Stream) -> bool:
-    """Whether a stream has the surveyed landmarks, a saved map whose frame is absolute."""
-    return stream[0] == SURVEY
+    """Whether a stream has the surveyed landmarks."""
+    return stream == SURVEYED
 
 
 PART = 1 << 64

@@ -10,10 +10,12 @@ from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.verification.centre import recomputed_centre
 from teamslam.central.desk.verification.recorded import Recorded, identity
+from teamslam.central.node import CentralNode, make_centre
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.estimation.gaussian import unpacked
+from teamslam.team.saved_map import SavedMapError, map_name
 from teamslam.team.translate import SURVEY_FRAME
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -32,19 +34,37 @@ def world_of(seed: int, unknown: tuple[str, ...], steps: int):
     return scenario, streams_of(scenario)
 
 
-def day(seed, numbers, *, unknown=("*",), wrong=None, steps=500, origin=(0.0, 0.0), unnamed=False):
-    """Run a team with surveyed landmarks; wrong: displacements [m] by number."""
-    scenario, streams = world_of(seed, unknown, steps)
+def surveyed_landmarks(seed, streams, numbers, wrong=None, origin=(0.0, 0.0)):
+    """Survey landmarks with an error of SIGMA_M; wrong: displacements [m] by number."""
     noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (len(numbers), 2))
-    places = {k: streams.landmarks[list(streams.landmark_ids).index(k)] for k in numbers}
-    surveyed = []
-    for number, off in zip(numbers, noise.tolist(), strict=True):
-        x, y = places[number] + off + (wrong or {}).get(number, (0.0, 0.0)) + origin
-        identity_ = None if unnamed else number
-        surveyed.append(SurveyedLandmark(float(x), float(y), identity_, sigma_m=SIGMA_M))
-    central = msgspec.structs.replace(scenario.central, surveyed=tuple(surveyed))
+    at = np.searchsorted(streams.landmark_ids, numbers)
+    found = []
+    for number, place in zip(
+        numbers, (streams.landmarks[at] + noise + origin).tolist(), strict=True
+    ):
+        x, y = np.add(place, (wrong or {}).get(number, (0.0, 0.0))).tolist()
+        found.append(SurveyedLandmark(number, x, y, sigma_m=SIGMA_M))
+    return tuple(found)
+
+
+def team(scenario, streams, surveyed, maps=()):
+    """Run a team; return the samples and the centre."""
+    central = msgspec.structs.replace(scenario.central, surveyed=surveyed)
     scenario = msgspec.structs.replace(scenario, central=central)
-    return list(run_team(scenario, streams)), streams
+    centres = []
+
+    def made(config, names) -> CentralNode:
+        centres.append(make_centre(config, names, maps=maps))
+        return centres[-1]
+
+    return list(run_team(scenario, streams, central=made)), centres[0]
+
+
+def day(seed, numbers, *, unknown=("*",), wrong=None, steps=500, origin=(0.0, 0.0)):
+    """Run a team with surveyed landmarks."""
+    scenario, streams = world_of(seed, unknown, steps)
+    surveyed = surveyed_landmarks(seed, streams, numbers, wrong, origin)
+    return team(scenario, streams, surveyed)[0], streams
 
 
 day_once = cache(lambda *args, **options: day(*args, **options))
@@ -140,3 +160,21 @@ def test_every_map_is_computed_again_from_the_log():
 def test_a_meaningless_survey_is_refused_with_the_reason(surveyed, fusion, words):
     with pytest.raises(msgspec.ValidationError, match=words):
         msgspec.convert({"surveyed": surveyed, "fusion": fusion}, CentralConfig)
+
+
+def test_the_saved_map_of_a_surveyed_day_keeps_its_frame_on_later_days():
+    maps = []
+    for seed in (1, 2, 3):
+        scenario, streams = world_of(seed, ("*",), 300)
+        surveyed = surveyed_landmarks(seed, streams, (3, 9, 15)) if seed == 1 else ()
+        samples, centre = team(scenario, streams, surveyed, maps)
+        maps = [centre.maps.fold.save_map(f"day{seed}")]
+        fused = final_map(samples)
+        assert fused.frame == maps[0].frame == SURVEY_FRAME
+        assert not evaluate(samples).arbitrary_frame
+    assert errors(fused, streams)[0] < 0.3
+    assert not any("second time" in each for each in fused.reasons)
+    samples, _ = team(scenario, streams, surveyed_landmarks(3, streams, (3,)), maps)
+    assert any("second time" in each for each in final_map(samples).reasons)
+    with pytest.raises(SavedMapError, match="surveyed"):
+        map_name("survey")

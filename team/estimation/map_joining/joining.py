@@ -23,6 +23,7 @@ from teamslam.team.estimation.association.landmark_sets import (
     add_landmarks,
 )
 from teamslam.team.estimation.contribution import (
+    SURVEYED,
     Contribution,
     InitialPoseFactor,
     Key,
@@ -229,14 +230,15 @@ class Fold:
     def frame(self) -> Stream | None:
         """The stream whose start fixes the main island's frame; None before any submap.
 
-        It is one with a known initial pose, else any one of the island; of several the surveyed
-        landmarks, else a saved map, else the smallest. All known initial poses are given in one
-        frame, that of the survey.
+        It is one with a known initial pose, else any one of the island; of several a saved map,
+        else the smallest. All known initial poses are given in one frame. That of a saved map with
+        a known start is the survey's.
         """
         if self.main_key is None:
             return None
         streams = self.main.graph.streams
-        return _frame_of([stream for stream in streams if stream in self.starts] or streams)
+        frame = _frame_of([stream for stream in streams if stream in self.starts] or streams)
+        return SURVEYED if is_map(frame) and frame in self.starts else frame
 
     def island(self, robot: str, incarnation: int) -> Island:
         """Return the island of a stream. Raises KeyError for a stream without submaps."""
