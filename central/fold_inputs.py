@@ -37,7 +37,9 @@ class FoldInputs:
         self.robots: set[str] = set()
         self.tick_ns = round(config.tick_s * 1e9)
         self._bounds = config.bounds
-        self._bounds_of_map = msgspec.structs.replace(config.bounds, submap_landmarks=MOST_SAVED)
+        self._bounds_of_map = msgspec.structs.replace(
+            config.bounds, submap_landmarks=MOST_SAVED, extent_m=config.bounds.coordinate_m
+        )
         self._members = Members(self.tick_ns, config.least_sigma, config.covariance_factor)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
