@@ -6,7 +6,7 @@ import msgspec
 from msgspec import Meta
 
 from teamslam.team.association import AssociationProfile
-from teamslam.team.config import Bounds, FusionRule, NonNegative, Positive
+from teamslam.team.config import UNNAMED, Bounds, FusionRule, NonNegative, Positive
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,6 +40,32 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     marker: NonNegative = 0.0
 
 
+class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A landmark ~ N((x, y), P) in the team's frame [m].
+
+    landmark: its number. sigma_m: standard deviation of each coordinate. covariance: xx, xy, yy of
+    P [m²] instead.
+    """
+
+    landmark: Annotated[int, Meta(ge=0, lt=UNNAMED)]
+    x: float
+    y: float
+    sigma_m: Positive = 0.02
+    covariance: tuple[Positive, float, Positive] | None = None
+
+    def __post_init__(self) -> None:
+        xx, xy, yy = self.covariance or (1.0, 0.0, 1.0)
+        if not xx * yy > xy * xy:
+            raise ValueError("the covariance xx, xy, yy must be positive definite")
+
+    @property
+    def matrix(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The covariance P [m²]."""
+        variance = self.sigma_m * self.sigma_m
+        xx, xy, yy = self.covariance or (variance, 0.0, variance)
+        return (xx, xy), (xy, yy)
+
+
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fusion rule and its parameters.
 
@@ -65,7 +91,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of one
     submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
-    thresholds for merging landmarks without identities, by kind of sensor.
+    thresholds for merging landmarks without identities, by kind of sensor. surveyed: landmarks at
+    known places, which fix the team's frame.
     """
 
     fusion: FusionRule = "join"
@@ -85,3 +112,10 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bounds: Bounds = Bounds()
     association: AssociationProfile = AssociationProfile()
     landmark_sigma: NonNegative = 0.0
+    surveyed: Annotated[tuple[SurveyedLandmark, ...], Meta(max_length=1000)] = ()
+
+    def __post_init__(self) -> None:
+        if len({each.landmark for each in self.surveyed}) < len(self.surveyed):
+            raise ValueError("surveyed names each landmark once")
+        if self.surveyed and self.fusion != "join":
+            raise ValueError("surveyed landmarks need the rule join")

@@ -11,6 +11,7 @@ import msgspec
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.members import Members
+from teamslam.central.survey import survey_of
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
     Contribution,
@@ -21,6 +22,7 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from teamslam.team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
 from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap
 
@@ -35,11 +37,17 @@ class FoldInputs:
         self.robots: set[str] = set()
         self.tick_ns = round(config.tick_s * 1e9)
         self._bounds = config.bounds
-        self._bounds_of_map = msgspec.structs.replace(config.bounds, submap_landmarks=MOST_SAVED)
+        self._bounds_of_map = msgspec.structs.replace(
+            config.bounds, submap_landmarks=MOST_SAVED, extent_m=config.bounds.coordinate_m
+        )
         self._members = Members(self.tick_ns, config.least_sigma, config.covariance_factor)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
+        if config.surveyed:
+            survey, start = survey_of(config.surveyed)
+            self.add_start(start)
+            self._members.add(survey, digest_of(encoded(survey)), ())
 
     def add_start(self, start: InitialPoseFactor) -> None:
         """Add a stream's initial pose, before its first submap."""

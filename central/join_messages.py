@@ -11,6 +11,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.fused import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
 from teamslam.central.sent_priors import in_main_island
+from teamslam.central.survey import survey_warnings
 from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
@@ -180,6 +181,7 @@ def reasons(
         *_apart(fold),
         *_worded(refusals(fold)),
         *(words for words in fold.warnings if not words.startswith(RIVAL)),
+        *survey_warnings(fold),
         *_lost(shown),
         *_repeated(shown),
         *_left_out(fold, shown, landmark_submaps),

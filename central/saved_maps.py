@@ -9,7 +9,7 @@ from teamslam.team import core, translate
 from teamslam.team.config import BIASES, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.contribution import is_map
+from teamslam.team.estimation.contribution import is_map, is_survey
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import Island
@@ -84,7 +84,11 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
 
     One that several maps have counts as the one that changed most.
     """
-    if fold.main_key is None or not maps_of(fold.main.graph):
+    if fold.main_key is None:
+        return ()
+    graph = fold.main.graph
+    earlier = [each for each in maps_of(graph) if not is_survey(each.contribution.stream)]
+    if not earlier:
         return ()
     island, found = fold.main, dict[int, m.LandmarkChange]()
     limit = chi2_limit(2, FALSE_ALARM)
@@ -95,8 +99,8 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
         if not is_map(each.contribution.stream)
         for node in each.landmarks.tolist()
     }
-    old: set[int] = {id_ for _, id_ in island.graph.former}
-    for saved in maps_of(island.graph):
+    old: set[int] = {id_ for stream, id_ in graph.former if not is_survey(stream)}
+    for saved in earlier:
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
         for each in displacements(island, saved):
             before = found.get(each.landmark)

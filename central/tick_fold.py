@@ -44,7 +44,7 @@ from teamslam.central.withdrawal import (
 )
 from teamslam.team.config import BIASES
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Contribution, Stream, whole_of
+from teamslam.team.estimation.contribution import Contribution, Stream, is_survey, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
@@ -488,11 +488,14 @@ class TickFold:
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """Return the version vector: the last sequence of each stream, folded or refused."""
+        """Return the version vector: the last sequence of each stream, folded or refused; without
+        surveyed landmarks, which are part of the configuration.
+        """
         last: dict[Stream, int] = {}
         parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]
         parts += [(key[1:3], key[3]) for key in fold.refused]
         for part, sequence in parts:
             stream = whole_of(part)
-            last[stream] = max(last.get(stream, -1), sequence)
+            if not is_survey(stream):
+                last[stream] = max(last.get(stream, -1), sequence)
         return {stream: last[stream] for stream in sorted(last)}

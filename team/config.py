@@ -26,6 +26,8 @@ local index in a submap, 2³¹ | a number of the first member in the team's map.
 Bias = Literal["bearing", "clock_offset", "forward_scale", "range_offset", "range_scale"]
 MAP = "map-"
 """Before the name of a saved map, where members of the set have that of a robot."""
+SURVEY = MAP + "survey"
+"""The member of the set that has the surveyed landmarks."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
 """The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry

@@ -8,10 +8,12 @@ import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from teamslam.team.config import UNNAMED
+from teamslam.team.config import MAP, SURVEY, UNNAMED
 from teamslam.team.estimation.gaussian import packed, unpacked
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
 from teamslam.team.wire.codec import WireError, decoded, encoded
@@ -53,30 +55,52 @@ def submap_of(saved: m.SavedMap) -> m.Submap:
     Its end pose lies at its start, with a small covariance of its own, which no landmark and no
     other submap depends on. All its unnamed landmarks count as seen at once: no two are one.
     """
-    numbers = ids(saved.ids, "ids")
-    n = 2 * len(numbers)
-    covariance = np.zeros((3 + n, 3 + n))
-    covariance[:3, :3] = LEAF_SIGMA**2 * np.eye(3)
-    covariance[3:, 3:] = unpacked(floats(saved.covariance, "covariance"), n)
+    n = 2 * len(ids(saved.ids, "ids"))
+    submap = member_of(
+        saved.author,
+        saved.ids,
+        floats(saved.means, "means"),
+        unpacked(floats(saved.covariance, "covariance"), n),
+        saved.counts,
+        config=saved.sets[-1],
+    )
     rows = floats(saved.sensitivity, "sensitivity").reshape(len(saved.biases), n)
-    counts = ids(saved.counts, "counts")[numbers >= UNNAMED]
+    if not len(rows):
+        return submap
+    rows = np.hstack([np.zeros((len(rows), 3)), rows])
+    return msgspec.structs.replace(submap, biases=saved.biases, sensitivity=from_floats(rows))
+
+
+def member_of(
+    author: str,
+    numbers: bytes,
+    means: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    counts: bytes,
+    *,
+    config: bytes,
+) -> m.Submap:
+    """Make a submap of landmarks only; numbers, counts: as in `SavedMap.ids` and `counts`."""
+    n = len(means)
+    joint = np.zeros((3 + n, 3 + n))
+    joint[:3, :3] = LEAF_SIGMA**2 * np.eye(3)
+    joint[3:, 3:] = covariance
+    unnamed = ids(counts, "counts")[ids(numbers, "ids") >= UNNAMED]
     return m.Submap(
         stamp_ns=0,
-        robot=saved.author,
+        robot=author,
         incarnation=0,
         sequence=0,
         first_measurement=0,
         last_measurement=0,
         start_ns=0,
-        config=saved.sets[-1],
-        ids=saved.ids,
-        mean=from_floats(np.concatenate([np.zeros(3), floats(saved.means, "means")])),
-        covariance=from_floats(packed(covariance)),
-        biases=saved.biases,
-        sensitivity=from_floats(np.hstack([np.zeros((len(rows), 3)), rows])) if len(rows) else b"",
-        counts=from_ids(counts),
-        seen=b"\1" * len(counts),
-        keyframes=min(1, len(counts)),
+        config=config,
+        ids=numbers,
+        mean=from_floats(np.concatenate([np.zeros(3), means])),
+        covariance=from_floats(packed(joint)),
+        counts=from_ids(unnamed),
+        seen=b"\1" * len(unnamed),
+        keyframes=min(1, len(unnamed)),
     )
 
 
@@ -87,6 +111,8 @@ def map_name(text: str) -> str:
             f"{text!r} is no name of a map: up to 32 small letters, digits and _, a letter first; "
             "give one by --name"
         )
+    if MAP + text == SURVEY:
+        raise SavedMapError(f"{text!r} names the surveyed landmarks; give another name by --name")
     return text
 
 

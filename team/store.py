@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 from teamslam.team.saved_map import submap_of
+from teamslam.team.translate import SURVEY_FRAME
 from teamslam.team.wire import messages as m
 
 Stream = tuple[str, int]
@@ -120,8 +121,9 @@ class SubmapStore:
             self.verdicts.add(judgement)
 
     def add_map(self, saved: m.SavedMap) -> str | None:
-        """Add a saved map as a stream of one submap without a start; return the reason if it is
-        refused.
+        """Add a saved map as a stream of one submap; return the reason if it is refused.
+
+        Its start is unknown, or the origin if its frame is the survey's.
 
         Law 1: two maps with a set in common would count its measurements twice.
         """
@@ -140,7 +142,7 @@ class SubmapStore:
                     robot=saved.author,
                     incarnation=0,
                     number=0,
-                    pose=b"",
+                    pose=bytes(24) if saved.frame == SURVEY_FRAME else b"",
                     covariance=b"",
                 )
             )

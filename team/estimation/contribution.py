@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import MAP, Bias
+from teamslam.team.config import MAP, SURVEY, Bias
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.shapes import Bool, Float, UInt32
@@ -37,6 +37,15 @@ def is_map(stream: Stream) -> bool:
     return stream[0].startswith(MAP)
 
 
+SURVEYED: Stream = (SURVEY, 0)
+"""The stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
+
+
+def is_survey(stream: Stream) -> bool:
+    """Whether a stream has the surveyed landmarks."""
+    return stream == SURVEYED
+
+
 PART = 1 << 64
 """Step of the incarnation number from which a part of a cut stream is numbered."""
 
@@ -62,6 +71,8 @@ def first_of(stream: Stream) -> int:
 
 def named(stream: Stream) -> str:
     """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
+    if is_survey(stream):
+        return "the surveyed landmarks"
     if is_map(stream):
         return f"the saved map {stream[0].removeprefix(MAP)}"
     first = first_of(stream)

@@ -316,9 +316,13 @@ def _frames(log: Collected) -> TruthFrames:
 
 
 def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
-    """Whether no known initial pose fixes the final map's frame (or any frame, without a map)."""
+    """Whether neither a known initial pose nor a survey fixes the final map's frame (or any frame,
+    without a map).
+    """
     if fused is None or not fused.members:
         return frames.none_is_known
+    if fused.frame == translate.SURVEY_FRAME:
+        return False
     return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
 
 

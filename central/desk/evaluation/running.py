@@ -21,6 +21,8 @@ from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
 
+KNOWN_FRAMES = {"", START_POSES, translate.SURVEY_FRAME}
+"""Frames with truth that no stream's start fixes."""
 SPACING_NS = 100_000_000
 """Least spacing of compared estimates."""
 WAITING = 4_096
@@ -31,7 +33,7 @@ BATCHES = 20_000
 
 @dataclass
 class TruthFrames:
-    """Frames with truth: those fixed by a known initial pose.
+    """Frames with truth: those fixed by a known initial pose or a survey.
 
     Without initial poses every frame counts, as does a message without a frame (both from earlier
     versions).
@@ -45,7 +47,7 @@ class TruthFrames:
 
     def has(self, frame: str) -> bool:
         """Whether truth is given in this frame."""
-        return self._starts.get(frame, frame in {"", START_POSES} or not self._starts)
+        return self._starts.get(frame, frame in KNOWN_FRAMES or not self._starts)
 
     @property
     def none_is_known(self) -> bool:

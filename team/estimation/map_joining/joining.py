@@ -8,7 +8,7 @@ until shared landmarks and inter-robot measurements tie it to the main island.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
@@ -23,6 +23,7 @@ from teamslam.team.estimation.association.landmark_sets import (
     add_landmarks,
 )
 from teamslam.team.estimation.contribution import (
+    SURVEYED,
     Contribution,
     InitialPoseFactor,
     Key,
@@ -208,12 +209,12 @@ class Fold:
 
     @property
     def main_key(self) -> Stream | None:
-        """Key of the island with the known initial poses, else of one with a saved map and a robot,
-        else of the one with the smallest stream, of a robot if there is any.
+        """Key of the island with a known initial pose and a robot, else of one with a saved map and
+        a robot, else of the one with the smallest stream, of a robot if there is any.
         """
-        started = sorted(stream for stream in self.home if stream in self.starts)
         robots = sorted(stream for stream in self.home if not is_map(stream))
         placed = {self.home[robot] for robot in robots}
+        started = sorted(s for s in self.home if s in self.starts and self.home[s] in placed)
         maps = sorted(s for s in self.home if is_map(s) and self.home[s] in placed)
         streams = started or maps or robots or sorted(self.home)
         return self.home[streams[0]] if streams else None
@@ -229,13 +230,15 @@ class Fold:
     def frame(self) -> Stream | None:
         """The stream whose start fixes the main island's frame; None before any submap.
 
-        It is the smallest one with a known initial pose, else a saved map of the island, else the
-        smallest one of the island. All known initial poses are given in one frame.
+        It is one with a known initial pose, else any one of the island; of several a saved map,
+        else the smallest. All known initial poses are given in one frame. That of a saved map with
+        a known start is the survey's.
         """
         if self.main_key is None:
             return None
-        started = [stream for stream in self.home if stream in self.starts]
-        return min(started) if started else _frame_of(self.main)
+        streams = self.main.graph.streams
+        frame = _frame_of([stream for stream in streams if stream in self.starts] or streams)
+        return SURVEYED if is_map(frame) and frame in self.starts else frame
 
     def island(self, robot: str, incarnation: int) -> Island:
         """Return the island of a stream. Raises KeyError for a stream without submaps."""
@@ -460,11 +463,10 @@ def precedence(fold: Fold, key: Stream) -> tuple[bool, bool, bool, Stream]:
     """
     streams = fold.islands[key].graph.streams
     started, saved = any(s in fold.starts for s in streams), any(map(is_map, streams))
-    return not started, not saved, key != fold.main_key, _frame_of(fold.islands[key])
+    return not started, not saved, key != fold.main_key, _frame_of(streams)
 
 
-def _frame_of(island: Island) -> Stream:
-    streams = island.graph.streams
+def _frame_of(streams: Collection[Stream]) -> Stream:
     return min(filter(is_map, streams), default=min(streams))
 
 

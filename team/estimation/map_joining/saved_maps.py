@@ -84,11 +84,18 @@ def displacements(
     ]
     if among is not None:
         return sorted(found, key=lambda each: each.landmark)
-    stream = saved.contribution.stream
-    for (of, id_), former in island.graph.former.items():
-        if of == stream and id_ in island.graph.landmarks:
-            found.append(_apart(island, id_, former, island.graph.landmarks[id_]))
+    found += displacements_apart(island, saved.contribution.stream)
     return sorted(found, key=lambda each: each.landmark)
+
+
+def displacements_apart(island: Island, stream: Stream) -> list[Displacement]:
+    """Estimate the displacements of the landmarks whose places in a saved map are apart."""
+    landmarks = island.graph.landmarks
+    return [
+        _apart(island, id_, former, landmarks[id_])
+        for (of, id_), former in island.graph.former.items()
+        if of == stream and id_ in landmarks
+    ]
 
 
 def _observed_by_others(graph: Graph, saved: Joined) -> set[int]:
@@ -147,9 +154,9 @@ def _tests(
 
 
 def _is_tested(block: Float[np.ndarray, "2 2"], own: Float[np.ndarray, "2 2"]) -> bool:
-    scale = NEGLIGIBLE * float(np.trace(own))
+    scale, trace = NEGLIGIBLE * float(np.trace(own)), float(block[0, 0] + block[1, 1])
     determinant = float(block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0])
-    return bool(block[0, 0] > scale and block[1, 1] > scale) and determinant > scale * scale
+    return bool(block[0, 0] > scale and block[1, 1] > scale) and determinant > scale * trace
 
 
 def _apart(island: Island, id_: int, former: int, present: int) -> Displacement:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from teamslam.team.config import MAP
+from teamslam.team.config import MAP, SURVEY
 from teamslam.team.core import (
     check_ascending,
     check_finite,
@@ -316,6 +316,8 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
 
     def check(self) -> None:  # noqa: D102
         n = len(ids(self.ids, "ids"))
+        if self.author == SURVEY:
+            raise ValueError("wrong field: the name is that of the surveyed landmarks")
         if not 2 <= n <= MOST_SAVED:
             raise ValueError(f"out of bounds: {n} landmarks, 2 to {MOST_SAVED} are possible")
         check_landmarks(self.ids, self.means, self.covariance, joint=True)

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.config import BiasSigmas, CentralConfig, CommonBiasSigmas
+from teamslam.central.config import BiasSigmas, CentralConfig, CommonBiasSigmas, SurveyedLandmark
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
@@ -35,7 +35,7 @@ PAGE = ROOT / "docs" / "scenario.md"
 STRUCTS: tuple[type[msgspec.Struct], ...] = (
     Scenario, SimulatedWorld, UtiasWorld, FolderWorld, UnlabelledWorld, LiveWorld, RobotConfig,
     MotionModel, MotionNoise, Sensor, Lens, FrontEnd, AssociationSettings, CentralConfig,
-    BiasSigmas, CommonBiasSigmas, Bounds,
+    BiasSigmas, CommonBiasSigmas, SurveyedLandmark, Bounds,
 )  # fmt: skip
 AT_THE_TOP = {"estimator", "fusion", "seed"}
 """Fields of a robot and the centre that a scenario sets once, for the whole team."""

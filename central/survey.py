@@ -1,0 +1,62 @@
+"""Surveyed landmarks as a member of the set: a map whose frame is that of the survey.
+
+It is a saved map (`teamslam.team.estimation.map_joining.saved_maps`) whose start is known exactly:
+landmark i ~ N(surveyed place, P_i) in the team's frame, independent of the others. Streams without
+an initial pose are placed by it; a landmark that contradicts the rest is separated from it.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from teamslam.central.config import SurveyedLandmark
+from teamslam.team.config import SURVEY
+from teamslam.team.estimation.contribution import SURVEYED, InitialPoseFactor, is_map, named
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
+from teamslam.team.saved_map import member_of
+from teamslam.team.wire.arrays import from_ids
+from teamslam.team.wire.messages import Submap
+
+DIGEST = bytes(8)
+"""The configuration names the survey, its submap names no other one."""
+
+
+def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPoseFactor]:
+    """Make the submap of surveyed landmarks about their centroid, and its exact start there."""
+    order = sorted(surveyed, key=lambda each: each.landmark)
+    points = np.array([[each.x, each.y] for each in order])
+    origin = points.mean(axis=0)
+    covariance = np.zeros((2 * len(order), 2 * len(order)))
+    for k, each in enumerate(order):
+        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = each.matrix
+    submap = member_of(
+        SURVEY,
+        from_ids([each.landmark for each in order]),
+        (points - origin).ravel(),
+        covariance,
+        from_ids([1] * len(order)),
+        config=DIGEST,
+    )
+    return submap, InitialPoseFactor(*SURVEYED, np.array([*origin, 0.0]))
+
+
+def survey_warnings(fold: Fold) -> Iterator[str]:
+    """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance, and saved
+    maps that contain a survey already.
+    """
+    if not fold.contributions:
+        return
+    for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):
+        if stream != SURVEYED:
+            yield (
+                f"{named(stream)} contains a survey, which central.surveyed counts a second time: "
+                "leave that out"
+            )
+    for each in displacements_apart(fold.main, SURVEYED):
+        yield (
+            f"the surveyed landmark {each.landmark} is ({each.by[0]:+.2f}, {each.by[1]:+.2f}) m "
+            f"from its surveyed place, with a standard deviation of {each.sigma_m:.2g} m (chi² "
+            f"{each.chi2:.0f}): it is left out of the survey; check its number and place in "
+            "central.surveyed"
+        )
