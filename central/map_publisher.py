@@ -39,6 +39,7 @@ class MapPublisher:
         self._published_ns: int | None = None
         self._quiet_ns: int | None = None
         self._published: Mapping[Stream, int] = {}
+        self._welcomed: Collection[Stream] = ()
         self._announced: dict[str, str] = {}
 
     @property
@@ -79,6 +80,9 @@ class MapPublisher:
         return self._publish("final", math.inf, now_ns)
 
     def _is_due(self, closed_ns: float, now_ns: int) -> bool:
+        has_landmarks = self.store.maps or self.fold.landmarks
+        if has_landmarks and not self.store.newcomers <= {*self._welcomed}:
+            return True
         last_ns = self._published_ns
         if last_ns is not None and now_ns - last_ns < self._period_ns:
             return False
@@ -108,6 +112,7 @@ class MapPublisher:
     ) -> list[Outgoing]:
         out = self.fold.make_map(tail, closed_ns, ahead=ahead)
         self._published_ns = self._quiet_ns = now_ns
+        self._welcomed = self.store.newcomers
         for each in out:
             if isinstance(each.message, m.FusedMap):
                 members = each.message.members

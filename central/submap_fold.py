@@ -15,6 +15,7 @@ from teamslam.central.fused import receivable
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
     Tail,
+    gets_landmarks_alone,
     priors,
     reasons,
     shown_landmarks,
@@ -254,17 +255,21 @@ class SubmapFold:
         for of, ids, requested in parts:
             if recorded is None:
                 news = self._sent_priors
+                alone = [s for s in requested if gets_landmarks_alone(of, ids, fused, s)]
                 requested = (
-                    news.void(of, requested) if fused.final else news.worth(of, requested, ids)
+                    news.void(of, requested)
+                    if fused.final
+                    else news.worth(of, requested, ids, alone)
                 )
             out += priors(of, ids, fused, requested)
         return out
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
-        """List the latest stream of each robot that is in the map or withdrawn."""
+        """List the latest stream of each robot that is in the map, withdrawn or a newcomer."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
-        for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
+        joined = {(x.robot, x.incarnation) for x in fused.members}
+        for robot, incarnation in joined | withdrawn | self.store.newcomers:
             if is_map((robot, incarnation)):
                 continue
             latest[robot] = max(latest.get(robot, 0), incarnation)
