@@ -50,12 +50,16 @@ class MapPublisher:
     # Maps.
 
     def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Fold the closed ticks; publish a map if one is due.
+        """Fold the closed ticks; publish a map if one is due, or for a robot that has begun at an
+        unknown pose, which needs its landmarks.
 
         closed_ns: every submap that ends up to here has arrived.
         """
         self.fold.fold_until(closed_ns)
         withdrawals = self._announce_withdrawals(now_ns)
+        has_landmarks = self.store.maps or self.fold.landmarks
+        if has_landmarks and not self.store.newcomers <= {*self._welcomed}:
+            return [*withdrawals, *self._publish_whole(closed_ns, now_ns)]
         if withdrawals or self._is_due(closed_ns, now_ns):
             return [*withdrawals, *self._publish_closed(closed_ns, now_ns)]
         if self.store.chains:
@@ -80,9 +84,6 @@ class MapPublisher:
         return self._publish("final", math.inf, now_ns)
 
     def _is_due(self, closed_ns: float, now_ns: int) -> bool:
-        has_landmarks = self.store.maps or self.fold.landmarks
-        if has_landmarks and not self.store.newcomers <= {*self._welcomed}:
-            return True
         last_ns = self._published_ns
         if last_ns is not None and now_ns - last_ns < self._period_ns:
             return False

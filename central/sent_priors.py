@@ -51,6 +51,7 @@ class _Sent:
     encounter_ns: int
     since: int
     frame: Stream | None = None
+    alone: bool = False
 
 
 def in_main_island(fold: Fold, stream: Stream) -> bool:
