@@ -65,7 +65,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of one
     submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
-    thresholds for merging landmarks without identities, by kind of sensor.
+    thresholds for merging landmarks without identities, by kind of sensor. localise: robots are
+    localised in the loaded saved map, which is neither changed nor extended; under `join`.
     """
 
     fusion: FusionRule = "join"
@@ -85,3 +86,4 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bounds: Bounds = Bounds()
     association: AssociationProfile = AssociationProfile()
     landmark_sigma: NonNegative = 0.0
+    localise: bool = False

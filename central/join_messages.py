@@ -269,7 +269,7 @@ def priors(
         else:
             is_alone = gets_landmarks_alone(fold, shown, fused, stream)
             landmarks = _landmarks_alone(fold, shown) if is_alone else NO_LANDMARKS
-            message = translate.landmark_prior_message(*stream, fused, landmarks)
+            message = translate.landmark_prior_message(*stream, fused, landmarks, fold.frame)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
 

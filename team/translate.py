@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
@@ -426,13 +427,16 @@ def prior_of(message: m.Prior) -> RobotPrior:
 
 
 def landmark_prior_message(
-    robot: str, incarnation: int, fused: m.FusedMap, landmarks: LandmarkGaussian
+    robot: str,
+    incarnation: int,
+    fused: m.FusedMap,
+    landmarks: LandmarkGaussian,
+    frame: Stream | None,
 ) -> m.Prior:
-    """Make the prior of a robot outside the team's map: landmarks in its frame, or none.
-
-    Without landmarks it is in the robot's own frame.
+    """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one in
+    the robot's own.
     """
-    of_team = len(landmarks.ids) > 0
+    of_team = frame is not None and len(landmarks.ids) > 0
     return m.Prior(
         stamp_ns=fused.stamp_ns,
         robot=robot,
@@ -445,7 +449,7 @@ def landmark_prior_message(
         members=fused.members,
         heard=fused.heard,
         withdrawn=len(fused.withdrawn),
-        frame=fused.frame if of_team else frame_name(robot, incarnation),
+        frame=frame_name(*(frame if of_team and frame else (robot, incarnation))),
         in_team_frame=False,
     )
 

@@ -24,7 +24,6 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
