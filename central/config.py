@@ -92,7 +92,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
     thresholds for merging landmarks without identities, by kind of sensor. surveyed: landmarks at
-    known places, which fix the team's frame.
+    known places, which fix the team's frame. localise: robots are localised in the loaded saved
+    map, which is neither changed nor extended; under `join`.
     """
 
     fusion: FusionRule = "join"
@@ -112,6 +113,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bounds: Bounds = Bounds()
     association: AssociationProfile = AssociationProfile()
     landmark_sigma: NonNegative = 0.0
+    localise: bool = False
     surveyed: Annotated[tuple[SurveyedLandmark, ...], Meta(max_length=1000)] = ()
 
     def __post_init__(self) -> None:

@@ -17,8 +17,9 @@ from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.verification import find_possible_duplicates
 from teamslam.team.estimation.contribution import Stream, first_of, is_map, named, whole_of
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.estimation.map_joining import landmark_view, marginals
-from teamslam.team.estimation.map_joining.alignment import SharedPoints
+from teamslam.team.estimation.map_joining.alignment import NEEDED, SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
     find_lost_streams,
     find_missed,
@@ -46,6 +47,10 @@ a landmark in one window. Running maps show tentative ones, too.
 """
 NAMED = 10
 """Most names in a list of omitted landmarks, refusals, or robots of an island."""
+LANDMARKS_ALONE = 100
+"""Most landmarks in the prior of a robot outside the team's map: those nearest to the origin of its
+frame, where the robots of the first day began.
+"""
 FEW = 3
 """Most pairs of landmarks without names in such a list."""
 NONE_SHARED = f"not joined: {SharedPoints(0)}, "
@@ -264,27 +269,33 @@ def priors(
                 withdrawn=len(fused.withdrawn),
             )
         else:
-            message = _withdrawn_prior(stream, fused)
+            is_alone = gets_landmarks_alone(fold, shown, fused, stream)
+            landmarks = _landmarks_alone(fold, shown) if is_alone else NO_LANDMARKS
+            message = translate.landmark_prior_message(*stream, fused, landmarks, fold.frame)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
 
 
-def _withdrawn_prior(stream: Stream, fused: m.FusedMap) -> m.Prior:
-    return m.Prior(
-        stamp_ns=fused.stamp_ns,
-        robot=stream[0],
-        incarnation=stream[1],
-        sequence=-1,
-        digest=fused.digest,
-        ids=b"",
-        mean=b"",
-        covariance=b"",
-        members=fused.members,
-        heard=fused.heard,
-        withdrawn=len(fused.withdrawn),
-        frame=translate.frame_name(*stream),
-        in_team_frame=False,
-    )
+def gets_landmarks_alone(
+    fold: Fold, shown: Sequence[int], fused: m.FusedMap, stream: Stream
+) -> bool:
+    """Whether a stream's prior is the landmarks of a running map, by which it may be placed.
+
+    The stream is outside the team's map, neither withdrawn nor cut.
+    """
+    is_out = fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream)
+    named_ones = sum(id_ < UNNAMED for id_ in shown)
+    return named_ones >= NEEDED and not is_out and fold.latest_part(stream) == stream
+
+
+def _landmarks_alone(fold: Fold, shown: Sequence[int]) -> LandmarkGaussian:
+    """Make the joint Gaussian of the main island's named landmarks nearest to the origin."""
+    chosen = sorted(id_ for id_ in shown if id_ < UNNAMED)
+    if len(chosen) > LANDMARKS_ALONE:
+        points = landmark_view.points_of(fold.main, chosen)
+        order = np.argsort((points * points).sum(axis=1), kind="stable")
+        chosen = sorted(chosen[k] for k in order[:LANDMARKS_ALONE].tolist())
+    return LandmarkGaussian(*marginals.landmark_map(fold, chosen))
 
 
 def trajectories(

@@ -39,6 +39,7 @@ class MapPublisher:
         self._published_ns: int | None = None
         self._quiet_ns: int | None = None
         self._published: Mapping[Stream, int] = {}
+        self._welcomed: Collection[Stream] = ()
         self._announced: dict[str, str] = {}
 
     @property
@@ -49,12 +50,16 @@ class MapPublisher:
     # Maps.
 
     def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Fold the closed ticks; publish a map if one is due.
+        """Fold the closed ticks; publish a map if one is due, or for a robot that has begun at an
+        unknown pose, which needs its landmarks.
 
         closed_ns: every submap that ends up to here has arrived.
         """
         self.fold.fold_until(closed_ns)
         withdrawals = self._announce_withdrawals(now_ns)
+        has_landmarks = self.store.maps or self.fold.landmarks
+        if has_landmarks and not self.store.newcomers <= {*self._welcomed}:
+            return [*withdrawals, *self._publish_whole(closed_ns, now_ns)]
         if withdrawals or self._is_due(closed_ns, now_ns):
             return [*withdrawals, *self._publish_closed(closed_ns, now_ns)]
         if self.store.chains:
@@ -108,6 +113,7 @@ class MapPublisher:
     ) -> list[Outgoing]:
         out = self.fold.make_map(tail, closed_ns, ahead=ahead)
         self._published_ns = self._quiet_ns = now_ns
+        self._welcomed = self.store.newcomers
         for each in out:
             if isinstance(each.message, m.FusedMap):
                 members = each.message.members

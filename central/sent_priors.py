@@ -4,11 +4,12 @@ A robot joins its last prior with its own later submaps, so a new prior is worth
 information from teammates (moved landmarks, inter-robot measurements), or for landmarks that it
 comes near to. Priors are most of the centre's traffic.
 
-A robot outside the team's map gets one message that withdraws its earlier priors, also from a
-restarted centre, which has sent none.
+A robot outside the team's map gets the map's landmarks alone by the same rule, as if it was at the
+origin, or one message that withdraws its earlier priors, also from a restarted centre, which has
+sent none.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,7 @@ class _Sent:
     """The map of a robot's last prior and the landmarks in it.
 
     encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since:
-    number of broadcasts since. frame: the team's, at that time.
+    number of broadcasts since. frame: the team's, at that time. alone: without a pose.
     """
 
     blocks: LandmarkBlocks
@@ -50,6 +51,7 @@ class _Sent:
     encounter_ns: int
     since: int
     frame: Stream | None = None
+    alone: bool = False
 
 
 def in_main_island(fold: Fold, stream: Stream) -> bool:
@@ -65,12 +67,19 @@ class SentPriors:
         self._sent: dict[Stream, _Sent | None] = {}
         """None: the stream's priors are withdrawn."""
 
-    def worth(self, fold: Fold, streams: Sequence[Stream], shown: Sequence[int]) -> list[Stream]:
+    def worth(
+        self,
+        fold: Fold,
+        streams: Sequence[Stream],
+        shown: Sequence[int],
+        alone: Collection[Stream] = (),
+    ) -> list[Stream]:
         """Select the streams to which a prior of this fold with these landmarks is to be sent.
 
-        Streams that left the team's map are selected once, to withdraw their priors.
+        alone: those that get landmarks alone. Others outside the team's map are selected once, to
+        withdraw their priors.
         """
-        inside = [each for each in streams if in_main_island(fold, each)]
+        inside = [each for each in streams if each in alone or in_main_island(fold, each)]
         out = self._withdrawn({*streams} - {*inside})
         if not inside:
             return out
@@ -80,7 +89,7 @@ class SentPriors:
             for each in inside
             if self.is_worth(
                 each,
-                last_pose(fold, fold.latest_part(each)),
+                None if each in alone else last_pose(fold, fold.latest_part(each)),
                 blocks,
                 newest.get(each[0], NEVER),
                 fold.frame,
@@ -105,24 +114,26 @@ class SentPriors:
     def is_worth(
         self,
         stream: Stream,
-        pose: Float[np.ndarray, "3"],
+        pose: Float[np.ndarray, "3"] | None,
         blocks: LandmarkBlocks,
         encounter_ns: int = NEVER,
         frame: Stream | None = None,
     ) -> bool:
-        """Whether to send a prior at this pose in this map; if so, note it as sent."""
-        offsets = blocks.means - pose[:2]
+        """Whether to send a prior at this pose in this map; if so, note it as sent. None: one of
+        landmarks alone.
+        """
+        offsets = blocks.means if pose is None else blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         old = self._sent.get(stream)
         if (
             old is None
             or old.since + 1 >= EVERY
-            or old.frame != frame
+            or (old.frame, old.alone) != (frame, pose is None)
             or encounter_ns > old.encounter_ns
             or _has_changed(old, blocks, nearest[:NEEDED])
         ):
             ids = np.sort(blocks.ids[nearest[: self._most]])
-            self._sent[stream] = _Sent(blocks, ids, encounter_ns, 0, frame)
+            self._sent[stream] = _Sent(blocks, ids, encounter_ns, 0, frame, pose is None)
             return True
         self._sent[stream] = replace(old, since=old.since + 1)
         return False

@@ -15,11 +15,18 @@ from teamslam.central.fused import receivable
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
     Tail,
+    gets_landmarks_alone,
     priors,
     reasons,
     shown_landmarks,
     team_map,
     trajectories,
+)
+from teamslam.central.localising import (
+    in_saved_map,
+    lone_newcomer,
+    restricted,
+    saved_landmarks,
 )
 from teamslam.central.monitor import NOTHING, finding
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
@@ -117,6 +124,8 @@ class SubmapFold:
 
     def save_map(self, name: str) -> m.SavedMap:
         """Make a saved map of the final map, the last one made; raises NothingToSaveError."""
+        if self.config.localise:
+            raise NothingToSaveError("a team that is localised in a saved map makes no map")
         if self._final is None or not self._final[0].contributions:
             raise NothingToSaveError("there is no final map with a landmark")
         before = {saved.author: saved for saved in self.store.maps.values()}
@@ -135,12 +144,15 @@ class SubmapFold:
         for stream in sorted(
             s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
         ):
-            filed = self._filed.get(stream, 0)
-            if not filed and (start := translate.start_of(store.start(stream))) is not None:
+            filed, localises = self._filed.get(stream, 0), self.config.localise
+            start = translate.start_of(store.start(stream))
+            if start is not None and not filed and not localises:
                 ticks.add_start(start)
             for submap in chains[stream][filed:]:
                 sightings = store.sightings(submap)
-                ticks.add_submap(submap, digest_of(*map(encoded, (submap, *sightings))), sightings)
+                digest = digest_of(*map(encoded, (submap, *sightings)))
+                taken = restricted(submap, store.maps.values()) if localises else submap
+                ticks.add_submap(taken, digest, sightings)
                 self._filed[stream] = submap.sequence + 1
 
     @property
@@ -198,6 +210,9 @@ class SubmapFold:
         self.finding = found.with_biases(biases)
         figures = self.finding.figures
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
+        members = ticks.members(fold)
+        if self.config.localise:
+            fold = in_saved_map(fold)
         shown = shown_landmarks(fold, self.config, tail)
         self.diagnosis = diagnose(
             fold,
@@ -215,7 +230,7 @@ class SubmapFold:
             tail,
             shown.ids,
             digest=digest,
-            members=ticks.members(fold),
+            members=members,
             withdrawn=ticks.withdrawn,
             missing=store.missing() if recorded is None else recorded.missing,
             arrived=store.arrived if recorded is None else recorded.arrived,
@@ -226,6 +241,8 @@ class SubmapFold:
             diagnosis=self.diagnosis,
             changes=landmark_changes(fold, shown.ids) if final else (),
         )
+        if self.config.localise and (saved := min(store.maps.items(), default=None)) is not None:
+            fused = saved_landmarks(fused, saved[1])
         self._final = (fold, fused) if final else None
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
@@ -251,20 +268,30 @@ class SubmapFold:
         for robot, own in self._apart.items():
             ids = shown_landmarks(own, self.config, "closed").ids
             parts.append((own, ids, [each for each in streams if each[0] == robot]))
+        lone = lone_newcomer(fold)
+        if lone is not None and lone[0] not in self._apart:
+            parts[0] = (fold, shown, [each for each in parts[0][2] if each != lone])
+            of_map = in_saved_map(fold)
+            ids = shown_landmarks(of_map, self.config, "closed").ids
+            parts.append((of_map, ids, [each for each in streams if each == lone]))
         for of, ids, requested in parts:
             if recorded is None:
                 news = self._sent_priors
+                alone = [s for s in requested if gets_landmarks_alone(of, ids, fused, s)]
                 requested = (
-                    news.void(of, requested) if fused.final else news.worth(of, requested, ids)
+                    news.void(of, requested)
+                    if fused.final
+                    else news.worth(of, requested, ids, alone)
                 )
             out += priors(of, ids, fused, requested)
         return out
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
-        """List the latest stream of each robot that is in the map or withdrawn."""
+        """List the latest stream of each robot that is in the map, withdrawn or a newcomer."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
-        for robot, incarnation in {(x.robot, x.incarnation) for x in fused.members} | withdrawn:
+        joined = {(x.robot, x.incarnation) for x in fused.members}
+        for robot, incarnation in joined | withdrawn | self.store.newcomers:
             if is_map((robot, incarnation)):
                 continue
             latest[robot] = max(latest.get(robot, 0), incarnation)

@@ -240,6 +240,15 @@ class SubmapStore:
         assert start is not None
         return start
 
+    @property
+    def newcomers(self) -> set[Stream]:
+        """The streams that have begun at an unknown pose and have no submap yet."""
+        return {
+            key
+            for key, stream in self.streams.items()
+            if stream.start is not None and not stream.start.pose and not stream.chain
+        }
+
     def sightings(self, submap: m.Submap) -> list[m.SightingFactor]:
         """The inter-robot measurements from a submap, by stamp and teammate."""
         stream = self.streams.get((submap.robot, submap.incarnation), _EMPTY)

@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import SURVEY, UNNAMED, RobotConfig
-from teamslam.team.estimation.gaussian import Matrix, packed, unpacked
+from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.map_joining.joining import Contribution, InitialPoseFactor
@@ -429,13 +430,43 @@ def prior_message(
 
 
 def prior_of(message: m.Prior) -> RobotPrior:
-    """Read the prior for the robot's conditioning."""
+    """Read the prior for the robot's conditioning; one of landmarks alone has the pose zero."""
     mean = floats(message.mean, "mean").astype(np.float64)
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
+    if not message.in_team_frame:
+        mean, covariance = np.pad(mean, (3, 0)), np.pad(covariance, (3, 0))
     landmark_ids = ids(message.ids, "ids").astype(np.uint32)
     biases = tuple((each.bias, each.value, each.sigma) for each in message.biases)
     shared = SubmapCorrection(message.covariance_factor, biases)
     return RobotPrior(mean[:3], landmark_ids, mean[3:].reshape(-1, 2), covariance, shared)
+
+
+def landmark_prior_message(
+    robot: str,
+    incarnation: int,
+    fused: m.FusedMap,
+    landmarks: LandmarkGaussian,
+    frame: Stream | None,
+) -> m.Prior:
+    """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one in
+    the robot's own.
+    """
+    of_team = frame is not None and len(landmarks.ids) > 0
+    return m.Prior(
+        stamp_ns=fused.stamp_ns,
+        robot=robot,
+        incarnation=incarnation,
+        sequence=-1,
+        digest=fused.digest,
+        ids=from_ids(landmarks.ids),
+        mean=from_floats(landmarks.means.ravel()),
+        covariance=joint_bytes(landmarks.covariance) if of_team else b"",
+        members=fused.members,
+        heard=fused.heard,
+        withdrawn=len(fused.withdrawn),
+        frame=frame_name(*(frame if of_team and frame else (robot, incarnation))),
+        in_team_frame=False,
+    )
 
 
 def trajectory_message(

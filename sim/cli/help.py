@@ -14,7 +14,7 @@ OPTIONS = "Options"
 NETWORK = "Network and keys"
 RARE = "Rarely needed"
 SECTIONS = {
-    "Run a team": ("launch", "scenarios", "simulate"),
+    "Run a team": ("launch", "localise", "scenarios", "simulate"),
     "Look at a run": (
         "view", "report", "compare", "rerun", "map", "log", "verify-ledger", "repair",
     ),

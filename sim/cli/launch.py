@@ -25,6 +25,7 @@ from teamslam.sim.cli.options import (
     IdentitiesOption,
     JsonFile,
     Keys,
+    Localise,
     MapFiles,
     Peers,
     Pieces,
@@ -32,6 +33,7 @@ from teamslam.sim.cli.options import (
     Seed,
     SpeedText,
     check_joins,
+    check_localises,
     check_pieces,
     fail,
     over_tls,
@@ -94,6 +96,7 @@ def launch(
     report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
     browser: Open = None,
     map_: MapFiles = None,
+    localise: Localise = False,
     record: Annotated[
         Path | None,
         typer.Option(
@@ -174,7 +177,10 @@ def launch(
         centre=not without_centre,
         comm_range_m=comm_range,
         identities=identities,
+        localise=localise,
     )
+    if localise:
+        check_localises(map_, resolved)
     if pieces is not None:
         check_pieces(resolved)
     resolved, missing, streams = _checked_world(resolved)

@@ -9,6 +9,7 @@ from teamslam.sim.cli.help import WIDE, Group
 from teamslam.sim.cli.importing import app as import_commands
 from teamslam.sim.cli.keys import app as key_commands
 from teamslam.sim.cli.launch import app as launch_commands
+from teamslam.sim.cli.localise import app as localise_commands
 from teamslam.sim.cli.log import app as log_tools
 from teamslam.sim.cli.maps import app as map_tools
 from teamslam.sim.cli.nodes import app as node_commands
@@ -31,9 +32,9 @@ app = typer.Typer(
     context_settings=WIDE,
 )
 for _part in (
-    launch_commands, scenario_commands, node_commands, order_commands, key_commands,
-    recorded_commands, rerun_commands, compare_commands, view_commands, calibrate_commands,
-    import_commands, driver_commands, status_commands,
+    launch_commands, localise_commands, scenario_commands, node_commands, order_commands,
+    key_commands, recorded_commands, rerun_commands, compare_commands, view_commands,
+    calibrate_commands, import_commands, driver_commands, status_commands,
 ):  # fmt: skip
     app.add_typer(_part)
 app.add_typer(log_tools)

@@ -54,6 +54,14 @@ MapFiles = Annotated[
         metavar="FILE",
     ),
 ]
+Localise = Annotated[
+    bool,
+    typer.Option(
+        "--localise",
+        help="Localise robots in the map of --map, which stays as it is.",
+        rich_help_panel=RARE,
+    ),
+]
 JsonFile = Annotated[
     Path | None,
     typer.Option(
@@ -325,6 +333,14 @@ def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
     """End with 2 where maps are given to a team whose fusion rule joins no submaps."""
     if maps and scenario.central.fusion != "join":
         fail(f"--map: the fusion rule {scenario.central.fusion} joins no saved map", WRONG_USE)
+
+
+def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" = None) -> None:
+    """End with 2 unless robots can be localised: in one map, by a centre."""
+    if len(maps or ()) != 1:
+        fail("--localise: give one saved map by --map", WRONG_USE)
+    if scenario is not None and (scenario.peers or not scenario.centre):
+        fail("--localise: a team without a centre extends its map; launch it with one", WRONG_USE)
 
 
 def check_names(team: str, robot: str | None = None) -> None:

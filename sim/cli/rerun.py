@@ -15,8 +15,10 @@ from teamslam.sim.cli.options import (
     EstimatorOption,
     FusionOption,
     JsonFile,
+    Localise,
     LogArgument,
     MapFiles,
+    check_localises,
     fail,
     saved_maps,
     warn_of_holes,
@@ -66,6 +68,7 @@ def rerun(
         typer.Option(help="Seed of the estimators and of the losses.", min=0, metavar="N"),
     ] = None,
     map_: MapFiles = None,
+    localise: Localise = False,
     noise: Annotated[
         list[str] | None,
         typer.Option(
@@ -128,6 +131,8 @@ def rerun(
     --verify only if all is equal; else 1. 2: wrong use.
     """
     saved_maps(map_)
+    if localise:
+        check_localises(map_)
     changes = Changes(
         without=tuple(without or ()),
         fusion=fusion,
@@ -142,6 +147,7 @@ def rerun(
         unsafe_feedback=unsafe_feedback,
         noise=_noise(noise or []),
         maps=tuple(map(str, map_ or ())),
+        localise=localise,
     )
     if not verify:
         _compare(log, changes, json_file, output)

@@ -58,6 +58,7 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
         seed=changes.seed,
         estimator=changes.estimator,
         fusion=changes.fusion,
+        localise=changes.localise,
     )
     links = changes.loss or changes.delay_s or changes.no_centre or changes.partitions
     if changed.fusion != "join" and (links or changes.unsafe_feedback):

@@ -14,6 +14,7 @@ class Changes:
     centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
     when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
     kind (`teamslam.sim.recorded.noise`). maps: saved maps of earlier days, by path.
+    localise: robots are localised in the map, which stays as it is.
     """
 
     without: tuple[str, ...] = ()
@@ -29,3 +30,4 @@ class Changes:
     unsafe_feedback: bool = False
     noise: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()
+    localise: bool = False

@@ -95,6 +95,7 @@ def with_options(
     centre: bool = True,
     comm_range_m: float | None = None,
     identities: str | None = None,
+    localise: bool = False,
 ) -> Scenario:
     """Apply command-line changes; None leaves a field unchanged.
 
@@ -106,6 +107,7 @@ def with_options(
     fields |= {key: value for key, value in changes.items() if value is not None}
     if comm_range_m is not None:
         fields["radio"]["comm_range_m"] = comm_range_m
+    fields["central"]["localise"] = fields["central"]["localise"] or localise
     fields["peers"] = fields["peers"] or peers
     fields["centre"] = fields["centre"] and centre
     if dataset is not None:

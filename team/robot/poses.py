@@ -18,6 +18,7 @@ from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
 from teamslam.team.estimation.plausible import prior_beyond
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.own_map import OwnMap
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps
 from teamslam.team.robot.team_map import TeamMap
@@ -33,6 +34,7 @@ class PoseEstimator(Protocol):
 
     writer: MessageWriter
     submaps: Submaps
+    own_map: OwnMap
 
     @property
     def sequence(self) -> int:
@@ -72,14 +74,14 @@ class RunningPoses:
         """
         if not is_newer_prior(prior, self._prior):
             return []
-        if prior.in_team_frame:
-            whole = self.team_map.decode(prior).whole
-            why = prior_beyond(whole.mean, whole.covariance, self._bounds)
-            if why is not None:
-                self._warnings.append(f"the team's map is refused: {why}")
-                return []
+        whole = self.team_map.decode(prior).whole
+        why = prior_beyond(whole.mean, whole.covariance, self._bounds)
+        if why is not None:
+            self._warnings.append(f"the team's map is refused: {why}")
+            return []
         self._prior = prior
-        return self._withdrawn_pose()
+        # By landmarks alone the next pose decides whether the robot is still placed.
+        return [] if prior.ids and prior.frame == self._claimed else self._withdrawn_pose()
 
     def _withdrawn_pose(self) -> list[Outgoing]:
         """The own pose on team/pose, if the last pose there was in another frame than the prior."""
@@ -106,6 +108,13 @@ class RunningPoses:
         prior = self._prior if self.has_prior else None
         return prior if prior is not None and prior.incarnation == incarnation else None
 
+    def _placing(self, incarnation: int) -> m.Prior | None:
+        """The newest prior if it places this incarnation, by a pose or by landmarks alone."""
+        prior = self._prior
+        if prior is None or prior.incarnation != incarnation:
+            return None
+        return prior if prior.in_team_frame or prior.ids else None
+
     def begin_incarnation(self, incarnation: int) -> None:
         """Begin an incarnation: forget the prior of an earlier one."""
         if self._prior is not None and self._prior.incarnation < incarnation:
@@ -116,7 +125,7 @@ class RunningPoses:
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
-        prior = self.prior_of(estimator.writer.incarnation)
+        prior = self._placing(estimator.writer.incarnation)
         out = self.estimate(stamp_ns, prior, estimator)
         self._own = out[0]
         if len(out) == 1:
@@ -135,7 +144,12 @@ class RunningPoses:
             return out
         try:
             with np.errstate(all="ignore"):  # a pose that is not finite is withheld
-                posed = self.team_map.pose(prior, estimator.submaps, window).pose
+                if prior.in_team_frame:
+                    posed = self.team_map.pose(prior, estimator.submaps, window).pose
+                elif (placed := self.team_map.place(prior, estimator.own_map, window)) is None:
+                    return out
+                else:
+                    posed = placed
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from teamslam.team import translate
-from teamslam.team.estimation.gaussian import curved
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian, curved
 from teamslam.team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
@@ -16,8 +16,10 @@ from teamslam.team.estimation.map_joining.conditioning import (
     pose_now,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.map_joining.localising import localised
 from teamslam.team.estimation.map_joining.whole_map import initial_map
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.own_map import OwnMap
 from teamslam.team.wire import messages as m
 
 CONDENSED = 16
@@ -60,6 +62,18 @@ class TeamMap:
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._warning(given)
         return Posed(curved(posed.pose), posed.known, posed.refused)
+
+    def place(self, prior: m.Prior, own: OwnMap, window: LocalMap | None) -> PoseGaussian | None:
+        """Estimate the robot's pose in the team's frame by a prior of landmarks alone; None where
+        they do not determine it.
+        """
+        given, self.doubt = self.decode(prior), ""
+        team = LandmarkGaussian(given.ids, given.means, given.covariance[3:, 3:])
+        posed = localised(team, own.whole, window)
+        if isinstance(posed, str):
+            return None
+        self.known, self.refused = posed.known, posed.refused
+        return curved(posed.pose)
 
     def decode(self, prior: m.Prior) -> RobotPrior:
         """The estimate in a prior; that of the last one asked for is kept."""

@@ -246,24 +246,38 @@ def disagreeing(
 ) -> list[int] | str:
     """Find the landmarks of two islands, one with a saved map, that moved between them.
 
-    Where not all agree within `confidence`, the largest set of landmarks that one rigid motion
-    places is taken from all pairs; then those that disagree with the rest are removed, the worst
-    first, and those that agree are added again. Returns the reason if no more than half of the
-    landmarks agree.
+    Returns the reason if no more than half of the landmarks agree within `confidence`.
     """
     n = len(ids)
     in_main = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
     in_other = joint_marginal(other, [other.graph.landmarks[id_] for id_ in ids])
-    a, A = in_main[0].reshape(-1, 2), in_main[1]
-    b, B = in_other[0].reshape(-1, 2), in_other[1]
-    limit = chi2_limit(2, 1.0 - confidence)
-    agree = np.ones(n, np.bool_)
-    chi2 = _disagreements(a, A, b, B, agree)
-    if chi2.max() > limit:
+    a, b = in_main[0].reshape(-1, 2), in_other[0].reshape(-1, 2)
+    agree = agreeing(a, in_main[1], b, in_other[1], chi2_limit(2, 1.0 - confidence))
+    count = int(agree.sum())
+    if count < LEAST_AGREEING or 2 * count <= n:
+        return _refusal(main, other, n, count)
+    return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
+
+
+def agreeing(
+    a: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "m m"],
+    b: Float[np.ndarray, "n 2"],
+    B: Float[np.ndarray, "m m"],
+    limit: float,
+) -> Bool[np.ndarray, " n"]:
+    """Mark the landmarks of two maps, N(a, A) and N(b, B), that one rigid motion places.
+
+    Where not all agree within the limit of χ², the largest set that the motion of a pair places is
+    taken; then those that disagree with the rest are removed, the worst first, and those that agree
+    are added again.
+    """
+    agree = np.ones(len(a), np.bool_)
+    if _disagreements(a, A, b, B, agree).max() > limit:
         agree = _largest_agreement(a, A, b, B, limit)
         if agree.sum() < LEAST_AGREEING:
-            return _refusal(main, other, n, int(agree.sum()))
-    for _ in range(n):
+            return agree
+    for _ in range(len(a)):
         chi2 = _disagreements(a, A, b, B, agree)
         worst = int(np.argmax(np.where(agree, chi2, -np.inf)))
         if chi2[worst] > limit and agree.sum() > LEAST_AGREEING:
@@ -273,10 +287,7 @@ def disagreeing(
         if agree[best] or chi2[best] > limit:
             break
         agree[best] = True
-    count = int(agree.sum())
-    if 2 * count <= n:
-        return _refusal(main, other, n, count)
-    return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
+    return agree
 
 
 def _refusal(main: Island, other: Island, shared: int, agreeing: int) -> str:

@@ -221,9 +221,10 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     mean: 3 + 2L floats; covariance: packed upper triangle. The robot uses its further submaps as
     the centre does: covariances times covariance_factor, means moved by the shared errors (biases).
     members, heard: as in FusedMap; withdrawn: number of withdrawn robots; they order two priors.
-    frame: of pose and landmarks, as in FusedMap; in_team_frame: it is the team's. A prior that is
-    not in the team's frame withdraws the priors before it: the robot is not in the team's map,
-    `frame` is its own, and ids, mean and covariance are empty.
+    frame: of pose and landmarks, as in FusedMap; in_team_frame: the robot is in the team's map. If
+    not, the prior withdraws those before it. Without landmarks `frame` is then the robot's own, and
+    ids, mean and covariance are empty; else `frame` is the team's, and mean, 2L floats, and
+    covariance are those of landmarks alone, by which the robot estimates its pose.
     """
 
     robot: Name
@@ -242,12 +243,8 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     in_team_frame: bool = True
 
     def check(self) -> None:  # noqa: D102
-        if not self.in_team_frame:
-            if self.ids or self.mean or self.covariance:
-                raise ValueError("a prior that is not in the team's frame contains an estimate")
-            return
         check_ascending(self.ids, "ids")
-        n = 3 + 2 * len(ids(self.ids, "ids"))
+        n = 2 * len(ids(self.ids, "ids")) + 3 * self.in_team_frame
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
 

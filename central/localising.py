@@ -1,0 +1,73 @@
+"""Localise robots in a saved map: the map's island, and runs that do not change the map.
+
+With `localise` of the configuration the fold has the landmarks of the saved map only: others are
+left out of the robots' submaps, which is their marginal. Robots have no start, so the frame is the
+map's. The published map is the saved one; priors and paths are those of the joint solution.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from teamslam.central.fused import JOINT_LANDMARKS
+from teamslam.team import translate
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.contribution import Stream, is_map
+from teamslam.team.estimation.gaussian import packed, unpacked
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import derivatives, floats, from_floats, from_ids, ids
+
+
+def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
+    """Leave out the named landmarks of a robot's submap that no saved map has."""
+    numbers = ids(submap.ids, "ids")
+    known = [ids(each.ids, "ids") for each in maps]
+    keep = (numbers >= UNNAMED) | np.isin(numbers, np.concatenate([numbers[:0], *known]))
+    if keep.all() or is_map((submap.robot, submap.incarnation)):
+        return submap
+    mean = floats(submap.mean, "mean")
+    poses = len(mean) - 2 * len(numbers)
+    rows = np.flatnonzero(np.concatenate([np.ones(poses, np.bool_), np.repeat(keep, 2)]))
+    P = unpacked(floats(submap.covariance, "covariance"), len(mean))
+    shared = derivatives(submap.sensitivity, len(mean) * len(submap.biases), "sensitivity")
+    return msgspec.structs.replace(
+        submap,
+        ids=from_ids(numbers[keep]),
+        mean=from_floats(mean[rows]),
+        covariance=from_floats(packed(P[np.ix_(rows, rows)])),
+        sensitivity=shared.reshape(len(submap.biases), len(mean))[:, rows].astype("<f4").tobytes(),
+    )
+
+
+def in_saved_map(fold: Fold) -> Fold:
+    """Return the fold with the island of the saved map alone, an empty one if there is none."""
+    key = next((key for stream, key in sorted(fold.home.items()) if is_map(stream)), None)
+    if key is None:
+        return EMPTY_FOLD
+    home = {stream: at for stream, at in fold.home.items() if at == key}
+    return replace(fold, home=home, starts={})
+
+
+def lone_newcomer(fold: Fold) -> Stream | None:
+    """Return the robot that is the main island alone, without a start, beside a saved map."""
+    there = [stream for stream, key in fold.home.items() if key == fold.main_key]
+    is_beside = any(is_map(stream) for stream in fold.home)
+    return there[0] if len(there) == 1 and is_beside and there[0] not in fold.starts else None
+
+
+def saved_landmarks(fused: m.FusedMap, saved: m.SavedMap) -> m.FusedMap:
+    """Replace the landmarks of a team's map by those of the saved map, as they were saved."""
+    n = len(ids(saved.ids, "ids"))
+    joint = fused.final and n <= JOINT_LANDMARKS
+    P = unpacked(floats(saved.covariance, "covariance"), 2 * n)
+    return msgspec.structs.replace(
+        fused,
+        frame=translate.frame_name(saved.author, 0),
+        joint=joint,
+        ids=saved.ids,
+        means=saved.means,
+        covariance=translate.covariance_bytes(P, joint=joint),
+    )

@@ -1,0 +1,110 @@
+"""Place a robot without a start in the team's map, by the landmarks that both have.
+
+The robot's own map, a Gaussian over its pose p and its landmarks from its start on, is one submap
+whose start in the team's frame is unknown. The alignment of the shared landmarks gives the start;
+least squares over the team's landmarks and this submap then gives the pose with its covariance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from teamslam.team.core import WholeMap
+from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.estimation.map_joining.alignment import (
+    NEEDED,
+    Alignment,
+    SharedPoints,
+    aligned,
+    disagreement,
+    refusal,
+)
+from teamslam.team.estimation.map_joining.conditioning import TRUSTING, Posed, followed
+from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
+from teamslam.team.estimation.map_joining.whole_map import joined
+from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.shapes import Float, Int64, UInt32
+
+FLAT = 1e4
+"""Factor by which the covariance of the alignment is raised for the prior of the start: the
+landmarks that give it are counted in the solution.
+"""
+
+
+def localised(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) -> Posed | str:
+    """Estimate the pose of a robot in the frame of the team's landmarks, or give the reason why
+    they do not determine it.
+
+    own: the robot's map from its start on; window: the open one. Where landmarks disagree, the
+    largest set that one rigid motion places is used, if it is most of them. Raises
+    NotACovarianceError, NotDeterminedError.
+    """
+    whole = own if window is None else joined(own, window.named)
+    _, in_team, in_own = np.intersect1d(team.ids, whole.ids, return_indices=True)
+    shared = _Shared.of(team, whole, in_team, in_own)
+    fit, why = shared.fit()
+    count, refused = len(in_team), 0
+    if fit is not None and why is not None and count > LEAST_AGREEING:
+        limit = chi2_limit(2, 1.0 - TRUSTING.alignment_confidence)
+        agree = agreeing(shared.a, shared.A, shared.b, shared.P[3:, 3:], limit)
+        refused = count - int(agree.sum())
+        if count - refused >= LEAST_AGREEING and 2 * refused < count:
+            shared = _Shared.of(team, whole, in_team[agree], in_own[agree])
+            fit, why = shared.fit()
+    if fit is None or why is not None:
+        return why or ""
+    covariance = np.zeros_like(shared.P)
+    covariance[:3, :3], covariance[3:, 3:] = FLAT * fit.covariance, shared.A
+    start = WholeMap(shared.ids, np.concatenate([fit.a_from_b, shared.a.ravel()]), covariance)
+    found = followed(start, [LocalMap(shared.ids, shared.mean, shared.P)])
+    if found.disputed:
+        return f"{SharedPoints(len(shared.ids))} contradict each other"
+    return Posed(PoseGaussian(*found.whole.pose()), count, refused + sum(found.refused))
+
+
+class _Shared(NamedTuple):
+    """Landmarks of the team, N(a, A), and a robot's (pose, the same landmarks), N(mean, P)."""
+
+    ids: UInt32[np.ndarray, " n"]
+    a: Float[np.ndarray, "n 2"]
+    A: Float[np.ndarray, "m m"]
+    mean: Float[np.ndarray, " k"]
+    P: Float[np.ndarray, "k k"]
+
+    @classmethod
+    def of(
+        cls,
+        team: LandmarkGaussian,
+        whole: WholeMap,
+        in_team: Int64[np.ndarray, " n"],
+        in_own: Int64[np.ndarray, " n"],
+    ) -> "_Shared":
+        """Take the marginals of the landmarks at these indices."""
+        at, of = _points(in_team), np.concatenate([np.arange(3), 3 + _points(in_own)])
+        return cls(
+            team.ids[in_team],
+            team.means[in_team],
+            team.covariance[np.ix_(at, at)],
+            whole.mean[of],
+            whole.covariance[np.ix_(of, of)],
+        )
+
+    @property
+    def b(self) -> Float[np.ndarray, "n 2"]:
+        """The robot's landmarks."""
+        return self.mean[3:].reshape(-1, 2)
+
+    def fit(self) -> tuple[Alignment | None, str | None]:
+        """Align the landmarks; return the alignment, with the reason where it places nothing."""
+        shared, fit = SharedPoints(len(self.ids)), None
+        if len(self.ids) >= NEEDED:
+            fit = aligned(self.a, self.A, self.b, self.P[3:, 3:])
+        why = refusal(shared, fit, TRUSTING.alignment_heading_sigma)
+        if why is None and fit is not None:
+            why = disagreement(shared, fit.chi2, TRUSTING.alignment_confidence)
+        return fit, why
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    return (2 * index[:, None] + np.arange(2)).ravel()

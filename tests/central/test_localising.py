@@ -1,0 +1,145 @@
+"""Robots without a start are placed in a saved map at once; `localise` leaves the map as it is."""
+
+import json
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from teamslam.central.desk.verification.centre import recomputed_centre
+from teamslam.central.desk.verification.recorded import Recorded, identity
+from teamslam.central.desk.verification.robot import recomputed_robot
+from teamslam.central.localising import restricted
+from teamslam.central.saved_maps import NothingToSaveError
+from teamslam.sim.cli.main import app
+from teamslam.sim.in_memory.team import final_map
+from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team import translate
+from teamslam.team.recording.recorder import Recorder
+from teamslam.team.saved_map import write_map
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_ids, ids
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import encoded
+from tests.central.test_saved_map import day, elsewhere, first_day, part, with_means
+from tests.trials.day_two import judge, simulated, summary
+
+SECOND_NS = 1_000_000_000
+
+
+@cache
+def short_day(*, localise=False, wrong=False, length_s=60):
+    """The first minute of a second day of robots without a start."""
+    scenario = with_options(load("thesis-b"), seed=1001, localise=localise)
+    whole = streams_of(scenario)
+    first_ns = min(first for first, _ in whole.spans_ns.values())
+    streams = part(whole, first_ns, first_ns + length_s * SECOND_NS, begins=False)
+    saved = with_means(elsewhere) if wrong else first_day()[1]
+    return day(0, [saved], scenario=scenario, streams=streams)
+
+
+def test_robots_without_a_start_are_placed_within_seconds_as_surely_as_stated():
+    rows = [row for start in simulated(5) for row in judge(start)]
+    found = summary(rows)
+    assert found["robots"] == 10
+    assert found["not_placed"] == found["wrong"] == 0
+    assert found["worst_delay_s"] <= 10.0
+    assert found["within_two_sigma"] >= 0.8
+
+
+def messages_of(samples, kind):
+    return [each for each in (opened(sample)[2] for sample in samples) if isinstance(each, kind)]
+
+
+def test_a_prior_of_landmarks_alone_comes_first_and_then_one_with_a_pose():
+    samples, _, _ = short_day()
+    for robot in ("r1", "r2"):
+        priors = [each for each in messages_of(samples, m.Prior) if each.robot == robot]
+        first, *later = priors
+        assert not first.in_team_frame
+        assert first.frame == "map-site/0"
+        assert len(ids(first.ids, "ids")) == 18
+        assert len(floats(first.mean, "mean")) == 36
+        assert later[0].in_team_frame
+
+
+def test_a_map_of_another_site_places_no_robot():
+    samples, _, _ = short_day(wrong=True)
+    poses = messages_of(samples, m.PoseEstimate)
+    assert poses
+    assert not [each for each in poses if each.in_team_frame and each.frame.startswith("map-")]
+
+
+@pytest.mark.parametrize("localise", [False, True])
+def test_the_maps_priors_and_poses_are_computed_again_from_the_log(localise):
+    samples, _, _ = short_day(localise=localise)
+    log = Recorded()
+    log.take_all(samples)
+    computed = recomputed_centre(log) | recomputed_robot(log, "r1")
+    for channel in (ch.FUSED_MAP, ch.FINAL_MAP, ch.PRIOR, ch.TEAM_POSE):
+        outputs = log.outputs_of(channel)
+        assert outputs
+        for each in outputs:
+            if channel is ch.TEAM_POSE and each.message.robot != "r1":
+                continue
+            again = computed[identity(each.sample.key, each.message)]
+            assert encoded(again) == each.sample.payload
+
+
+def test_localising_leaves_the_map_as_it_was_saved():
+    samples, centre, _ = short_day(localise=True)
+    saved, fused = first_day()[1], final_map(samples)
+    assert (fused.ids, fused.means, fused.covariance) == (
+        saved.ids,
+        saved.means,
+        saved.covariance,
+    )
+    assert fused.frame == "map-site/0"
+    for each in messages_of(samples, m.FusedMap):
+        assert (each.ids, each.means) == (saved.ids, saved.means)
+    assert {each.robot for each in messages_of(samples, m.Trajectory)} == {"r1", "r2"}
+    with pytest.raises(NothingToSaveError):
+        centre.maps.fold.save_map("later")
+
+
+def test_a_landmark_that_the_map_lacks_is_left_out_of_submaps():
+    saved = first_day()[1]
+    submap = messages_of(short_day()[0], m.Submap)[0]
+    numbers = ids(submap.ids, "ids")
+    few = ids(saved.ids, "ids")
+    assert restricted(submap, [saved]) is submap
+    without = msgspec.structs.replace(saved, ids=from_ids(few[few != numbers[0]]))
+    taken = restricted(submap, [without])
+    taken.check()
+    assert ids(taken.ids, "ids").tolist() == numbers[1:].tolist()
+    whole, marginal = (translate.local_map_of(each) for each in (submap, taken))
+    keep = np.delete(np.arange(len(whole.mean)), np.arange(2) + len(whole.mean) - 2 * len(numbers))
+    assert (marginal.mean == whole.mean[keep]).all()
+    assert (marginal.covariance == whole.covariance[np.ix_(keep, keep)]).all()
+    assert np.allclose(marginal.sensitivity, whole.sensitivity[:, keep], rtol=1e-6)
+
+
+def test_localising_in_the_map_of_another_site_gives_no_path_and_the_same_map():
+    samples, _, _ = short_day(localise=True, wrong=True)
+    assert not messages_of(samples, m.Trajectory)
+    assert final_map(samples).means == with_means(elsewhere).means
+
+
+def test_the_command_localises_a_log_again(tmp_path):
+    log, site, result = (tmp_path / name for name in ("log.mcap", "site.map", "x.json"))
+    with Recorder(log, "small", {"seed": "1"}) as recorder:
+        recorder.write(short_day()[0])
+    write_map(site, first_day()[1])
+    run = CliRunner().invoke
+    made = run(app, ["localise", "--map", str(site), str(log), "--json", str(result)])
+    assert made.exit_code == 0, made.output
+    figures = json.loads(result.read_text())["recomputed"]
+    assert figures["map"]["frame"] == "map-site/0"
+    assert len(figures["map"]["landmarks"]) == 18
+    without = run(app, ["launch", "thesis-b", "--localise"])
+    assert without.exit_code == 2
+    assert "one saved map" in without.output
