@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from teamslam.central.diagnosis import describe, to_object
@@ -23,10 +22,6 @@ def scenario(world: StressWorld, place: Path) -> Scenario:
     return with_options(load(str(folder / "scenario.toml")), dataset=folder)
 
 
-def robust(of: Scenario) -> Scenario:
-    return msgspec.structs.replace(of, central=msgspec.structs.replace(of.central, robust_c=1.0))
-
-
 def diagnosed(of: Scenario) -> tuple[m.Diagnosis, ...]:
     return final_map(list(run_team(of, streams_of(of)))).diagnosis
 
@@ -36,13 +31,12 @@ def test_a_right_map_has_no_cause_of_misfit(tmp_path: Path, seed: int) -> None:
     assert diagnosed(scenario(replace(WORLD, seed=seed), tmp_path)) == ()
 
 
-@pytest.mark.parametrize("is_robust", [False, True], ids=["least squares", "robust"])
 @pytest.mark.parametrize("by", [(0.5, 0.0), (1.4, 1.4)], ids=["half a metre", "two metres"])
 def test_a_landmark_that_was_moved_is_named_with_its_motion(
-    tmp_path: Path, by: tuple[float, float], is_robust: bool
+    tmp_path: Path, by: tuple[float, float]
 ) -> None:
     of = scenario(replace(WORLD, moved=(MovedLandmark(7, by, 60.0),)), tmp_path)
-    first, *_ = diagnosed(robust(of) if is_robust else of)
+    first, *_ = diagnosed(of)
     assert (first.cause, first.landmark) == ("landmark_moved", 7)
     for value, sigma, true in zip(first.value, first.sigma, by, strict=True):
         assert value == pytest.approx(true, abs=4.0 * sigma)
@@ -52,20 +46,16 @@ def test_a_landmark_that_was_moved_is_named_with_its_motion(
 
 
 def test_one_number_of_two_landmarks_is_named(tmp_path: Path) -> None:
-    first, *_ = diagnosed(robust(scenario(replace(WORLD, same_id=((3, 9),)), tmp_path)))
+    first, *_ = diagnosed(scenario(replace(WORLD, same_id=((3, 9),)), tmp_path))
     assert (first.cause, first.landmark) == ("identity_shared", 3)
 
 
-@pytest.mark.parametrize("is_robust", [False, True], ids=["least squares", "robust"])
-def test_a_robot_that_was_carried_off_is_named_with_place_and_time(
-    tmp_path: Path, is_robust: bool
-) -> None:
+def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path: Path) -> None:
     off = CarriedOff("r2", 4.0, 0.6, 50.0)
     of = scenario(replace(TEAM, carried_off=(off,)), tmp_path)
-    (found,) = diagnosed(robust(of) if is_robust else of)
+    (found,) = diagnosed(of)
     assert (found.cause, found.robot) == ("carried_off", "r2")
-    if is_robust:  # a withdrawn robot's own motion in the spoilt submap is not told apart
-        assert math.hypot(*found.value[:2]) == pytest.approx(4.0, abs=0.5)
+    assert math.hypot(*found.value[:2]) == pytest.approx(4.0, abs=0.5)
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
 
 

@@ -250,6 +250,8 @@ def test_without_a_submap_the_final_map_is_empty():
 
 
 def test_a_final_map_whose_covariances_are_too_small_says_so_itself():
-    assert not final(whole()).reasons
+    right = final(whole())
+    assert (right.reasons, right.diagnosis) == ((), ())
     tight = final(whole(msgspec.structs.replace(CONFIG, covariance_factor=0.02)))
-    assert any("its covariances are not to be trusted" in words for words in tight.reasons)
+    assert any("the covariances are too small" in words for words in tight.reasons)
+    assert "noise_underestimated" in {each.cause for each in tight.diagnosis}

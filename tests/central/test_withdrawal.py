@@ -205,7 +205,9 @@ def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimate
     )
     final = final_map(run(msgspec.structs.replace(of, robots=team), "odometry"))
     assert final.withdrawn == ()
-    assert any("r3 drives -2" in each and "than its odometry" in each for each in final.reasons)
+    (found,) = final.diagnosis
+    assert (found.cause, found.robot) == ("odometry_scale", "r3")
+    assert found.value[0] == pytest.approx(-0.25, abs=4.0 * found.sigma[0])
 
 
 def test_no_number_of_robots_withdraws_a_robot_by_what_they_report() -> None:
