@@ -27,6 +27,7 @@ ITERATIONS = 15
 TOLERANCE = 1e-4
 """Largest change [m, rad] of the last step."""
 
+
 def robust(island: Island) -> Island:
     """Solve an island with a robust loss, from its state."""
     settings = island.settings
