@@ -27,8 +27,8 @@ from teamslam.team.wire import messages as m
 SIGMAS = 4.0
 """Least size of a shared error in its standard deviations."""
 NONLINEAR = 0.08
-"""Standard deviation of a shared error's estimate as a share of it. The submaps' sensitivities are a
-smoother's; the mean of 100 particles answers errors by a few per cent more.
+"""Standard deviation of a shared error's estimate as a share of it. The submaps' sensitivities are
+a smoother's; the mean of 100 particles answers errors by a few per cent more.
 """
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the others' map to show a reflection."""
@@ -142,8 +142,8 @@ _REMEDIES: Mapping[str, str] = {
 def _shared_errors(biases: Sequence[BiasEstimate], scale: float) -> Iterator[m.Diagnosis]:
     """Find errors that differ from the robot's configuration beyond doubt.
 
-    A covariance scale above 1 enlarges the standard deviations by its root. That of an error that is
-    found is larger by the error of its sensitivities, which vanishes with it.
+    A covariance scale above 1 enlarges the standard deviations by its root. That of an error that
+    is found is larger by the error of its sensitivities, which vanishes with it.
     """
     for (robot, _), bias, value, stated in biases:
         error, sigma = _ERRORS.get(bias), stated * math.sqrt(max(scale, 1.0))

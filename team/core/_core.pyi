@@ -264,13 +264,13 @@ class SubmapFactor:
 
     mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).
     sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with
-    which the bias moves it, 0 or 1; -1 for none. is_measured: False for a saved map, whose errors belong
-    to no range. A state is additive; `at` has the index in it of the first number of each member.
+    which the bias moves it, 0 or 1; -1 for none. curvature: ∂²mean/∂b², a row per bias.
+    is_measured: False for a saved map, whose errors belong to no range. A state is additive; `at` has the index in it of the first number of each member.
     """
 
-    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64], is_measured: bool = True) -> None: ...
+    def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64], is_measured: bool = True, curvature: NDArray[numpy.float64] | None = None) -> None: ...
 
-    def with_errors(self, sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64]) -> SubmapFactor:
+    def with_errors(self, sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64], curvature: NDArray[numpy.float64] | None = None) -> SubmapFactor:
         """Make the same submap with other biases."""
 
     def normal(self, state: NDArray[numpy.float64], at: NDArray[numpy.int64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
@@ -1030,12 +1030,12 @@ class Window:
         Replace the paths (K, M, 3), with the particles at their ends, the weights and the landmarks.
         """
 
-    def sensitivity(self, mean: NDArray[numpy.float64], with_nodes: bool) -> tuple[NDArray[numpy.float64], int]:
+    def sensitivity(self, mean: NDArray[numpy.float64], with_nodes: bool) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int]:
         """
         Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.
 
         Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother
-        about the particles' mean path; and the index in `gaussian.FAULTS` of why there are none.
+        about the particles' mean path; rows of second derivatives, that of clock_offset with nodes, else zero; and the index in `gaussian.FAULTS` of why there are none.
         """
 
     @property

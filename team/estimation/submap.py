@@ -89,9 +89,9 @@ class LocalMap:
     covariance: symmetric positive definite, [m², m·rad, rad²]. node_stamps: team time of the K pose
     nodes [ns], strictly ascending. biases, sensitivity: errors b that the robot's submaps share,
     ascending, and a row S = ∂mean/∂b of each. curvature: rows D = ∂²mean/∂b², zero but for the
-    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the unnamed landmarks, those from
-    number 2³¹ on. The start pose is exactly zero with zero
-    uncertainty: the submap contains no information from outside the window.
+    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the unnamed landmarks, those
+    from number 2³¹ on. The start pose is exactly zero with zero uncertainty: the submap contains
+    no information from outside the window.
     """
 
     ids: UInt32[np.ndarray, " L"]

@@ -69,8 +69,8 @@ class SubmapCorrection(NamedTuple):
     biases: tuple[tuple[Bias, float, float], ...] = ()
 
     def taken(self, local: LocalMap) -> LocalMap:
-        """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D, with the
-        submap's sensitivity S and curvature D.
+        """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D,
+        with the submap's sensitivity S and curvature D.
 
         The remaining uncertainty of b is taken as independent of the map; the true correlation
         makes this covariance rather too large than too small. A bias without an estimate is zero.

@@ -54,12 +54,12 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     sightings: Count = 0
     biases: tuple[Bias, ...] = ()
     sensitivity: bytes = b""
-    curvature: bytes = b""
     gated: Count = 0
     counts: Ids = b""
     seen: bytes = b""
     keyframes: Count = 0
     classes: Floats = b""
+    curvature: bytes = b""
 
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")

@@ -90,6 +90,17 @@ def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements
     assert np.abs(answered - row).max() < 0.15 * np.abs(row).max()
 
 
+def test_the_clocks_derivative_changes_as_the_curvature_states():
+    """A window that is late by b is the true one less S b and ½ D b², and S alone is worse."""
+    late, errors = 0.4, dict.fromkeys(BIASES, 0.0)
+    true, off = window_of(**errors), window_of(**(errors | {"clock_offset": late}))
+    clock = BIASES.index("clock_offset")
+    linear = off.mean + late * off.sensitivity[clock]
+    bent = linear + 0.5 * late**2 * off.curvature[clock]
+    assert np.abs(bent - true.mean).max() < 0.5 * np.abs(linear - true.mean).max()
+    assert not np.delete(off.curvature, clock, axis=0).any()
+
+
 def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
     front = FrontEnd(particles=10, biases=BIASES)
     window, random = windows.open_window(front, Sensor()), random_numbers(1, "r1", 0, 0)
@@ -218,7 +229,7 @@ def test_the_rows_are_those_of_a_dense_smoother_whose_jacobians_are_differences(
     nodes, away = (1, 4), se2.inverse(np.array(mount))
     window, motions = some_window(seed, SMOOTHED, nodes, mount)
     mean = window.close()[1]
-    rows, fault = window.sensitivity(mean, True)
+    rows, _, fault = window.sensitivity(mean, True)
     assert fault == 0
     points = np.array([se2.transformed(away, p) for p in mean[9:].reshape(-1, 2)])
     answer = stated(window, motions, points).T
@@ -243,7 +254,7 @@ def wrap_pose(difference):
 
 def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
     window = core.Window(5, noise_of(SMOOTHED))
-    rows, fault = window.sensitivity(np.zeros(3), True)
+    rows, _, fault = window.sensitivity(np.zeros(3), True)
     assert rows.shape == (5, 3)
     assert not rows.any()
     assert fault == 0
@@ -288,12 +299,15 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
     n = 3 + 2 * count
     state = rng.normal(0.0, 3.0, 6 + 2 * count + biases)
     mean, sensitivity = rng.normal(0.0, 3.0, n), rng.normal(size=(biases, n))
+    curvature = 0.1 * rng.normal(size=(biases, n))
     root = rng.normal(size=(n, n)) + 3.0 * np.eye(n)
     information = root @ root.T
 
     def residual(x):
         points = x[6 : 6 + 2 * count].reshape(-1, 2)
-        r = local_truth(x[:3], x[3:6], points) - mean - x[6 + 2 * count :] @ sensitivity
+        r = local_truth(x[:3], x[3:6], points) - mean
+        b = x[6 + 2 * count :]
+        r = r - b @ sensitivity - 0.5 * b**2 @ curvature
         r[2] = wrap(r[2])
         return r
 
@@ -304,8 +318,8 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
     at = np.array(
         [0, 3, *(6 + 2 * k for k in range(count)), *range(len(state) - biases, len(state))]
     )
-    powers = np.zeros(biases, np.int64)
-    factor = core.SubmapFactor(mean, information, np.zeros((count, 3)), sensitivity, powers)
+    powers, points = np.zeros(biases, np.int64), np.zeros((count, 3))
+    factor = core.SubmapFactor(mean, information, points, sensitivity, powers, curvature=curvature)
     hessian, gradient, chi2 = factor.normal(state, at)
     r = residual(state)
     tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
