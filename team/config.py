@@ -28,6 +28,8 @@ MAP = "map-"
 """Before the name of a saved map, where members of the set have that of a robot."""
 SURVEY = MAP + "survey"
 """The member of the set that has the surveyed landmarks."""
+SURVEY_FRAME = SURVEY + "/0"
+"""The frame that its start fixes."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
 """The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.saved_map import submap_of
-from teamslam.team.translate import SURVEY_FRAME
 from teamslam.team.wire import messages as m
 
 Stream = tuple[str, int]

@@ -6,7 +6,7 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from teamslam.team.config import SURVEY, UNNAMED, RobotConfig
+from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
 from teamslam.team.estimation.inter_robot import InterRobotFactor
@@ -36,10 +36,6 @@ from teamslam.team.wire.codec import unsound
 def frame_name(robot: str, incarnation: int) -> str:
     """Name the frame that the start of a stream fixes."""
     return f"{robot}/{incarnation}"
-
-
-SURVEY_FRAME = frame_name(SURVEY, 0)
-"""The frame of surveyed landmarks."""
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:

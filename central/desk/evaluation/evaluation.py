@@ -44,7 +44,7 @@ from teamslam.central.desk.names import data_set_name, in_order, not_joined, sho
 from teamslam.central.diagnosis import describe, to_object
 from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
-from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
@@ -321,7 +321,7 @@ def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
     """
     if fused is None or not fused.members:
         return frames.none_is_known
-    if fused.frame == translate.SURVEY_FRAME:
+    if fused.frame == SURVEY_FRAME:
         return False
     return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
 

@@ -16,12 +16,13 @@ from teamslam.central.desk.evaluation.errors import (
 )
 from teamslam.central.fused import START_POSES
 from teamslam.team import translate
+from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.estimation.consistency import chi2_quantile, nees
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
 
-KNOWN_FRAMES = {"", START_POSES, translate.SURVEY_FRAME}
+KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}
 """Frames with truth that no stream's start fixes."""
 SPACING_NS = 100_000_000
 """Least spacing of compared estimates."""
