@@ -46,9 +46,9 @@ void run_odometry(bool turns_first, bool is_mounted) {
     if (k % 5 == 0) odometry.mark_sighting();
     if (k % 9 == 0) add(odometry.pass_unnamed_scan());
     if (k % 7 == 0) {
-      const auto [motion, shift, rest] = odometry.end_keyframe();
+      const auto [motion, shift, seconds, rest] = odometry.end_keyframe();
       add(motion);
-      for (const double x : {shift.forward, shift.left, shift.turn}) add(x);
+      for (const double x : {shift.forward, shift.left, shift.turn, seconds}) add(x);
       if (rest) add(*rest);
     }
     if (k % 13 == 0) {
