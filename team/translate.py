@@ -198,8 +198,10 @@ def _sensitivity_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
 
 
 def _curvature_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
-    if not message.curvature:
+    if not message.biases:
         return NO_COLUMNS
+    if not message.curvature:
+        return np.zeros((len(message.biases), len(message.mean) // 8))
     row = derivatives(message.curvature, len(message.mean) // 8, "curvature")
     return np.array([row * (bias == "clock_offset") for bias in message.biases])
 

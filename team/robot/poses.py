@@ -34,7 +34,6 @@ class PoseEstimator(Protocol):
 
     writer: MessageWriter
     submaps: Submaps
-    own_map: OwnMap
 
     @property
     def sequence(self) -> int:
@@ -45,6 +44,13 @@ class PoseEstimator(Protocol):
 
     def own_pose(self, window: LocalMap | None) -> PoseGaussian:
         """The pose by own measurements alone, given the open window."""
+
+
+@runtime_checkable
+class SelfPlacing(Protocol):
+    """A mapper whose own map can be laid on landmarks of the team's map."""
+
+    own_map: OwnMap
 
 
 class RunningPoses:
@@ -146,9 +152,12 @@ class RunningPoses:
             with np.errstate(all="ignore"):  # a pose that is not finite is withheld
                 if prior.in_team_frame:
                     posed = self.team_map.pose(prior, estimator.submaps, window).pose
-                elif (placed := self.team_map.place(prior, estimator.own_map, window)) is None:
-                    return out
                 else:
+                    if not isinstance(estimator, SelfPlacing):
+                        return out
+                    placed = self.team_map.place(prior, estimator.own_map, window)
+                    if placed is None:
+                        return out
                     posed = placed
         except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
             self._warnings.append(f"no team pose from the fused map: {error}")
