@@ -18,7 +18,14 @@ from teamslam.team.estimation.contribution import Stream, is_map
 from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import derivatives, floats, from_floats, from_ids, ids
+from teamslam.team.wire.arrays import (
+    derivatives,
+    floats,
+    from_derivatives,
+    from_floats,
+    from_ids,
+    ids,
+)
 
 
 def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
@@ -32,13 +39,18 @@ def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
     poses = len(mean) - 2 * len(numbers)
     rows = np.flatnonzero(np.concatenate([np.ones(poses, np.bool_), np.repeat(keep, 2)]))
     P = unpacked(floats(submap.covariance, "covariance"), len(mean))
-    shared = derivatives(submap.sensitivity, len(mean) * len(submap.biases), "sensitivity")
+
+    def kept(data: bytes, count: int, what: str) -> bytes:
+        found = derivatives(data, len(mean) * count, what).reshape(count, len(mean))
+        return from_derivatives(found[:, rows])
+
     return msgspec.structs.replace(
         submap,
         ids=from_ids(numbers[keep]),
         mean=from_floats(mean[rows]),
         covariance=from_floats(packed(P[np.ix_(rows, rows)])),
-        sensitivity=shared.reshape(len(submap.biases), len(mean))[:, rows].astype("<f4").tobytes(),
+        sensitivity=kept(submap.sensitivity, len(submap.biases), "sensitivity"),
+        curvature=kept(submap.curvature, int(bool(submap.curvature)), "curvature"),
     )
 
 
