@@ -101,7 +101,7 @@ class LocalMap:
     biases: tuple[Bias, ...] = ()
     sensitivity: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
     unnamed: Unnamed = NONE_UNNAMED
-    curvature: Float[np.ndarray, "B _"] = field(default_factory=NO_COLUMNS.copy)
+    curvature: Float[np.ndarray, "_ _"] = field(default_factory=NO_COLUMNS.copy)
 
     def __post_init__(self) -> None:
         """Make the curvature's zeros."""
