@@ -71,6 +71,7 @@ def team_map(
     biases: Sequence[BiasEstimate],
     reasons: tuple[str, ...],
     diagnosis: tuple[m.Diagnosis, ...],
+    left_out: Mapping[Stream, int],
     changes: tuple[m.LandmarkChange, ...] = (),
 ) -> m.FusedMap:
     """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
@@ -98,6 +99,7 @@ def team_map(
         dof=round(cost[1]),
         reasons=reasons,
         diagnosis=diagnosis,
+        left_out=tuple(version_entry(*each) for each in left_out.items()),
         biases=tuple(
             m.BiasEstimate(
                 robot=b.stream[0],

@@ -214,11 +214,12 @@ class SubmapFold:
         if self.config.localise:
             fold = in_saved_map(fold)
         shown = shown_landmarks(fold, self.config, tail)
+        withdrawn = ticks.submaps_of_withdrawn()
         self.diagnosis = diagnose(
             fold,
             biases,
             cuts_of(fold),
-            ticks.submaps_of_convicted(),
+            withdrawn,
             self.config.normal_scale,
             scale,
             final=final,
@@ -239,6 +240,7 @@ class SubmapFold:
             biases=biases,
             reasons=self._warnings if final else self.reasons,
             diagnosis=self.diagnosis,
+            left_out={x.stream: x.sequence for each in withdrawn.values() for x in each},
             changes=landmark_changes(fold, shown.ids) if final else (),
         )
         if self.config.localise and (saved := min(store.maps.items(), default=None)) is not None:

@@ -467,13 +467,13 @@ class TickFold:
                 return fold
         return self._fold_others((), math.inf, None).fold
 
-    def submaps_of_convicted(self) -> Mapping[str, Sequence[Contribution]]:
-        """Return the submaps of each robot that the fold has withdrawn, in order."""
+    def submaps_of_withdrawn(self) -> Mapping[str, Sequence[Contribution]]:
+        """Return the submaps of each robot that the fold leaves out, in order."""
         return {
             robot: [
                 each for _, chain in sorted(self._inputs.chains(robot).items()) for each in chain
             ]
-            for robot in sorted(self.convicted)
+            for robot in self.withdrawn
         }
 
     @property

@@ -159,7 +159,8 @@ class _RecordedSet:
         are missing.
         """
         stored = self._store.chains
-        vector = {(x.robot, x.incarnation): x.sequence for x in fused.members}
+        named = (*fused.members, *fused.left_out)
+        vector = {(x.robot, x.incarnation): x.sequence for x in named}
         if any(len(stored.get(stream, ())) <= last for stream, last in vector.items()):
             return None
         return {stream: stored[stream][: last + 1] for stream, last in vector.items()}

@@ -170,7 +170,8 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     map names the first and last few members of each. decisions: the newest closures and merges of
     robots, then the waiting ones. verdicts: the operators' verdicts in the map. changes: in a final
     map with a saved one, the state of each landmark, by number. diagnosis: causes of misfit, the
-    best one first.
+    best one first. left_out: the version vector of the withdrawn robots' submaps, which the
+    diagnosis compares with the map.
     """
 
     rule: Text
@@ -199,6 +200,7 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     verdicts: tuple[Judgement, ...] = ()
     changes: tuple[LandmarkChange, ...] = ()
     diagnosis: tuple[Diagnosis, ...] = ()
+    left_out: tuple[VersionEntry, ...] = ()
 
     def check(self) -> None:  # noqa: D102
         for each in self.memberships:
