@@ -6,22 +6,14 @@ import msgspec
 from msgspec import Meta
 
 from teamslam.team.association import AssociationProfile
-from teamslam.team.config import UNNAMED, Bounds, FusionRule, NonNegative, Positive
-
-
-class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior scales of the errors shared by all submaps of a robot.
-
-    The prior is Student's t of one degree of freedom: most robots are as well calibrated as the
-    scale, and one that is not may be off by any amount. bearing [rad]; clock_offset [s];
-    range_offset [m]; range_scale, forward_scale: shares of the range and of the distance driven.
-    """
-
-    bearing: Positive = 0.002
-    clock_offset: Positive = 0.005
-    range_offset: Positive = 0.005
-    range_scale: Positive = 0.005
-    forward_scale: Positive = 0.0015
+from teamslam.team.config import (
+    UNNAMED,
+    BiasSigmas,
+    Bounds,
+    FusionRule,
+    NonNegative,
+    Positive,
+)
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -271,6 +271,21 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("biases are named once each, in alphabetical order")
 
 
+class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Prior scales of the errors shared by all submaps of a robot.
+
+    The prior is Student's t of one degree of freedom: most robots are as well calibrated as the
+    scale, and one that is not may be off by any amount. bearing [rad]; clock_offset [s];
+    range_offset [m]; range_scale, forward_scale: shares of the range and of the distance driven.
+    """
+
+    bearing: Positive = 0.002
+    clock_offset: Positive = 0.005
+    range_offset: Positive = 0.005
+    range_scale: Positive = 0.005
+    forward_scale: Positive = 0.0015
+
+
 class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Physical bounds; values beyond them are refused with the reason."""
 

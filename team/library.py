@@ -13,10 +13,11 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import cast
 
+import msgspec
 import numpy as np
 
 from teamslam.team import core, translate
-from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.config import BIASES, BiasSigmas, FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.fastslam import (
@@ -214,7 +215,8 @@ def join(
     for robot, initial in sorted(initial_poses.items()):
         start = InitialPoseFactor(robot, _INCARNATION, initial.pose, initial.covariance)
         fold = joining.started(fold, start)
-    chosen = settings or JoinSettings()
+    sigmas = msgspec.structs.asdict(BiasSigmas())
+    chosen = settings or JoinSettings(bias_sigma={bias: sigmas[bias] for bias in BIASES})
     for tick in _ticks(submaps):
         fold = joining.folded(fold, tick, chosen)
     fold = joining.converged(fold, chosen)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from teamslam.central.config import BiasSigmas
 from teamslam.sim.recorded.chains import Chain, Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.batch_reference.errors import (
@@ -19,7 +18,7 @@ from teamslam.sim.studies.batch_reference.errors import (
 )
 from teamslam.sim.studies.batch_reference.graph import pose_key, values_of
 from teamslam.sim.studies.batch_reference.reference import batch_map
-from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.config import BiasSigmas, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.models import increment_of, noise, predicted
 from teamslam.team.estimation.se2 import Pose

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from teamslam.central.config import BiasSigmas
 from teamslam.sim.recorded.chains import Chain
 from teamslam.sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
-from teamslam.team.config import Sensor
+from teamslam.team.config import BiasSigmas, Sensor
 from teamslam.team.estimation.models import NEAREST_M, predicted
 from teamslam.team.estimation.se2 import Point, wrapped
 from teamslam.team.shapes import Float

@@ -247,6 +247,8 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     def check(self) -> None:  # noqa: D102
         check_ascending(self.ids, "ids")
         n = 2 * len(ids(self.ids, "ids")) + 3 * self.in_team_frame
+        if n == 0 and (self.mean or self.covariance):
+            raise ValueError("wrong length: a prior that withdraws contains an estimate")
         check_finite(self.mean, "mean", n)
         check_packed_covariance(self.covariance, n, "covariance")
 

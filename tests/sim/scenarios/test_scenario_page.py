@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.config import BiasSigmas, CentralConfig, CommonBiasSigmas, SurveyedLandmark
+from teamslam.central.config import CentralConfig, CommonBiasSigmas, SurveyedLandmark
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
@@ -20,6 +20,7 @@ from teamslam.sim.world.config import (
 )
 from teamslam.team.config import (
     AssociationSettings,
+    BiasSigmas,
     Bounds,
     FrontEnd,
     Lens,
