@@ -77,9 +77,9 @@ def test_the_scale_of_unseen_speeds_is_estimated_from_the_ranges() -> None:
     assert run.scale == pytest.approx(1.0, abs=0.008)
     assert run.map.errors is not None
     assert run.map.errors.in_band
-    told = [words for words in run.map.reasons if "farther than its odometry measures" in words]
-    assert len(told) == 3
-    assert all("drives +" in words for words in told)
+    told = [each for each in run.map.diagnosis if each.cause == "odometry_scale"]
+    assert len({each.robot for each in told}) == len(told) == 3
+    assert all(each.value[0] > 0.0 for each in told)
     assert not any("not valid" in words for words in run.map.reasons)
 
 
