@@ -156,8 +156,11 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
         )
     order = m.TeamEnd(stamp_ns=0, by="operator", reason=reason)
     bus.publish(Outgoing(ch.END_ORDER, "", order))
+    ends = (ch.TEAM_END, ch.FINAL_MAP)
+    if not bus.is_alive("central"):  # without a centre each robot's own map is its end
+        ends = (*ends, ch.TEAM_FINAL)
     for channel, _ in team.messages(patience_s):
-        if channel in (ch.TEAM_END, ch.FINAL_MAP, ch.TEAM_FINAL):
+        if channel in ends:
             return
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 

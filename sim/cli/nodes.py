@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from teamslam.team.config import RobotConfig
     from teamslam.team.recording.own_log import OwnLog
     from teamslam.team.wire.bus import Bus
+    from teamslam.team.wire.channels import Channel
     from teamslam.team.wire.messages import SavedMap
 
 _LOG = logging.getLogger("teamslam")
@@ -383,7 +384,7 @@ def record(
     from teamslam.team.recording.reader import LogError
     from teamslam.team.recording.shell import record as record_until_end
     from teamslam.team.shell import process
-    from teamslam.team.wire.channels import robot_node
+    from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL, robot_node
 
     resolved = scenario_of(scenario)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -395,13 +396,17 @@ def record(
     exists = output.exists()
     if exists and not output.is_file():
         refuse_existing(output)
+    peers = [robot.id for robot in resolved.robots] if resolved.peers else []
+    ends = (FINAL_MAP, TEAM_FINAL) if peers else (FINAL_MAP,)
     try:
-        is_over = exists and not check_continues(output, resolved.team, metadata, same_run=resume)
+        is_over = exists and not check_continues(
+            output, resolved.team, metadata, same_run=resume, ends=ends
+        )
     except LogError as error:
         fail(str(error), WRONG_USE)
     if is_over:
         typer.echo(f"{output} was finished by an earlier recorder", err=True)
-        _fail_if_provisional(_joined(output) if join_parts else parts_of(output))
+        _fail_if_provisional(_joined(output) if join_parts else parts_of(output), ends)
         return
     expected = [robot_node(r.id) for r in resolved.robots]
     expected += ["central"] if resolved.centre else []
@@ -428,12 +433,12 @@ def record(
                 lambda: next_part(output, resolved.team, metadata),
                 stop=stop,
                 scenario=configurations,
-                peers=[robot.id for robot in resolved.robots] if resolved.peers else (),
+                peers=peers,
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
             parts = _joined(output) if join_parts else parts_of(output)
-    _fail_if_provisional(parts)
+    _fail_if_provisional(parts, ends)
 
 
 def _joined(log: Path) -> list[Path]:
@@ -453,23 +458,26 @@ def _joined(log: Path) -> list[Path]:
     return parts
 
 
-def _fail_if_provisional(parts: Sequence[Path]) -> None:
-    if lacks := _lacking_in(parts):
+def _fail_if_provisional(parts: Sequence[Path], ends: "Sequence[Channel]") -> None:
+    if lacks := _lacking_in(parts, ends):
         fail(lacks, FAILED)
 
 
-def _lacking_in(parts: Sequence[Path]) -> str:
-    """Robots missing in the final map of a log, as text."""
+def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
+    """Describe the robots that the final maps of a log lack.
+
+    ends: channels of final maps. Each author's last map counts: the others are not its final one.
+    """
     from teamslam.team.recording.reader import LogError, open_log
     from teamslam.team.shell import lacking
-    from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL
     from teamslam.team.wire.codec import WireError, decoded
     from teamslam.team.wire.messages import FusedMap
 
+    found: dict[str, str] = {}
     for part in parts:
         try:
-            for sample in open_log(part).samples([FINAL_MAP, TEAM_FINAL]):
-                return lacking(decoded(sample.payload, FusedMap))
+            for sample in open_log(part).samples(ends):
+                found[sample.key] = lacking(decoded(sample.payload, FusedMap))
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
-    return ""
+    return "; ".join(dict.fromkeys(filter(None, found.values())))

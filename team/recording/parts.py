@@ -29,7 +29,7 @@ from teamslam.team.recording.reader import Log, LogError, log_of, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wall_clock import wall_clock, was_set_since
-from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL
+from teamslam.team.wire.channels import FINAL_MAP, Channel
 
 LONGEST_AWAY_S = 3600.0
 """Age [s] beyond which a log belongs to another run."""
@@ -39,13 +39,18 @@ JOINING = ".joining"
 
 
 def check_continues(
-    path: Path, team: str, metadata: Mapping[str, str], *, same_run: bool = False
+    path: Path,
+    team: str,
+    metadata: Mapping[str, str],
+    *,
+    same_run: bool = False,
+    ends: Sequence[Channel] = (FINAL_MAP,),
 ) -> bool:
     """Whether the run of the log continues; False: it has ended and only `join` remains.
 
     The same run has the same team and scenario and wrote within the hour, or before the wall clock
-    was set. same_run: skips the age test. Raises `LogError` for any other log, and for a finished
-    and joined one unless of this run.
+    was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
+    `LogError` for any other log, and for a finished and joined one unless of this run.
     """
     parts = parts_of(path)
     remedy = "choose another name or remove it"
@@ -66,7 +71,7 @@ def check_continues(
     ):
         what = f"exists, and is from {away_s / 3600:.1f} hours ago"
         raise LogError(path, what, f"{remedy}; --resume if it is of this run")
-    if log is None or not _is_over(open_log(path)):
+    if log is None or not _is_over(open_log(path), ends):
         return True
     joining = path.with_name(path.name + JOINING).exists() or len(parts) > 1
     if not (same_run or joining or joined_leftovers(path)):
@@ -74,11 +79,11 @@ def check_continues(
     return False
 
 
-def _is_over(log: Log) -> bool:
-    """Whether a log was finished after the final map."""
+def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
+    """Whether a log was finished after a map that ends its team."""
     with suppress(LogError):
         if log.complete:
-            chunks = log.chunks([FINAL_MAP, TEAM_FINAL])
+            chunks = log.chunks(ends)
             return any(chunk for chunk in chunks if not isinstance(chunk, LogError))
     return False
 

@@ -154,6 +154,15 @@ def test_the_parts_of_a_log_are_read_as_one(path: Path) -> None:
     assert not [each for each in check_log(log) if each.where == "file"]
 
 
+def test_a_robots_final_map_ends_the_log_of_a_team_without_a_centre_only(path: Path) -> None:
+    recorder, _ = next_part(path, "t", {"scenario": "s"})
+    with recorder:
+        recorder.write([Sample(c.TEAM_FINAL.key("r1"), encoded(FINAL), 0, 0, 0)])
+    assert check_continues(path, "t", {"scenario": "s"})
+    with pytest.raises(LogError, match="exists, with the final map of its run"):
+        check_continues(path, "t", {"scenario": "s"}, ends=(c.FINAL_MAP, c.TEAM_FINAL))
+
+
 @pytest.mark.parametrize("written", [0, 8, 500, 10**9])
 def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path: Path, written: int) -> None:
     in_two_parts(path)

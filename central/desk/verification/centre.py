@@ -116,7 +116,7 @@ def recorded_map(log: Recorded, name: str) -> m.SavedMap:
 
     Raises RerunError without a final map, NothingToSaveError.
     """
-    found = [f for of in (ch.FINAL_MAP, ch.TEAM_FINAL) for f in log.of(of)]
+    found = [*log.of(ch.FINAL_MAP)] or [*log.of(ch.TEAM_FINAL)]
     finals = [each for each in found if isinstance(each, m.FusedMap) and each.rule == "join"]
     if not finals:
         raise RerunError("the log has no final map of the rule join")
