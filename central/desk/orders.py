@@ -156,11 +156,10 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
         )
     order = m.TeamEnd(stamp_ns=0, by="operator", reason=reason)
     bus.publish(Outgoing(ch.END_ORDER, "", order))
-    ends = (ch.TEAM_END, ch.FINAL_MAP)
-    if not bus.is_alive("central"):  # without a centre each robot's own map is its end
-        ends = (*ends, ch.TEAM_FINAL)
+    # Without a centre each robot's own map is its end.
+    last = ch.FINAL_MAP if bus.is_alive("central") else ch.TEAM_FINAL
     for channel, _ in team.messages(patience_s):
-        if channel in ends:
+        if channel in (ch.TEAM_END, last):
             return
     raise WithdrawError(f"the centre has not followed within {patience_s:g} s; the order stands")
 
