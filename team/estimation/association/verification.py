@@ -50,7 +50,8 @@ class ClosureTests(NamedTuple):
     """Requirements of a closure.
 
     pairs, llr: least number of pairs and least evidence. context: least number of landmarks outside
-    the matched place, relative to the pairs, of the `known` ones of both sides (islands only).
+    the matched place, relative to the pairs, of the `known` ones of both sides (two islands only;
+    0: not tested).
     """
 
     pairs: int
@@ -80,7 +81,7 @@ def find_failed_test(closure: Closure, profile: AssociationProfile, tests: Closu
         return f"share {closure.share:.2f} < {profile.share:g} of what lies there is matched"
     outside = tests.known - 2 * pairs
     least = tests.context * min(pairs, MOST_REPEATED)
-    if outside < least:
+    if tests.context and outside < least:
         return f"context {outside} < {least:.0f} landmarks: nothing to tell it from"
     return ""
 
