@@ -60,7 +60,7 @@ def wrong(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
-def test_every_file_and_name_that_a_page_names_is_there(page: Path) -> None:
+def test_every_file_and_name_that_a_page_names_is_there(page):
     assert wrong(page.read_text()) == []
 
 
@@ -86,11 +86,11 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
-def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+def test_every_link_of_a_page_leads_somewhere(page):
     assert dangling(page) == []
 
 
-def test_what_is_not_there_is_found(tmp_path: Path) -> None:
+def test_what_is_not_there_is_found(tmp_path):
     (tmp_path / "page.md").write_text("# A heading\n[a](#a-heading) [b](#none) [c](gone.md)\n")
     assert dangling(tmp_path / "page.md") == ["#none", "gone.md"]
     assert wrong("see `team/shell.py: Shell.run` and `team/nothing.py`") == ["team/nothing.py"]
@@ -98,7 +98,7 @@ def test_what_is_not_there_is_found(tmp_path: Path) -> None:
     assert wrong("`docs/wire.md: Keys`, `team/wire/`") == []
 
 
-def test_the_laws_are_named_with_what_enforces_and_what_proves_them() -> None:
+def test_the_laws_are_named_with_what_enforces_and_what_proves_them():
     rows = re.findall(r"^\| \*\*(\d)\. .+$", ARCHITECTURE, re.MULTILINE)
     assert rows == ["1", "2", "3", "4"]
     table = ARCHITECTURE[ARCHITECTURE.index("## The four laws") :]
@@ -138,13 +138,13 @@ def unknown(line: str) -> str | None:
 
 
 @pytest.mark.parametrize("page", PAGES + DECISIONS + NOTES, ids=lambda page: page.name)
-def test_every_command_and_option_that_a_page_names_exists(page: Path) -> None:
+def test_every_command_and_option_that_a_page_names_exists(page):
     text = page.read_text()
     named = [" ".join(each.split()) for each in COMMAND.findall(text) + SPOKEN.findall(text)]
     assert [why for each in named if (why := unknown(each))] == []
 
 
-def test_a_command_or_an_option_that_is_not_there_is_found() -> None:
+def test_a_command_or_an_option_that_is_not_there_is_found():
     assert unknown("launch thesis --seed 2") is None
     assert unknown("log cut LOG --from 60 -o NEW") is None
     assert unknown("experiment … --seeds 3") is None

@@ -5,7 +5,6 @@ import json
 import re
 import runpy
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,7 +51,7 @@ def submaps(keyframes, rng, window=5):
     ]
 
 
-def test_every_name_of_the_library_comes_from_team_and_is_documented() -> None:
+def test_every_name_of_the_library_comes_from_team_and_is_documented():
     for name in library.__all__:
         assert getattr(teamslam, name) is getattr(library, name)
         assert (getattr(teamslam, name).__doc__ or "").strip()
@@ -60,7 +59,7 @@ def test_every_name_of_the_library_comes_from_team_and_is_documented() -> None:
     assert [name for name in library.__all__ if f"`{name}`" not in page] == []
 
 
-def test_two_robots_joined_are_where_the_batch_reference_says() -> None:
+def test_two_robots_joined_are_where_the_batch_reference_says():
     rng = np.random.default_rng(3)
     starts = {"r1": np.zeros(3), "r2": np.array([3.0, -2.0, 0.4])}
     measured = {robot: driven(start, 15, rng)[1] for robot, start in starts.items()}
@@ -77,7 +76,7 @@ def test_two_robots_joined_are_where_the_batch_reference_says() -> None:
     assert np.linalg.norm(last[:2]) < 0.15
 
 
-def test_a_robot_that_shares_too_little_is_apart_and_the_map_says_why() -> None:
+def test_a_robot_that_shares_too_little_is_apart_and_the_map_says_why():
     rng = np.random.default_rng(5)
     _, keyframes = driven(np.zeros(3), 5, rng)
     strangers = [
@@ -96,7 +95,7 @@ def test_a_robot_that_shares_too_little_is_apart_and_the_map_says_why() -> None:
     assert joined.apart["r3"] == "it has no submaps"
 
 
-def test_wrong_use_of_the_library_is_named() -> None:
+def test_wrong_use_of_the_library_is_named():
     with pytest.raises(ValueError, match="no submaps of r9"):
         teamslam.join({}, {"r9": teamslam.InitialPose(pose=np.zeros(3))})
     with pytest.raises(ValueError, match="no submaps at all"):
@@ -110,13 +109,13 @@ def test_wrong_use_of_the_library_is_named() -> None:
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("library") / "log.mcap"
     written(path, team_samples(thesis(60)))
     return path
 
 
-def test_submaps_of_a_log_join_to_its_final_map(log: Path) -> None:
+def test_submaps_of_a_log_join_to_its_final_map(log):
     starts = [opened(sample)[2] for sample in teamslam.open_log(log).samples([ch.START])]
     (final,) = [opened(sample)[2] for sample in teamslam.open_log(log).samples([ch.FINAL_MAP])]
     initial = {
@@ -135,36 +134,27 @@ def ran(name: str, *arguments: str, capsys: pytest.CaptureFixture[str], monkeypa
     return capsys.readouterr().out
 
 
-def test_the_example_of_fastslam_maps_the_landmarks(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_example_of_fastslam_maps_the_landmarks(capsys, monkeypatch, tmp_path):
     out = ran("fastslam.py", str(tmp_path / "f.png"), capsys=capsys, monkeypatch=monkeypatch)
     found = re.fullmatch(r"8 landmarks, RMSE (0\.\d+) m\n", out)
-    assert found is not None
     assert float(found[1]) < 0.2
     assert (tmp_path / "f.png").stat().st_size > 10_000
 
 
-def test_the_example_of_joining_ties_both_robots(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_example_of_joining_ties_both_robots(capsys, monkeypatch, tmp_path):
     out = ran("join_two_maps.py", str(tmp_path / "j.png"), capsys=capsys, monkeypatch=monkeypatch)
     assert "joined: 24 landmarks of r1, r2" in out
     assert out.endswith("not joined: none\n")
     assert (tmp_path / "j.png").stat().st_size > 10_000
 
 
-def test_the_example_of_a_log_joins_it_again(
-    log: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_a_log_joins_it_again(log, capsys, monkeypatch):
     out = ran("read_log.py", str(log), capsys=capsys, monkeypatch=monkeypatch)
     assert "team test, complete" in out
     assert re.search(r"^joined: \d+ landmarks, cost per dof \d", out, re.MULTILINE)
 
 
-def test_the_example_of_a_submap_reads_it_off_a_live_team(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_a_submap_reads_it_off_a_live_team(capsys, monkeypatch):
     with router() as endpoint, ZenohBus("demo", endpoint) as bus:
         bus.publish(Outgoing(ch.SUBMAP, "alpha", submap(0)))
         out = ran("read_submap.py", endpoint, "demo", capsys=capsys, monkeypatch=monkeypatch)
@@ -172,7 +162,7 @@ def test_the_example_of_a_submap_reads_it_off_a_live_team(
     assert "landmark 1 at" in out
 
 
-def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_notebook_runs_from_top_to_bottom(capsys):
     cells = json.loads((EXAMPLES / "submap.ipynb").read_text())["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     scope: dict[str, object] = {}
@@ -180,12 +170,11 @@ def test_the_notebook_runs_from_top_to_bottom(capsys: pytest.CaptureFixture[str]
         exec(compile(each, "submap.ipynb", "exec"), scope)
     out = capsys.readouterr().out
     found = re.search(r"mean of 50 windows: (\d\.\d+)", out)
-    assert found is not None
     assert 0.8 < float(found[1]) < 1.3
     assert all(cell.get("outputs", []) == [] for cell in cells), "committed without its outputs"
 
 
-def test_examples_use_nothing_of_ours_but_the_library() -> None:
+def test_examples_use_nothing_of_ours_but_the_library():
     programs = sorted(EXAMPLES.glob("*.py"))
     assert len(programs) == 7
     for program in programs:

@@ -1,12 +1,14 @@
-"""The project around the code: what is shipped, under which licences, what the texts promise."""
+"""The project's own files: versions, pins, extras, compose file, baselines."""
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
 from importlib import metadata
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import jaxtyping
@@ -15,9 +17,10 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from teamslam.team import shapes
+from benchmarks.baseline import Held, baselines, held
+from teamslam.team import extras, shapes
+from tests.support import ROOT
 
-ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
 BUILDING = ("cmake", "nanobind", "ninja", "scikit-build-core")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -54,11 +57,11 @@ def tracked() -> list[Path]:
     return [file for file in files if file.is_file()]
 
 
-def test_the_changelog_tells_of_this_version() -> None:
+def test_the_changelog_tells_of_this_version():
     assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_constraints_pin_every_distribution_by_version_alone() -> None:
+def test_constraints_pin_every_distribution_by_version_alone():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if not line.startswith("#")]
     assert [pin for pin in pins if not re.fullmatch(r"[\w.-]+==[\w.]+", pin)] == []
@@ -67,7 +70,7 @@ def test_constraints_pin_every_distribution_by_version_alone() -> None:
     assert {"pip", "scikit-build-core"} <= pinned
 
 
-def test_the_citation_is_sound_and_tells_of_this_version() -> None:
+def test_the_citation_is_sound_and_tells_of_this_version():
     page = ROOT / "CITATION.cff"
     command = [Path(sys.executable).with_name("check-jsonschema"), page]
     command += ["--builtin-schema", "vendor.citation-file-format"]
@@ -79,7 +82,7 @@ def test_the_citation_is_sound_and_tells_of_this_version() -> None:
     assert cited["authors"] == PROJECT["authors"]
 
 
-def test_every_pinned_distribution_has_its_hashes() -> None:
+def test_every_pinned_distribution_has_its_hashes():
     """`make setup` and the image install distributions with a listed hash alone."""
     pin = re.compile(
         r"^([\w.-]+==[\w.]+)(?: ;.*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M
@@ -99,7 +102,7 @@ def test_every_pinned_distribution_has_its_hashes() -> None:
     assert {"pip", *BUILDING, *closure(*PROJECT["dependencies"])} <= runtime
 
 
-def test_no_path_of_a_machine_is_committed() -> None:
+def test_no_path_of_a_machine_is_committed():
     machine = re.compile(
         rf"(?<![\w.}}])/(?:{'|'.join(['work', 'root', 'farm', 'home', 'Users'])})/"
     )
@@ -112,7 +115,7 @@ def test_no_path_of_a_machine_is_committed() -> None:
     assert found == []
 
 
-def test_no_data_set_and_no_log_is_committed() -> None:
+def test_no_data_set_and_no_log_is_committed():
     data = {".dat", ".zip", ".gz", ".mcap", ".npy", ".npz"}
     assert [file for file in tracked() if file.suffix in data] == []
     assert [file for file in tracked() if file.stat().st_size > 1_000_000] == []
@@ -125,7 +128,7 @@ def commands(page: Path, program: str) -> set[str]:
 
 
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
-def test_every_make_target_that_a_page_names_exists(page: str) -> None:
+def test_every_make_target_that_a_page_names_exists(page):
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     spoken = set(re.findall(r"`make (\w+)`", (ROOT / page).read_text()))
     named = commands(ROOT / page, "make") | spoken
@@ -133,7 +136,7 @@ def test_every_make_target_that_a_page_names_exists(page: str) -> None:
     assert named <= targets
 
 
-def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> None:
+def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command():
     """Each costs every robot of a team memory and time."""
     code = (
         "import sys; sys.argv = ['teamslam', 'robot', 'waypoints', 'r9']\n"
@@ -150,7 +153,7 @@ def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command() -> N
     assert loaded.isdisjoint(kept_out)
 
 
-def test_a_launch_and_its_report_need_no_scipy() -> None:
+def test_a_launch_and_its_report_need_no_scipy():
     """SciPy is half of an environment that has no need of it."""
     parts = (
         "sim.launch.launch", "sim.cli.main", "sim.in_memory.team", "central.main",
@@ -164,12 +167,12 @@ def test_a_launch_and_its_report_need_no_scipy() -> None:
     assert "scipy" not in closure(*PROJECT["dependencies"])
 
 
-def test_shapes_are_checked_in_tests() -> None:
+def test_shapes_are_checked_in_tests():
     assert shapes.Float is jaxtyping.Float
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
-def test_the_linear_algebra_of_a_command_has_one_thread() -> None:
+def test_the_linear_algebra_of_a_command_has_one_thread():
     code = (
         "import os, teamslam.sim.cli.entry, numpy, scipy.linalg\n"
         "for library in numpy, scipy: library.linalg.inv(numpy.eye(64))\n"
@@ -180,3 +183,84 @@ def test_the_linear_algebra_of_a_command_has_one_thread() -> None:
         [sys.executable, "-c", code], env=bare, capture_output=True, text=True, timeout=60
     )
     assert ran.stdout == "1\n", ran.stderr
+
+
+def test_an_extra_is_installed_by_its_packages_wherever_we_come_from(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/opt/a b/python")
+    cluster = extras.install_command("cluster")
+    assert cluster.startswith("'/opt/a b/python' -m pip install 'scipy>=")
+    assert "'joblib>=1.5' 'distributed>=" in cluster
+    assert "teamslam" not in cluster
+
+    def unknown(_: str) -> None:
+        raise PackageNotFoundError
+
+    monkeypatch.setattr(extras, "requires", unknown)
+    assert extras.install_command("cluster").endswith("pip install '.[cluster]'")
+
+
+COMPOSE = ROOT / "docker-compose.yml"
+
+
+@pytest.fixture(scope="module")
+def compose():
+    return yaml.safe_load(COMPOSE.read_text())
+
+
+def test_the_compose_file_is_valid_by_the_compose_specification():
+    """The schema is the one that check-jsonschema carries: nothing is fetched."""
+    schema = ["--builtin-schema", "vendor.compose-spec"]
+    command = [sys.executable, "-m", "check_jsonschema", *schema, str(COMPOSE)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_every_service_runs_the_command_that_its_name_says(compose):
+    commands = {name: service["command"] for name, service in compose["services"].items()}
+    reach = ["--connect", "tcp/router:7447"]
+    assert commands == {
+        "router": ["router", "--listen", "tcp/0.0.0.0:7447", "--insecure"],
+        "world": ["world", "waypoints", *reach],
+        "r1": ["robot", "waypoints", "r1", *reach],
+        "r2": ["robot", "waypoints", "r2", *reach],
+        "r3": ["robot", "waypoints", "r3", *reach],
+        "central": ["central", "waypoints", *reach],
+        "recorder": ["record", "waypoints", *reach, "--output", "/logs/team.mcap"],
+    }
+
+
+def test_nothing_is_published_beyond_the_host_itself(compose):
+    ports = [port for service in compose["services"].values() for port in service.get("ports", [])]
+    assert ports == ["127.0.0.1:7447:7447"]
+
+
+def test_each_baseline_says_how_it_is_measured_and_what_may_be_worse():
+    known = baselines()
+    assert {"growth", "in_memory", "ratios", "recorder", "start"} <= set(known)
+    for name, told in known.items():
+        program = name.partition("-")[0]  # one program may have a second baseline: growth-large
+        assert shlex.split(told["command"])[:3] == ["python", "-m", f"benchmarks.{program}"]
+        assert (ROOT / "benchmarks" / f"{program}.py").is_file()
+        assert told["measured"]
+        for of in told["figures"].values():
+            assert set(of) == {"value", "better", "tolerance"}
+            assert of["better"] in ("less", "more")
+
+
+@pytest.mark.parametrize(
+    ("better", "found", "expected"),
+    [("less", 13.1, True), ("less", 12.9, False), ("more", 6.9, True), ("more", 7.1, False),
+     ("less", float("nan"), True)],
+)  # fmt: skip
+def test_a_figure_is_worse_beyond_its_tolerance(better, found, expected):
+    baseline = {"figures": {"x": {"value": 10.0, "better": better, "tolerance": 0.3}}}
+    (row,) = held({"x": found}, baseline)
+    assert isinstance(row, Held)
+    assert row.is_worse == expected
+
+
+def test_the_ratios_of_seconds_hold():
+    """In a process of its own: here every function's shapes are checked at its call."""
+    command = [sys.executable, "-m", "benchmarks.ratios", "--rounds", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr

@@ -32,9 +32,7 @@ class Waiting:
         return build.status(node="world", state=self.state, warnings=("waiting for robot/r2",))
 
 
-def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(monkeypatch, caplog):
     caplog.set_level(logging.INFO, "teamslam")
     clock = [100.0]
     monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
@@ -66,9 +64,7 @@ class Slow(MemoryBus):
 
 
 @pytest.mark.parametrize("case", ["nobody records", "all is there", "lacks", "away", "back"])
-def test_a_process_stays_while_who_records_may_still_ask_for_something(
-    case: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_stays_while_who_records_may_still_ask_for_something(case, monkeypatch):
     """Without a recorder, or with one that has everything, it leaves at once."""
     clock = [100.0]
     monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
@@ -92,8 +88,8 @@ def test_a_process_stays_while_who_records_may_still_ask_for_something(
 
 @pytest.mark.parametrize("case", ["no report", "gets on", "gets no further", "an earlier life's"])
 def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_not(
-    case: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    case, monkeypatch
+):
     """Without a report a recorder has not read it yet: that ends nothing."""
     clock = [100.0]
     monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
@@ -101,7 +97,7 @@ def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_no
     bus, recorder = Slow(network, clock), MemoryBus(network)
     key = ch.TRAJECTORY.key("r1")
     totals = build.tally(node="central", since_ns=7, keys=(key,), counts=(9,))
-    bus.publish_totals = lambda: totals  # type: ignore[method-assign]
+    bus.publish_totals = lambda: totals
     recorder.declare_alive(RECORDER)
     bus.watch_alive(RECORDER)
     turning = Shell(bus, Waiting(), "central", threading.Event())
@@ -126,7 +122,7 @@ def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_no
     assert stayed == expected.get(case, 300.0)
 
 
-def test_who_has_to_deliver_is_ended_by_the_second_signal_only() -> None:
+def test_who_has_to_deliver_is_ended_by_the_second_signal_only():
     with process("driver", endless=True, patient=True) as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.is_set()

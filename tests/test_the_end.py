@@ -16,7 +16,7 @@ OF_R1, OF_R2 = (ch.TEAM_FINAL.key(robot) for robot in ("r1", "r2"))
 
 
 @pytest.fixture
-def bus() -> MemoryBus:
+def bus():
     """A bus on which everyone's end is replied, and garbage, whatever was asked for."""
 
     def kept(key: str, payload: bytes) -> bytes:
@@ -39,9 +39,7 @@ def bus() -> MemoryBus:
     ],
     ids=["with a centre", "peers", "a driver", "by conclusions"],
 )
-def test_only_the_ends_that_the_team_has_are_taken(
-    bus: MemoryBus, ends: tuple[ch.Channel, ...], robot: str, taken: list[str]
-) -> None:
+def test_only_the_ends_that_the_team_has_are_taken(bus, ends, robot, taken):
     end = TheEnd(bus, "robot/r2", ends, robot)
     assert end.missed() == [Sample(key, encoded(FINAL), 3, 4, 5) for key in taken]
     assert end.missed() == [], "it asks again only after a while"

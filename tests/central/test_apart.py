@@ -53,7 +53,7 @@ def worst_error(samples: tuple[Sample, ...], robot: str) -> float:
 
 
 @pytest.mark.parametrize("wrong", ["r1", "r2", "r3"])
-def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong: str) -> None:
+def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong):
     """Its first submaps can not yet be told from the others'. r1 fixes the frame."""
     samples = mirrored_run(wrong)
     assert final_map(list(samples)).withdrawn == (wrong,)
@@ -61,7 +61,7 @@ def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong: str) -> None:
         assert worst_error(samples, robot) < worst_error(mirrored_run(""), robot) + 1.0
 
 
-def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_are_not() -> None:
+def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_are_not():
     for robot, apart in (("", False), ("r2", True)):
         samples = mirrored_run(robot)
         ticks = of_set(samples)
@@ -72,7 +72,7 @@ def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_a
             assert {each.robot for each in fold.contributions} == {name}
 
 
-def test_too_small_covariances_by_themselves_are_no_contradiction() -> None:
+def test_too_small_covariances_by_themselves_are_no_contradiction():
     """Everybody claims a fifth of its standard deviations: each disagrees with itself as much."""
     ticks = of_set(team_run())
     for each in messages(team_run(), m.Submap):
@@ -86,13 +86,13 @@ def test_too_small_covariances_by_themselves_are_no_contradiction() -> None:
     assert ticks.fold_apart(ticks.fold, ahead=False) == {}
 
 
-def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path: Path) -> None:
+def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path):
     result = verify(written(tmp_path / "log.mcap", mirrored_run("r2")))
     assert result.first is None, str(result.first)
     assert {c.channel for c in result.channels if c.equal} >= {"prior", "final_map"}
 
 
-def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch):
     """The number of folded ticks is at most that of the nominal run for each robot left out, for
     each robot alone, and for a restart with each of the few suspensions.
     """

@@ -165,8 +165,8 @@ def test_late_submaps_give_the_same_bytes(world, ticks):
 
 
 def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_same_bytes(
-    cluttered, all_said,
-):  # fmt: skip
+    cluttered, all_said
+):
     messages, truth = cluttered
     halves = [folded(messages[:40]).fold, all_said.fold]
     nodes = [len(each.main.graph.landmarks) for each in halves]

@@ -3,7 +3,6 @@ withdrawn.
 """
 
 import math
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -73,7 +72,7 @@ def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
     return ticks
 
 
-def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried() -> None:
+def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried():
     ticks = folded(carried())
     fold = ticks.solve()
     assert not ticks.withdrawn
@@ -91,20 +90,20 @@ def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried
     assert cuts_of(other.solve()) == [found], "the order of arrival changes nothing"
 
 
-def test_nothing_is_said_of_a_robot_whose_camera_and_gyro_are_mirrored() -> None:
+def test_nothing_is_said_of_a_robot_whose_camera_and_gyro_are_mirrored():
     ticks = folded(mirrored())
     fold = ticks.solve()
     assert set(ticks.convicted) == {"r3"}
     assert cuts_of(fold) == []
 
 
-def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large() -> None:
+def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large():
     final = final_map(list(team_run("odometry")))
     assert final.withdrawn == ("r3",)
     assert not any(each.cause == "carried_off" for each in final.diagnosis)
 
 
-def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_path: Path) -> None:
+def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_path):
     """A scan of the stress world every 0.5 s: none lies between the seam at 50 s and 50.2 s."""
     off = CarriedOff("r2", 4.0, 0.6, 50.2)
     folder = write(StressWorld(seed=5, seconds=100.0, carried_off=(off,)), tmp_path)

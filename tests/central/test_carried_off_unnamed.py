@@ -64,7 +64,7 @@ def said(fused: m.FusedMap) -> list[m.Diagnosis]:
 
 
 @pytest.mark.parametrize("off", [FAR, NEAR, INSIDE], ids=["far", "near", "inside a window"])
-def test_the_map_is_right_and_names_the_robot_the_time_and_the_motion(off: CarriedOff) -> None:
+def test_the_map_is_right_and_names_the_robot_the_time_and_the_motion(off):
     of = run(off)
     final, path = of.final, of.path
     means = floats(final.means, "means").reshape(-1, 2)
@@ -82,7 +82,7 @@ def test_the_map_is_right_and_names_the_robot_the_time_and_the_motion(off: Carri
     assert math.remainder(turn - (after - before)[2], 2 * math.pi) == pytest.approx(0.0, abs=0.15)
 
 
-def test_the_robots_online_pose_is_withheld_until_its_place_is_found_and_right_then() -> None:
+def test_the_robots_online_pose_is_withheld_until_its_place_is_found_and_right_then():
     of = run(FAR)
     sent = (opened(each) for each in of.samples)
     poses = [
@@ -98,7 +98,7 @@ def test_the_robots_online_pose_is_withheld_until_its_place_is_found_and_right_t
         assert math.hypot(*(floats(each.pose, "pose")[:2] - true)) < 1.5
 
 
-def test_the_cut_depends_on_no_order_of_arrival() -> None:
+def test_the_cut_depends_on_no_order_of_arrival():
     of = run(FAR)
     folds = []
     for backwards in (False, True):
@@ -118,7 +118,7 @@ def test_the_cut_depends_on_no_order_of_arrival() -> None:
     assert (one.main.state == two.main.state).all()
 
 
-def test_a_team_that_is_left_alone_is_not_cut() -> None:
+def test_a_team_that_is_left_alone_is_not_cut():
     of = run()
     assert said(of.final) == []
     assert not any("look alike" in each or "refused" in each for each in of.final.reasons)

@@ -55,33 +55,31 @@ SAME = [("r1", 3), ("r2", 3)]
 APART = [("r1", 1), ("r2", 3)]
 
 
-def test_of_these_submaps_two_mistake_the_same_landmark_and_two_do_not() -> None:
+def test_of_these_submaps_two_mistake_the_same_landmark_and_two_do_not():
     assert len({last_seen(*each) for each in SAME}) == 1
     assert len({last_seen(*each) for each in APART}) == 2
 
 
 @pytest.mark.parametrize(("least", "stands"), [(1, True), (2, False)])
-def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(
-    least: int, stands: bool
-) -> None:
+def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(least, stands):
     fused = final(rule({("r1", 3)}, landmark_submaps=least))
     assert (FALSE in ids(fused.ids, "ids")) == stands
     assert len(left_out(fused)) == (not stands)
     assert all(f"of 6 landmarks ({FALSE})" in text for text in left_out(fused))
 
 
-def test_what_two_submaps_agree_on_enters_the_map_with_both() -> None:
+def test_what_two_submaps_agree_on_enters_the_map_with_both():
     fused = final(rule(set(SAME), landmark_submaps=2))
     assert FALSE in ids(fused.ids, "ids")
     assert left_out(fused) == []
 
 
-def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither() -> None:
+def test_what_two_submaps_contradict_each_other_on_is_confirmed_by_neither():
     fused = final(rule(set(APART), landmark_submaps=2))
     assert FALSE not in ids(fused.ids, "ids")
 
 
-def test_running_maps_and_priors_have_the_same_landmarks() -> None:
+def test_running_maps_and_priors_have_the_same_landmarks():
     found = rule({("r1", 3)}, landmark_submaps=2)
     out = found.publish_due(END_NS, END_NS)
     (fused,) = of(out, ch.FUSED_MAP)
@@ -93,7 +91,7 @@ def test_running_maps_and_priors_have_the_same_landmarks() -> None:
     assert all(ids(each.ids, "ids").tolist() == shown for each in priors)
 
 
-def test_the_rest_of_the_map_is_what_it_was() -> None:
+def test_the_rest_of_the_map_is_what_it_was():
     """Landmarks that are not shown stay in the solution: no pose and no other landmark changes."""
     whole, less = (final(rule({("r1", 3)}, landmark_submaps=least)) for least in (1, 2))
     kept = [k for k, id_ in enumerate(ids(whole.ids, "ids").tolist()) if id_ != FALSE]
@@ -101,14 +99,14 @@ def test_the_rest_of_the_map_is_what_it_was() -> None:
     np.testing.assert_array_equal(next(means)[kept], next(means))
 
 
-def test_a_map_in_which_nothing_is_confirmed_yet_is_empty() -> None:
+def test_a_map_in_which_nothing_is_confirmed_yet_is_empty():
     fused = final(rule(set(), landmark_submaps=100))
     assert fused.ids == b""
     assert fused.means == b""
     assert len(left_out(fused)) == 1
 
 
-def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one() -> None:
+def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one():
     found = MapPublisher(SubmapFold(CentralConfig(tick_s=3.0, broadcast_s=3.0), b"settings"))
     found.store.add_start(published(STREAMS["r1"])[0])
     for k in range(5):

@@ -27,14 +27,12 @@ def diagnosed(of: Scenario) -> tuple[m.Diagnosis, ...]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_right_map_has_no_cause_of_misfit(tmp_path: Path, seed: int) -> None:
+def test_a_right_map_has_no_cause_of_misfit(tmp_path, seed):
     assert diagnosed(scenario(replace(WORLD, seed=seed), tmp_path)) == ()
 
 
 @pytest.mark.parametrize("by", [(0.5, 0.0), (1.4, 1.4)], ids=["half a metre", "two metres"])
-def test_a_landmark_that_was_moved_is_named_with_its_motion(
-    tmp_path: Path, by: tuple[float, float]
-) -> None:
+def test_a_landmark_that_was_moved_is_named_with_its_motion(tmp_path, by):
     of = scenario(replace(WORLD, moved=(MovedLandmark(7, by, 60.0),)), tmp_path)
     first, *_ = diagnosed(of)
     assert (first.cause, first.landmark) == ("landmark_moved", 7)
@@ -45,12 +43,12 @@ def test_a_landmark_that_was_moved_is_named_with_its_motion(
     assert describe(first).startswith("landmark 7 moved by (")
 
 
-def test_one_number_of_two_landmarks_is_named(tmp_path: Path) -> None:
+def test_one_number_of_two_landmarks_is_named(tmp_path):
     first, *_ = diagnosed(scenario(replace(WORLD, same_id=((3, 9),)), tmp_path))
     assert (first.cause, first.landmark) == ("identity_shared", 3)
 
 
-def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path: Path) -> None:
+def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
     off = CarriedOff("r2", 4.0, 0.6, 50.0)
     of = scenario(replace(TEAM, carried_off=(off,)), tmp_path)
     (found,) = diagnosed(of)
@@ -59,7 +57,7 @@ def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path: Pat
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
 
 
-def test_a_mirrored_robot_is_named_as_mirrored(tmp_path: Path) -> None:
+def test_a_mirrored_robot_is_named_as_mirrored(tmp_path):
     first, *rest = diagnosed(scenario(replace(TEAM, mirrored=("r2",)), tmp_path))
     assert (first.cause, first.robot) == ("mirrored", "r2")
     assert not rest
@@ -68,15 +66,13 @@ def test_a_mirrored_robot_is_named_as_mirrored(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("noise", "cause"), [(2.0, "noise_underestimated"), (0.5, "noise_overestimated")]
 )
-def test_noise_that_is_stated_wrong_is_named_with_its_factor(
-    tmp_path: Path, noise: float, cause: str
-) -> None:
+def test_noise_that_is_stated_wrong_is_named_with_its_factor(tmp_path, noise, cause):
     (found,) = diagnosed(scenario(replace(TEAM, noise=noise), tmp_path))
     assert (found.cause, found.robot) == (cause, "")
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
 
 
-def test_the_object_of_a_cause_has_a_number_or_the_two_of_a_motion() -> None:
+def test_the_object_of_a_cause_has_a_number_or_the_two_of_a_motion():
     moved = m.Diagnosis(
         cause="landmark_moved", landmark=7, value=(2.0, 0.1), sigma=(0.1, 0.1), at_ns=10**9
     )

@@ -130,7 +130,7 @@ def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "still"), ("r2", "modest")]
 )
-def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar: str, kind: str) -> None:
+def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
     """r1 is the robot that names the frame."""
     samples = run_with(liar, kind)
     final = final_map(list(samples))
@@ -146,7 +146,7 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar: str, kind: str) ->
     assert errors.max() < online_errors(run_with("", ""), liar).max() + 1.0
 
 
-def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
+def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
     """r1 lies for a while; what is folded depends on the set, not on when it was asked for."""
     samples = run_with("r1", "still")
     ticks = of_set(samples)
@@ -164,7 +164,7 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again() -> None:
 
 
 @pytest.mark.parametrize("kind", ["micrometre", "far", "swap"])
-def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind: str) -> None:
+def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind):
     """Most of its newest submaps contradict the map, however little they weigh."""
     samples = run_with("r1", kind)
     ticks = of_set(samples, central=scenario().central)
@@ -175,9 +175,7 @@ def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind: str) -> None:
     assert final_map(list(samples)).withdrawn == ("r1",)
 
 
-def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grown(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grown(monkeypatch):
     trials: list[float] = []
 
     def undecided(agreement: Agreement, *_: object) -> Trial:
@@ -199,7 +197,7 @@ def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grow
     assert len(trials) == 2
 
 
-def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
+def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again():
     """One of its first submaps is wrong by 0.8 m; its true ones outvote it later."""
     samples = team_run()
     (wrong,) = (s for s in messages(samples, m.Submap) if (s.robot, s.sequence) == ("r1", 2))
@@ -215,7 +213,7 @@ def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again() -> None:
     assert ticks.withdrawn == ()
 
 
-def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map() -> None:
+def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map():
     """All submaps are there, of which the first tick and a half is closed."""
     samples = run_with("r1", "still")
     rule = MapPublisher(SubmapFold(scenario().central, bytes(8)))
@@ -235,7 +233,7 @@ def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map() -> None:
     assert not rule._has_news(math.inf), "a map that leaves it out lacks nothing"
 
 
-def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
+def test_two_robots_that_contradict_each_other_are_named_and_stay():
     """r1 shares nothing with r3, so no test decides between r1 and r2."""
     quiet = Agreement(0.0, 1.0, {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}, ())
     loud = Agreement(0.0, 1.0, {"r1": (1e4, 50.0), "r2": (60.0, 50.0), "r3": (50.0, 50.0)}, ())
@@ -250,7 +248,7 @@ def test_two_robots_that_contradict_each_other_are_named_and_stay() -> None:
     assert found.undecided.startswith("r1, r2 contradict each other: cost 200.0 per degree")
 
 
-def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree() -> None:
+def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree():
     def without(robots: Collection[str]) -> Agreement:
         liar_is_there = "r1" not in robots
         costs = {"r1": (1e-9, 50.0), "r2": (1e5 if liar_is_there else 50.0, 50.0)}
@@ -261,17 +259,17 @@ def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree() -> 
 
 
 @pytest.mark.parametrize(("chi2", "dof"), [(np.inf, 40.0), (np.nan, 40.0), (1e9, -47.0)])
-def test_a_cost_that_has_overflown_is_a_disagreement(chi2: float, dof: float) -> None:
+def test_a_cost_that_has_overflown_is_a_disagreement(chi2, dof):
     assert disagreement(Agreement(0.0, 1.0, {"r1": (chi2, dof)}, ()))["r1"] > 1e8
 
 
-def test_chance_alone_makes_nobody_suspect() -> None:
+def test_chance_alone_makes_nobody_suspect():
     """Five degrees of freedom reach nine per degree once in 10^8."""
     assert disagreement(Agreement(0.0, 1.0, {"r1": (45.0, 5.0)}, ())) == {"r1": 1.0}
     assert disagreement(Agreement(0.0, 1.0, {"r1": (450.0, 50.0)}, ())) == {"r1": 9.0}
 
 
-def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot_named() -> None:
+def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot_named():
     lying = of_set(run_with("r1", "still"), central=scenario(withdraw_above=None).central)
     lying.fold_until(math.inf)
     count = sum(each.robot == "r1" for each in messages(team_run(), m.Submap))
@@ -284,7 +282,7 @@ def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot
     assert dict(true.raised) == {}
 
 
-def test_a_covariance_above_the_least_spread_is_kept_to_the_bit() -> None:
+def test_a_covariance_above_the_least_spread_is_kept_to_the_bit():
     local = translate.local_map_of(messages(team_run(), m.Submap)[0])
     for least in ((5e-4, 5e-5), (0.0, 0.0)):
         kept = with_least_spread(local, least).covariance
@@ -298,7 +296,7 @@ def test_a_covariance_above_the_least_spread_is_kept_to_the_bit() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(found - twin))[:3], [5e-4, 5e-4, 5e-5], rtol=1e-6)
 
 
-def test_a_variance_that_rounding_made_negative_raises_nothing() -> None:
+def test_a_variance_that_rounding_made_negative_raises_nothing():
     ticks = of_set(team_run())
     ticks.fold_until(math.inf)
     island = replace(ticks.fold.main)

@@ -42,12 +42,12 @@ def errors_of_rest(found: MapResult) -> MapErrors:
 
 
 @pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> MapErrors:
+def clean(tmp_path_factory):
     return errors_of_rest(final(WORLD, tmp_path_factory.mktemp("clean")))
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_the_rest_of_the_map_is_right(fault: str, clean: MapErrors, tmp_path: Path) -> None:
+def test_the_rest_of_the_map_is_right(fault, clean, tmp_path):
     found = final(FAULTS[fault], tmp_path)
     of_rest = errors_of_rest(found)
     assert of_rest.count >= clean.count - 1

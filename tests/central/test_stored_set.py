@@ -34,7 +34,7 @@ def kept_in(path: Path) -> list[tuple[str, bytes]]:
         return heard(kept.samples())
 
 
-def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path: Path) -> None:
+def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path):
     path = tmp_path / "central.set"
     measured = Sample(ch.ODOMETRY.key("alpha"), encoded(odometry(1)), 0, 0, 0)
     unsound = Sample(ch.SUBMAP.key("alpha"), b"no message", 0, 0, 0)
@@ -49,7 +49,7 @@ def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path: Path) ->
     assert kept_in(path) == heard(SENT)
 
 
-def test_what_a_death_tore_is_cut_off_and_the_rest_is_there(tmp_path: Path) -> None:
+def test_what_a_death_tore_is_cut_off_and_the_rest_is_there(tmp_path):
     path = tmp_path / "central.set"
     with a_life(path) as kept:
         kept.note(SENT)
@@ -60,7 +60,7 @@ def test_what_a_death_tore_is_cut_off_and_the_rest_is_there(tmp_path: Path) -> N
     assert kept_in(path) == heard(SENT)
 
 
-def test_after_its_end_nothing_is_kept(tmp_path: Path) -> None:
+def test_after_its_end_nothing_is_kept(tmp_path):
     path = tmp_path / "central.set"
     with a_life(path) as kept:
         pass
@@ -68,7 +68,7 @@ def test_after_its_end_nothing_is_kept(tmp_path: Path) -> None:
     assert kept_in(path) == []
 
 
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "central.set"
     path.write_text("something else")
     with pytest.raises(SetFileError, match="is not a peer's set: give --set another file"):

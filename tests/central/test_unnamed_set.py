@@ -73,7 +73,7 @@ def _final(rule: MapPublisher) -> m.FusedMap:
 
 
 @pytest.fixture(scope="module")
-def final() -> m.FusedMap:
+def final():
     rule = _rule()
     for robot in two_robots():
         for submap in two_robots()[robot]:
@@ -81,9 +81,7 @@ def final() -> m.FusedMap:
     return _final(rule)
 
 
-def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
-    final: m.FusedMap,
-) -> None:
+def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(final):
     rule = _rule()
     for k in range(8):
         rule.store.add(two_robots()["r2"][k])
@@ -96,7 +94,7 @@ def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(
     assert [each.kind for each in final.decisions if each.kind == "merge"] == ["merge"]
 
 
-def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() -> None:
+def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map():
     maps = []
     for order in permutations(("r1", "r2", "verdict")):
         rule = _rule()
@@ -109,9 +107,7 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map() 
     assert maps[0].verdicts == (_verdict().judgement,)
 
 
-def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said(
-    final: m.FusedMap,
-) -> None:
+def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said(final):
     for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
         rule = _rule()
         for message in (*two_robots()["r1"], order[0], *two_robots()["r2"], order[1]):
@@ -121,7 +117,7 @@ def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said
         assert (found.means, found.digest) == (final.means, final.digest)
 
 
-def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedMap) -> None:
+def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final):
     maps = []
     for verdicts in ([_verdict()], []):
         fold = _rule().fold
@@ -135,7 +131,7 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final: m.FusedM
     assert without.means == final.means
 
 
-def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been() -> None:
+def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been():
     """Whenever the order comes: before its submaps, among them, behind a broadcast."""
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -122,7 +121,7 @@ def bits(ticks: TickFold) -> bytes:
 
 
 @pytest.mark.parametrize("when", ["before", "in the middle", "at the end"])
-def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(when: str) -> None:
+def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(when):
     samples = team_run()
     met = messages(samples, m.SightingFactor)
     assert any(s.robot == "r3" for s in met)
@@ -144,7 +143,7 @@ def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(
     assert bits(whole) != bits(of_set(samples))
 
 
-def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was() -> None:
+def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was():
     samples = team_run()
     ticks = of_set(samples)
     ticks.fold_until(30e9)
@@ -166,7 +165,7 @@ def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> MapPub
     return rule
 
 
-def test_a_map_names_who_was_withdrawn_in_its_digest_too() -> None:
+def test_a_map_names_who_was_withdrawn_in_its_digest_too():
     samples = team_run()
     orders = [
         m.Withdrawal(stamp_ns=k, robot="r3", by="operator", reason=f"reason {k}") for k in range(2)
@@ -181,7 +180,7 @@ def test_a_map_names_who_was_withdrawn_in_its_digest_too() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["odometry", "bearing", "range"])
-def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) -> None:
+def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong):
     samples = team_run(wrong)
     final = final_map(list(samples))
     assert final.withdrawn == ("r3",)
@@ -195,7 +194,7 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong: str) ->
     assert final.covariance == translate.joint_bytes(found.covariance)
 
 
-def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimated() -> None:
+def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimated():
     of = scenario()
     team = tuple(
         msgspec.structs.replace(
@@ -210,7 +209,7 @@ def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimate
     assert found.value[0] == pytest.approx(-0.25, abs=4.0 * found.sigma[0])
 
 
-def test_no_number_of_robots_withdraws_a_robot_by_what_they_report() -> None:
+def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
     """An order is its operator's: in earlier versions a majority of robots could repeat one that
     never was."""
     node = CentralNode(CentralConfig(), ["r1", "r2", "r3", "r4"])
@@ -263,7 +262,7 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Map
     return rule, encoded(out[-1].message)
 
 
-def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() -> None:
+def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
     """At 35 s r3 is a suspect whom nobody can convict yet; five submaps later there are enough."""
     by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
@@ -281,7 +280,7 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent() ->
     assert delivered([*early, *late], {len(early) - 1: 40.0})[1] == expected
 
 
-def test_who_was_convicted_without_what_comes_late_is_acquitted() -> None:
+def test_who_was_convicted_without_what_comes_late_is_acquitted():
     """Two that agree convict a third; a submap of it that came late takes the checkpoint away."""
     samples = team_run("odometry")
     ticks = of_set(samples)
@@ -298,7 +297,7 @@ def test_who_was_convicted_without_what_comes_late_is_acquitted() -> None:
     assert bits(ticks) == bits(of_set(samples, without="r3"))
 
 
-def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong() -> None:
+def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong():
     samples = team_run()
     assert final_map(list(samples)).withdrawn == ()
     assert messages(samples, m.Withdrawal) == []
@@ -315,9 +314,7 @@ def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])
 @pytest.mark.parametrize("seed", [3, 4])
-def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
-    kind: OutlierKind, seed: int
-) -> None:
+def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(kind, seed):
     """Nor is anybody a suspect; by windows without rejection all are (2000 and more)."""
     of = with_outliers(kind, seed)
     samples = tuple(run(of))
@@ -330,18 +327,16 @@ def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(
 
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])
-def test_a_robot_that_is_wrong_is_withdrawn_with_outliers_too(kind: OutlierKind) -> None:
+def test_a_robot_that_is_wrong_is_withdrawn_with_outliers_too(kind):
     assert final_map(run(with_outliers(kind, 3), "odometry")).withdrawn == ("r3",)
 
 
-def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays() -> None:
+def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays():
     samples = tuple(run(scenario(withdraw_above=None), "odometry"))
     assert final_map(list(samples)).withdrawn == ()
 
 
-def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(
-    tmp_path: Path,
-) -> None:
+def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(tmp_path):
     log = written(tmp_path / "log.mcap", list(team_run("odometry")))
     result = verify(log)
     assert result.first is None, str(result.first)
@@ -369,7 +364,7 @@ def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | 
     return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
 
 
-def test_who_is_wrong_is_whose_absence_makes_the_rest_agree() -> None:
+def test_who_is_wrong_is_whose_absence_makes_the_rest_agree():
     without = {
         frozenset({"a"}): agreement(b=9.0, c=8.0),
         frozenset({"b"}): agreement(a=1.0, c=1.2),
@@ -377,26 +372,26 @@ def test_who_is_wrong_is_whose_absence_makes_the_rest_agree() -> None:
     assert verdict(without, a=9.5, b=9.0, c=3.0) == "b"
 
 
-def test_nobody_is_wrong_where_the_rest_never_agree() -> None:
+def test_nobody_is_wrong_where_the_rest_never_agree():
     without = {frozenset({r}): agreement(**{o: 3.0 for o in "abc" if o != r}) for r in "abc"}
     assert verdict(without, a=9.5, b=9.0, c=6.0) is None
 
 
-def test_of_two_that_disagree_the_one_that_contradicts_itself_is_wrong() -> None:
+def test_of_two_that_disagree_the_one_that_contradicts_itself_is_wrong():
     without = {frozenset({"a"}): agreement(b=1.0), frozenset({"b"}): agreement(a=1.0)}
     assert verdict(without, a=9.0, b=9.0) is None
     without[frozenset({"b"})] = agreement(a=6.0)
     assert verdict(without, a=9.0, b=9.0) == "a"
 
 
-def test_a_few_bad_submaps_do_not_make_a_robot_suspect() -> None:
+def test_a_few_bad_submaps_do_not_make_a_robot_suspect():
     costs = list(agreement(a=1.0).submaps)
     costs[:4] = [each._replace(chi2=500.0) for each in costs[:4]]
     assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
     assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
 
 
-def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four() -> None:
+def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():
     bad, good = agreement(a=9.0).submaps[:7], agreement(a=1.0).submaps[:5]
     of_last_four = [0.92, 0.96, 1.0, 1.04]
     found = disagreement(Agreement(0.0, 1.0, {}, bad))["a"]
@@ -408,7 +403,7 @@ def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four() -> Non
     assert disagreement(Agreement(0.0, 1.0, {}, bad[:1])) == {}
 
 
-def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
+def test_a_team_of_one_that_is_withdrawn_has_an_empty_map():
     rule = MapPublisher(SubmapFold(CentralConfig(), bytes(8)))
     samples = team_run()
     for message in (*messages(samples, m.InitialPose), *messages(samples, m.Submap)):
@@ -430,7 +425,7 @@ def test_a_team_of_one_that_is_withdrawn_has_an_empty_map() -> None:
     assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))
 
 
-def test_a_withdrawn_robots_pose_is_taken_back_and_all_of_it_is_recomputed(tmp_path: Path) -> None:
+def test_a_withdrawn_robots_pose_is_taken_back_and_all_of_it_is_recomputed(tmp_path):
     of = scenario()
     posing = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
     samples = tuple(run(msgspec.structs.replace(of, robots=posing), "odometry"))

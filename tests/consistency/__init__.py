@@ -6,12 +6,12 @@ per degree of freedom, each of which has the expectation 1 if the covariances ar
 | statistic | of | module |
 |---|---|---|
 | NEES eᵀP⁻¹e | a window's submap: end pose and landmarks jointly | `test_submaps` |
-| NIS νᵀS⁻¹ν | a window's measurements before they are used | `test_innovation` |
+| NIS νᵀS⁻¹ν | a window's measurements before they are used | `test_submaps` |
 | NEES, joint cost Σ rᵀP⁻¹r | the team's map | `test_map` |
-| NEES, joint cost | a map with inter-robot measurements | `test_inter_robot` |
-| NEES, χ² | the alignment of two frames | `test_alignment` |
+| NEES, joint cost | a map with inter-robot measurements | `test_map` |
+| NEES, χ² | the alignment of two frames | `test_map` |
 | NEES | a robot's pose in the team's frame | `test_team_pose` |
-| NEES | a map and the biases estimated with it | `test_biases`, `test_range_scale` |
+| NEES | a map and the biases estimated with it | `test_map`, `test_range_scale` |
 
 The mean over the worlds has to lie in the two-sided interval that it leaves with probability 0.001
 (`team/estimation/consistency.py: chi2_interval`): above it the covariances are too small, below it

@@ -1,18 +1,30 @@
-"""The map's NEES and the joint cost, per degree of freedom.
+"""Joined maps: NEES and joint cost; each with a mutant that fails."""
 
-The mutant counts each submap twice.
-"""
+from dataclasses import replace
+
+import numpy as np
 
 from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining.alignment import aligned
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_map,
 )
+from tests.estimation.hybrid_slam.test_sensitivity import (
+    SIGMA,
+    biased_team,
+    fold_of,
+)
+from tests.estimation.map_joining.test_alignment import (
+    pairs,
+)
 from tests.estimation.map_joining.test_joining import (
     joined,
 )
-from tests.estimation.submap_world import solved, team
+from tests.estimation.sighting_world import joined_with, meeting
+from tests.estimation.submap_world import correlated, seen_from, solved, team, wrap
 
 RUNS = 200
 
@@ -41,3 +53,91 @@ def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
     assert least < cost < most
     twice, _, _, _ = consistency(JoinSettings(covariance_factor=0.5))
     assert twice > high
+
+
+def consistency_inter_robot(change):
+    """Mean NEES of map and last poses, mean joint cost; each per degree of freedom, with it."""
+    errors = cost = 0.0
+    dof = joint = 0.0
+    for seed in range(RUNS):
+        world = meeting(seed, robots=2, submaps=3, landmarks=2, reach=7.0)
+        sightings = [replace(each, covariance=change * each.covariance) for each in world.sightings]
+        fold = joined_with(world.submaps, world.starts, sightings, JoinSettings(), 100)
+        fold = solved(fold, JoinSettings())
+        found = landmark_map(fold)
+        truth = world.landmarks[found.ids]
+        if len(found.ids):
+            errors += nees((found.means - truth).ravel(), found.covariance)
+            dof += found.means.size
+        agreement = joint_cost(fold)
+        cost += agreement.chi2
+        joint += agreement.dof
+    return errors / dof, round(dof), cost / joint, round(joint)
+
+
+def test_a_map_with_sightings_is_consistent_and_one_that_counts_each_fourfold_is_not():
+    ratio, dof, cost, joint = consistency_inter_robot(1.0)
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < ratio < high
+    least, most = chi2_interval(joint, 0.999, 1)
+    assert least < cost < most
+    _, _, cost_of_mutant, _ = consistency_inter_robot(0.25)
+    assert cost_of_mutant > most
+
+
+def test_the_alignment_and_its_chi_square_are_consistent():
+    runs, errors, cost = 300, 0.0, 0.0
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        truth = np.array([20.0, -5.0, 2.0])
+        points = rng.uniform(-20.0, 20.0, (4, 2))
+        there = pairs(seen_from(truth, points[:, 0] + 1j * points[:, 1]))
+        P, Q = correlated(np.full(8, 0.3), rng), correlated(np.full(8, 0.2), rng)
+        noisy_a = points.ravel() + np.linalg.cholesky(P) @ rng.normal(size=8)
+        noisy_b = there.ravel() + np.linalg.cholesky(Q) @ rng.normal(size=8)
+        found = aligned(noisy_a.reshape(-1, 2), P, noisy_b.reshape(-1, 2), Q)
+        error = found.a_from_b - truth
+        error[2] = wrap(error[2])
+        errors += nees(error, found.covariance)
+        cost += found.chi2
+        assert found.dof == 5
+    low, high = chi2_interval(3, 0.999, runs)
+    assert low < errors / (3 * runs) < high
+    low, high = chi2_interval(5, 0.999, runs)
+    assert low < cost / (5 * runs) < high
+
+
+def without_columns(submaps):
+    return [
+        replace(each, local=replace(each.local, biases=(), sensitivity=np.empty((0, 0))))
+        for each in submaps
+    ]
+
+
+def nees_of_map_and_biases(seeds, *, blind=False):
+    of_map = of_biases = dof = 0.0
+    for seed in seeds:
+        world, submaps, errors = biased_team(seed)
+        options = JoinSettings(bias_sigma=SIGMA)
+        taken = without_columns(submaps) if blind else submaps
+        fold = fold_of(world, taken, options, tick=12, full=solved)
+        found = marginals.landmark_map(fold)
+        of_map += nees((found.means - world.landmarks[found.ids]).ravel(), found.covariance)
+        dof += found.means.size
+        for (robot, _), bias, value, sigma in marginals.bias_estimates(fold):
+            truth = errors[robot][0 if bias == "bearing" else 1]
+            of_biases += ((value - truth) / sigma) ** 2 / (4 * len(seeds))
+    return of_map / dof, of_biases
+
+
+SEEDS = range(200)
+
+
+def test_map_and_biases_are_consistent_and_without_bias_states_they_are_not():
+    of_map, of_biases = nees_of_map_and_biases(SEEDS)
+    low, high = chi2_interval(10, 0.999, len(SEEDS))
+    assert low < of_map < high
+    low, high = chi2_interval(4, 0.999, len(SEEDS))
+    assert low < of_biases < high
+    mutant, _ = nees_of_map_and_biases(SEEDS[:15], blind=True)
+    assert mutant > 2.0

@@ -70,18 +70,18 @@ def test_a_matrix_that_is_no_covariance_is_rejected():
         nees(np.ones(2), np.diag([1.0, -1.0]))
 
 
-def test_quantiles_that_are_written_as_numbers_are_those_of_the_library() -> None:
+def test_quantiles_that_are_written_as_numbers_are_those_of_the_library():
     assert chi2_limit(1, 1e-3) == UNLIKELY
     assert chi2_quantile(0.9999, 2) == GATE
 
 
-def test_limits_of_few_degrees_of_freedom_are_the_librarys_to_twelve_digits() -> None:
+def test_limits_of_few_degrees_of_freedom_are_the_librarys_to_twelve_digits():
     for tail in (1e-2, 1e-3, 1e-6):
         for dof in (*range(1, 40), 99, 100, 599, 600):
             assert chi2_limit(dof, tail) == float(f"{chdtri(dof, tail):.12g}")
 
 
-def test_limits_and_quantiles_of_any_degrees_of_freedom_are_the_librarys() -> None:
+def test_limits_and_quantiles_of_any_degrees_of_freedom_are_the_librarys():
     dof = np.concatenate([np.linspace(1.0, 60.0, 119), np.geomspace(1.0, 30_000.0, 40)])
     for below in (1e-3, 0.025, 0.5, 0.975, 0.999, 1.0 - 1e-7):
         found = chi2_quantiles(below, 1.0 - below, dof)

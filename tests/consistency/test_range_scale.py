@@ -7,7 +7,7 @@ import numpy as np
 
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.joining import JoinSettings
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from tests.estimation.map_joining.test_range_scale import (
     COMMON,
     LANDMARKS,

@@ -56,9 +56,7 @@ def hash_of(name: str, tmp_path: Path, *command: str, runs_by: Sequence[str] = (
 @COMPILED
 @pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_gcc_gives_the_same_bits_at_every_level(
-    name: str, flags: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_gcc_gives_the_same_bits_at_every_level(name, flags, tmp_path):
     if shutil.which("g++") is None:
         pytest.skip("g++ is not on the path")
     if "-mavx2" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
@@ -68,7 +66,7 @@ def test_gcc_gives_the_same_bits_at_every_level(
 
 @COMPILED
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_clang_gives_the_bits_of_gcc(name: str, tmp_path: Path) -> None:
+def test_clang_gives_the_bits_of_gcc(name, tmp_path):
     """clang comes from the ziglang wheel."""
     if find_spec("ziglang") is None:
         pytest.skip("ziglang is not installed: pip install --no-deps -r hashes-zig.txt")
@@ -79,7 +77,7 @@ def test_clang_gives_the_bits_of_gcc(name: str, tmp_path: Path) -> None:
 
 @COMPILED
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_an_arm_processor_gives_the_bits_of_an_intel(name: str, tmp_path: Path) -> None:
+def test_an_arm_processor_gives_the_bits_of_an_intel(name, tmp_path):
     """Debian: apt install g++-aarch64-linux-gnu qemu-user. Its base has fused multiply-add."""
     compiler, emulator = map(shutil.which, ("aarch64-linux-gnu-g++", "qemu-aarch64"))
     if compiler is None or emulator is None:
@@ -88,7 +86,7 @@ def test_an_arm_processor_gives_the_bits_of_an_intel(name: str, tmp_path: Path) 
     assert found == PROGRAMS[name][0]
 
 
-def test_no_library_holds_a_fused_multiply_add() -> None:
+def test_no_library_holds_a_fused_multiply_add():
     if shutil.which("objdump") is None:
         pytest.skip("objdump is not on the path")
     built = sorted(LIBRARIES.glob("_core_*.so"))
@@ -103,7 +101,7 @@ def test_no_library_holds_a_fused_multiply_add() -> None:
         assert FUSED.search(code.stdout) is None, library
 
 
-def test_the_search_for_fused_instructions_finds_one(tmp_path: Path) -> None:
+def test_the_search_for_fused_instructions_finds_one(tmp_path):
     if shutil.which("g++") is None or shutil.which("objdump") is None:
         pytest.skip("g++ or objdump is not on the path")
     source, made = tmp_path / "fused.cpp", tmp_path / "fused.o"
@@ -113,7 +111,7 @@ def test_the_search_for_fused_instructions_finds_one(tmp_path: Path) -> None:
     assert FUSED.search(code.stdout)
 
 
-def test_the_library_is_built_from_the_sources_that_are_here() -> None:
+def test_the_library_is_built_from_the_sources_that_are_here():
     """Else the tests look at another core: `make core` builds it."""
     sources = [*(FOLDER / "src").glob("*.[ch]pp"), FOLDER / "CMakeLists.txt"]
     names = sorted(sources, key=lambda path: path.relative_to(FOLDER).as_posix())
@@ -121,7 +119,7 @@ def test_the_library_is_built_from_the_sources_that_are_here() -> None:
     assert core.digest == hashlib.sha256(digests.encode()).hexdigest()
 
 
-def test_the_type_stub_is_that_of_the_library() -> None:
+def test_the_type_stub_is_that_of_the_library():
     if find_spec("nanobind") is None:
         pytest.skip("nanobind is not installed")
     script = (
@@ -134,7 +132,7 @@ def test_the_type_stub_is_that_of_the_library() -> None:
     assert made.stdout == (FOLDER / "_core.pyi").read_text()
 
 
-def test_the_level_can_be_chosen() -> None:
+def test_the_level_can_be_chosen():
     command = [sys.executable, "-c", "from teamslam.team import core; print(core.level)"]
     levels = {}
     for level in ("base", "absent"):

@@ -1,4 +1,4 @@
-"""Elementary functions: their errors in units of the last place, and their special cases."""
+"""Elementary functions and random numbers of the core."""
 
 import math
 from collections.abc import Callable
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from teamslam.team import core
+from teamslam.team.estimation.consistency import chi2_quantile
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459")
 DIGITS = 45
@@ -80,7 +81,7 @@ def _arguments(name: str) -> list[tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("name", REFERENCES)
-def test_an_elementary_function_is_right_to_the_last_place(name: str) -> None:
+def test_an_elementary_function_is_right_to_the_last_place(name):
     reference, most = REFERENCES[name]
     function = getattr(core, name)
     with localcontext() as context:
@@ -93,7 +94,7 @@ def test_an_elementary_function_is_right_to_the_last_place(name: str) -> None:
             assert off <= Decimal(most), (arguments, found, off)
 
 
-def test_special_cases_are_those_of_ieee_754() -> None:
+def test_special_cases_are_those_of_ieee_754():
     inf, nan, tiny, huge = math.inf, math.nan, 5e-324, 1.7e308
     values = (0.0, -0.0, 1.0, -1.0, inf, -inf, tiny, -tiny, huge, -huge, nan)
     for y in values:
@@ -130,7 +131,7 @@ def assert_same_bits(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("x", [SPECIAL, np.random.default_rng(0).normal(0.0, 9.0, 37)])
-def test_an_array_s_functions_are_those_of_its_numbers(x: np.ndarray) -> None:
+def test_an_array_s_functions_are_those_of_its_numbers(x):
     for name in ONE:
         function = getattr(core, name)
         assert_same_bits(function(x), np.array([function(v) for v in x.tolist()]))
@@ -145,7 +146,7 @@ def test_an_array_s_functions_are_those_of_its_numbers(x: np.ndarray) -> None:
     assert_same_bits(c, core.cos(x))
 
 
-def test_a_function_takes_numbers_and_arrays_of_any_type_shape_and_layout() -> None:
+def test_a_function_takes_numbers_and_arrays_of_any_type_shape_and_layout():
     for one in (1, True, np.float32(1.0), np.int64(1), np.float64(1.0)):
         assert isinstance(core.log(one), float)
     x = np.arange(1.0, 25.0).reshape(2, 3, 4)
@@ -156,12 +157,59 @@ def test_a_function_takes_numbers_and_arrays_of_any_type_shape_and_layout() -> N
     assert (core.hypot(np.arange(3), np.zeros((2, 1))) == [[0, 1, 2], [0, 1, 2]]).all()
     for wrong in ("1", None, [1.0], 1j):
         with pytest.raises(TypeError):
-            core.exp(wrong)  # type: ignore[call-overload]
+            core.exp(wrong)
     with pytest.raises(ValueError, match="fit"):
         core.atan2(np.zeros(2), np.zeros(3))
 
 
-def test_a_normal_variable_stays_below_with_the_probability_of_tables() -> None:
+def test_a_normal_variable_stays_below_with_the_probability_of_tables():
     x = np.array([-9.5, -3.0, -1.0, 0.0, 0.5, 1.959963984540054, 4.0, 20.0])
     tables = [0.5 * math.erfc(-v / math.sqrt(2.0)) for v in x]
     np.testing.assert_allclose(core.normal_below(x), tables, rtol=0.0, atol=1e-15)
+
+
+KEY = bytes(range(16))
+
+
+def test_uniform_numbers_are_those_of_philox_4x64():
+    drawn, published = core.Random(KEY), np.random.Philox(key=int.from_bytes(KEY, "little"))
+    blocks = published.random_raw(4 * 100).reshape(-1, 4)
+    assert [drawn.uniform() for _ in range(100)] == [
+        (bits >> 11) * 2.0**-53 for bits in blocks[:, 0].tolist()
+    ]
+
+
+def test_normal_numbers_are_box_and_muller_s_of_the_same_blocks():
+    bits = np.random.Philox(key=int.from_bytes(KEY, "little")).random_raw(32).reshape(2, 16)
+    uniform = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    radius, angle = np.sqrt(-2.0 * np.log(uniform[:, :8])), 2.0 * np.pi * uniform[:, 8:]
+    expected = np.hstack([radius * np.cos(angle), radius * np.sin(angle)])
+    assert core.Random(KEY).normals(2, 16) == pytest.approx(expected, abs=1e-14)
+
+
+def test_a_part_of_a_block_does_not_depend_on_how_many_are_asked_for():
+    assert (
+        core.Random(KEY).normals(1, 5).tolist() == core.Random(KEY).normals(1, 16)[:, :5].tolist()
+    )
+
+
+def test_normal_numbers_are_standard_normal():
+    x = core.Random(b"sixteen bytes ok").normals(1000, 300).ravel()
+    n = len(x)
+    assert abs(x.mean()) < 4.0 / np.sqrt(n)
+    assert abs((x * x).mean() - 1.0) < 4.0 * np.sqrt(2.0 / n)
+    assert abs((x**4).mean() - 3.0) < 4.0 * np.sqrt(96.0 / n)
+    edges = core.normal_below(np.linspace(-4.0, 4.0, 65))
+    counts = np.histogram(core.normal_below(x), np.concatenate([[0.0], edges, [1.0]]))[0]
+    expected = n * np.diff(np.concatenate([[0.0], edges, [1.0]]))
+    chi2 = ((counts - expected) ** 2 / expected).sum()
+    assert chi2 < float(chi2_quantile(0.9999, float(len(counts) - 1)))
+    assert abs(np.corrcoef(x[:-1], x[1:])[0, 1]) < 4.0 / np.sqrt(n)
+    assert abs(np.corrcoef(x[::16], x[8::16])[0, 1]) < 4.0 / np.sqrt(n / 16)
+
+
+def test_wrong_keys_and_sizes_are_refused():
+    with pytest.raises(ValueError, match="16 bytes"):
+        core.Random(b"short")
+    with pytest.raises(ValueError, match="at most"):
+        core.Random(KEY).normals(1 << 20, 1 << 20)

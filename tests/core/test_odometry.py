@@ -49,7 +49,7 @@ def assert_equal(found: tuple[np.ndarray, np.ndarray], expected: Increment) -> N
 
 @pytest.mark.parametrize("mount", [None, MOUNT])
 @pytest.mark.parametrize("added", [None, ADDED])
-def test_motions_are_the_sensors_since_a_keyframe_and_the_bases_since_a_node(mount, added) -> None:
+def test_motions_are_the_sensors_since_a_keyframe_and_the_bases_since_a_node(mount, added):
     steps = [increment_of(MOTION, *part) for part in PARTS]
     if added is not None:
         spread = np.diag(added)
@@ -81,7 +81,7 @@ def test_motions_are_the_sensors_since_a_keyframe_and_the_bases_since_a_node(mou
     assert odometry.reach_node() == []
 
 
-def test_a_motion_that_was_measured_goes_on_by_its_parts() -> None:
+def test_a_motion_that_was_measured_goes_on_by_its_parts():
     odometry = core.Odometry(model_of(MOTION), None)
     whole = OdometryInterval(8, 8, 0.0, 0.0, moved(np.array([0.4, 0.1, 0.3]), 0.01 * np.eye(3)))
     twist, covariance = whole.moved
@@ -91,7 +91,7 @@ def test_a_motion_that_was_measured_goes_on_by_its_parts() -> None:
     assert_equal(odometry.end_keyframe()[0], expected)
 
 
-def test_the_motion_since_a_scan_without_identities_begins_there() -> None:
+def test_the_motion_since_a_scan_without_identities_begins_there():
     odometry = driven()
     assert_equal(odometry.pass_unnamed_scan(), composed([increment_of(MOTION, *p) for p in PARTS]))
     odometry.drive(*PARTS[0], None)
@@ -103,7 +103,7 @@ def test_the_motion_since_a_scan_without_identities_begins_there() -> None:
     assert_equal(rest, composed([increment_of(MOTION, *PARTS[1])]))
 
 
-def test_arrays_of_other_shapes_and_types_are_refused() -> None:
+def test_arrays_of_other_shapes_and_types_are_refused():
     poses = np.zeros((1, 3))
     core.reduce_scans([SEEN], poses)
     with pytest.raises(ValueError, match="poses must be"):
@@ -124,6 +124,6 @@ def test_arrays_of_other_shapes_and_types_are_refused() -> None:
         calibration_of(msgspec.structs.replace(Sensor(), range_scale=0.0))
 
 
-def test_the_median_of_no_scans_is_nothing() -> None:
+def test_the_median_of_no_scans_is_nothing():
     ids, ranges, bearings, own = core.reduce_scans([], np.empty((0, 3)))
     assert (len(ids), len(ranges), len(bearings), own.shape) == (0, 0, 0, (0, 0))

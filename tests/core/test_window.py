@@ -60,11 +60,11 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_an_array_of_another_shape_or_type_is_refused(name: str) -> None:
+def test_an_array_of_another_shape_or_type_is_refused(name):
     window = opened()
     kept = bytes_of(window)
     with pytest.raises((ValueError, TypeError)):
-        window.advance(*changed(*WRONG[name]))  # type: ignore[arg-type]
+        window.advance(*changed(*WRONG[name]))
     assert bytes_of(window) == kept
 
 
@@ -74,19 +74,17 @@ def test_an_array_of_another_shape_or_type_is_refused(name: str) -> None:
     [(0, core.MotionError), (1, core.MotionError), (3, core.NotFiniteError),
      (4, core.NotFiniteError), (7, core.NotFiniteError)],
 )  # fmt: skip
-def test_a_number_that_is_not_finite_is_refused(
-    place: int, error: type[ValueError], bad: float
-) -> None:
+def test_a_number_that_is_not_finite_is_refused(place, error, bad):
     window = opened()
     kept = bytes_of(window)
     array = np.array(KEYFRAME[place])
     array[-1] = bad
     with pytest.raises(error):
-        window.advance(*changed(place, array))  # type: ignore[arg-type]
+        window.advance(*changed(place, array))
     assert bytes_of(window) == kept
 
 
-def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one() -> None:
+def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one():
     window, indefinite = opened(), np.diag([1.0, -1.0, 1.0])
     kept = bytes_of(window)
     seen = IDS, RANGES, BEARINGS, UNCLAIMED
@@ -102,13 +100,13 @@ def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one
 
 
 @pytest.mark.parametrize("place", [0, 2, 3, 4])
-def test_a_sensor_without_noise_or_white_noise_is_refused(place: int) -> None:
+def test_a_sensor_without_noise_or_white_noise_is_refused(place):
     noise = (*NOISE[:place], 0.0, *NOISE[place + 1 :])
     with pytest.raises(ValueError, match="of the sensor must be"):
         core.Window(M, noise)
 
 
-def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes() -> None:
+def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes():
     window = core.Window(M, NOISE, mount=(0.3, 0.1, 0.7))
     window.advance(*KEYFRAME)
     based = window.of_base()
@@ -122,7 +120,7 @@ def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes() -> N
             use()
 
 
-def test_the_arrays_of_a_window_are_copies() -> None:
+def test_the_arrays_of_a_window_are_copies():
     window = opened()
     kept = bytes_of(window)
     arrays = window.particles()
@@ -130,18 +128,18 @@ def test_the_arrays_of_a_window_are_copies() -> None:
     assert bytes_of(window) == kept
 
 
-def test_arrays_may_lie_otherwise_and_be_read_only() -> None:
+def test_arrays_may_lie_otherwise_and_be_read_only():
     window, other = opened(), opened()
     wide = np.zeros((2, 2))
     wide[:, 0] = RANGES
     frozen = NORMALS.copy()
     frozen.flags.writeable = False
-    window.advance(*changed(3, wide[:, 0])[:-1], frozen)  # type: ignore[arg-type]
+    window.advance(*changed(3, wide[:, 0])[:-1], frozen)
     other.advance(*KEYFRAME)
     assert bytes_of(window) == bytes_of(other)
 
 
-def test_the_innovation_of_a_keyframe_is_that_which_advance_returns() -> None:
+def test_the_innovation_of_a_keyframe_is_that_which_advance_returns():
     window = opened()
     squared, error, S = window.innovation(*KEYFRAME[:6])
     step = window.advance(*KEYFRAME)
@@ -149,7 +147,7 @@ def test_the_innovation_of_a_keyframe_is_that_which_advance_returns() -> None:
     assert core.normalised_square(error, S) == squared
 
 
-def test_a_window_of_particles_goes_on_as_the_one_they_come_from() -> None:
+def test_a_window_of_particles_goes_on_as_the_one_they_come_from():
     window = opened()
     again = core.Window.of_particles(*window.particles(), NOISE)
     log = again.step(*KEYFRAME[:6], NORMALS)
@@ -158,7 +156,7 @@ def test_a_window_of_particles_goes_on_as_the_one_they_come_from() -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_replacing_paths_by_themselves_changes_nothing() -> None:
+def test_replacing_paths_by_themselves_changes_nothing():
     window = opened(3, CONSTANT)
     kept = bytes_of(window)
     _, log_weights, _, means, covariances = window.particles()
@@ -168,7 +166,7 @@ def test_replacing_paths_by_themselves_changes_nothing() -> None:
         window.replace(window.paths()[:1], log_weights, means, covariances)
 
 
-def test_particles_that_do_not_fit_each_other_are_refused() -> None:
+def test_particles_that_do_not_fit_each_other_are_refused():
     poses, logs, ids, means, covariances = opened().particles()
     fitting = poses, logs, ids, means, covariances
     for place, wrong in enumerate(
@@ -186,7 +184,7 @@ def test_particles_that_do_not_fit_each_other_are_refused() -> None:
         core.Window.of_particles(poses, logs + np.inf, ids, means, covariances, NOISE)
 
 
-def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path() -> None:
+def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path():
     with pytest.raises(IndexError):
         core.Window(M, NOISE).mark()
     window = opened()
@@ -200,7 +198,7 @@ def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path() -
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 127, 128, 129, 1000, 4099])
-def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count: int) -> None:
+def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count):
     weights = RNG.dirichlet(np.ones(count))
     squares = float(np.add.reduce(weights * weights))
     assert core.sample_factor(weights) == 1.0 / (1.0 - 5.0 * min(squares, 0.1))
@@ -210,9 +208,7 @@ def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count: i
 @given(
     st.integers(1, 40), st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([NOISE, CONSTANT])
 )
-def test_windows_of_any_size_run_and_close(
-    count: int, seed: int, improved: bool, noise: tuple[float, ...]
-) -> None:
+def test_windows_of_any_size_run_and_close(count, seed, improved, noise):
     """Sizes, ids and claims at random, for a build with sanitizers to find reads beyond an end."""
     rng = np.random.default_rng(seed)
     window = core.Window(count, noise, improved, (0.1, 0.2, 0.3) if seed % 2 else (0.0, 0.0, 0.0))

@@ -13,7 +13,7 @@ from tests.estimation import arithmetic
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the class is one of x86_64")
-def test_a_processor_without_avx_computes_the_same_bits() -> None:
+def test_a_processor_without_avx_computes_the_same_bits():
     finished = subprocess.run(
         [sys.executable, "-m", "tests.estimation.arithmetic"],
         env={**os.environ, **CLASSES["without AVX"]},

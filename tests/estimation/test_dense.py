@@ -26,14 +26,14 @@ def _drawn(shape: tuple[int, ...], seed: int = 3) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("one", "other"), SHAPES)
-def test_a_product_is_that_of_numpy(one: tuple[int, ...], other: tuple[int, ...]) -> None:
+def test_a_product_is_that_of_numpy(one, other):
     a, b = _drawn(one), _drawn(other, 4)
     found = dense.product(a, b)
     assert found.shape == (a @ b).shape
     np.testing.assert_allclose(found, a @ b, rtol=1e-12, atol=1e-13)
 
 
-def test_an_entry_of_a_product_is_one_sum_in_order_whatever_else_is_computed() -> None:
+def test_an_entry_of_a_product_is_one_sum_in_order_whatever_else_is_computed():
     a, b = _drawn((7, 13)), _drawn((13, 1100), 4)
     in_order = np.zeros((7, 1100))
     for p in range(13):
@@ -44,7 +44,7 @@ def test_an_entry_of_a_product_is_one_sum_in_order_whatever_else_is_computed() -
     assert (dense.product(a, b) == in_order).all()
 
 
-def test_solutions_are_those_of_numpy() -> None:
+def test_solutions_are_those_of_numpy():
     A = _drawn((6, 4, 4))
     for B in (_drawn((6, 4, 2), 5), _drawn((4, 2), 5)):
         np.testing.assert_allclose(dense.solve(A, B), np.linalg.solve(A, B), rtol=1e-9)
@@ -58,7 +58,7 @@ def test_solutions_are_those_of_numpy() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 9, 31, 32, 70, 130])
-def test_factors_are_those_of_numpy(n: int) -> None:
+def test_factors_are_those_of_numpy(n):
     P = _drawn((n, n + 21))
     P = P @ P.T
     L = dense.cholesky(P)
@@ -71,7 +71,7 @@ def test_factors_are_those_of_numpy(n: int) -> None:
         np.testing.assert_allclose(P @ dense.solve_factored(L, B), B, rtol=1e-8, atol=1e-8)
 
 
-def test_a_matrix_that_has_no_factor_and_shapes_that_do_not_fit_are_refused() -> None:
+def test_a_matrix_that_has_no_factor_and_shapes_that_do_not_fit_are_refused():
     for singular in (-np.eye(3), np.array([[1.0, 1.0], [1.0, 1.0]])):
         with pytest.raises(np.linalg.LinAlgError):
             dense.cholesky(singular)

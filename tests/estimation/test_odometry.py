@@ -27,7 +27,7 @@ def interval(increment: list[float], claim: np.ndarray | None = None) -> Odometr
 
 @pytest.mark.parametrize("claim", [None, CLAIM])
 @pytest.mark.parametrize("cuts", [(0.5,), (0.1, 0.35, 0.8)])
-def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts) -> None:
+def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts):
     whole = interval([0.8, -0.3, 0.7], claim)
     motion = MotionModel() if claim is None else NOISY
     ends = [0, *(round(cut * SECOND) for cut in cuts), SECOND]
@@ -39,7 +39,7 @@ def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts) -> N
                                atol=1e-12)  # fmt: skip
 
 
-def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_the_whole() -> None:
+def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_the_whole():
     dense = MotionModel(forward=MotionNoise(0, 0.05), turn=MotionNoise(0, 0.02))
     whole = interval([0.8, -0.3, 0.7])
     one = whole.part(dense, SECOND, 0)
@@ -50,7 +50,7 @@ def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_th
 
 
 @pytest.mark.parametrize("way", [1.5, -1.5])
-def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way: float) -> None:
+def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way):
     wheels = MotionModel("differential-drive", wheel_base=0.5, left_wheel=0.1, right_wheel=0.02)
     for motion in (NOISY, wheels):
         arc = increment_of(motion, 1.0, way, 0.4)
@@ -59,7 +59,7 @@ def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way: float
         np.testing.assert_allclose(told.covariance, arc.covariance, atol=1e-12)
 
 
-def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say() -> None:
+def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say():
     motion = MotionModel(forward=MotionNoise(0.3), turn=MotionNoise(0.2), lateral=MotionNoise(0.1))
     xi = np.array([0.8, -0.5, 0.9])
     along = np.array([*(xi[:2] / np.hypot(*xi[:2])), 0.0])
@@ -75,7 +75,7 @@ def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say() 
     np.testing.assert_allclose(told.covariance, expected, atol=1e-9)
 
 
-def test_a_car_of_whose_left_wheel_the_speed_is_told_drives_its_circle() -> None:
+def test_a_car_of_whose_left_wheel_the_speed_is_told_drives_its_circle():
     car = MotionModel("ackermann", wheel_base=2.83, wheel_offset=0.76, steering_offset=0.02)
     forward, yaw_rate = steered(car, 3.0, 0.18)
     radius = 2.83 / np.tan(0.2)
@@ -85,7 +85,7 @@ def test_a_car_of_whose_left_wheel_the_speed_is_told_drives_its_circle() -> None
     assert np.isnan(steered(car, 3.0, 1.4)).all(), "the centre of the turn is under the wheel"
 
 
-def test_shares_of_the_way_are_held_for_their_time_and_then_grow_as_it_does() -> None:
+def test_shares_of_the_way_are_held_for_their_time_and_then_grow_as_it_does():
     car = MotionModel("ackermann", wheel_base=2.83, shares=(0.14, 0.15, 0.0), shares_interval_s=0.2)
     held = increment_of(car, 0.2, 5.0, 0.0).covariance
     np.testing.assert_allclose(np.sqrt(np.diag(held)), [0.14, 0.15, 0.0], atol=1e-12)
@@ -93,14 +93,14 @@ def test_shares_of_the_way_are_held_for_their_time_and_then_grow_as_it_does() ->
     np.testing.assert_allclose(twice, 2.0 * held, atol=1e-12)
 
 
-def test_what_can_not_be_configured_is_said() -> None:
+def test_what_can_not_be_configured_is_said():
     with pytest.raises(ValueError, match="ackermann needs wheel_base"):
         MotionModel("ackermann")
     with pytest.raises(ValueError, match="are a car's, not of velocity"):
         MotionModel(wheel_offset=0.5)
 
 
-def test_a_step_by_parts_ends_where_the_whole_does() -> None:
+def test_a_step_by_parts_ends_where_the_whole_does():
     whole = interval([2.0, 0.5, 3.0])
     half = whole.part(MotionModel(), SECOND // 2, SECOND // 2).mean
     np.testing.assert_allclose(compose(half, half), [2.0, 0.5, 3.0], atol=1e-12)

@@ -44,7 +44,7 @@ def updated(scan) -> tuple[np.ndarray, np.ndarray]:
     return one_landmark.updated(MEAN, packed(SPREAD), POSE, seen, SENSOR, scan.own)[:2]
 
 
-def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane() -> None:
+def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane():
     point = np.array([[2.5, 1.5]])
     mean, P = updated(point_scan(IDS, point, CLAIM[None]))
     H = turn(POSE[2]).T
@@ -55,7 +55,7 @@ def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_
     np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
 
 
-def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does() -> None:
+def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does():
     seen, R = np.array([4.0, 0.3]), np.array([[0.04, 0.006], [0.006, 0.002]])
     mean, P = updated(polar_scan(IDS, seen[:1], seen[1:], packed(R)[None]))
     r, b = predicted(POSE, MEAN)
@@ -65,7 +65,7 @@ def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does
     np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
 
 
-def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
+def test_a_landmark_is_placed_with_the_covariance_of_its_point():
     scan = point_scan(IDS, np.array([[2.5, 1.5]]), CLAIM[None])
     seen = np.column_stack((scan.ranges, scan.bearings))
     (mean,), (P,) = core.place(POSE, seen, (*SENSOR[:2], 1.0, SENSOR[2], 1.0), scan.own)
@@ -77,7 +77,7 @@ def test_a_landmark_is_placed_with_the_covariance_of_its_point() -> None:
         np.testing.assert_allclose(one, other, atol=1e-14)
 
 
-def test_the_sensors_own_covariance_claimed_changes_nothing() -> None:
+def test_the_sensors_own_covariance_claimed_changes_nothing():
     seen = np.array([4.0]), np.array([0.3])
     claimed = polar_scan(IDS, *seen, np.array([[SENSOR[0], 0.0, SENSOR[2]]]))
     bare = polar_scan(IDS, *seen)
@@ -85,7 +85,7 @@ def test_the_sensors_own_covariance_claimed_changes_nothing() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_points_near_with_much_noise_place_a_landmark_without_a_bias() -> None:
+def test_points_near_with_much_noise_place_a_landmark_without_a_bias():
     rng = np.random.default_rng(5)
     truth, sigma, count = np.array([0.6, 0.2]), 0.2, 4000
     points = truth + sigma * rng.standard_normal((count, 2))
@@ -106,7 +106,7 @@ def test_points_near_with_much_noise_place_a_landmark_without_a_bias() -> None:
 
 
 @pytest.mark.parametrize("whites", [(1.0, 1.0), (0.4, 1.0), (0.5, 0.3)])
-def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None:
+def test_landmarks_along_paths_with_own_noises_are_least_squares(whites):
     rng = np.random.default_rng(2)
     path = np.column_stack((np.arange(5.0), 0.1 * np.arange(5.0), 0.2 * np.arange(5.0)))
     truth = np.array([4.0, 6.0])
@@ -138,7 +138,7 @@ def test_landmarks_along_paths_with_own_noises_are_least_squares(whites) -> None
     np.testing.assert_allclose(full(covariances[0, 0]), np.linalg.inv(information), rtol=5e-3)
 
 
-def test_a_claim_is_carried_to_another_pose_as_the_plane_turns() -> None:
+def test_a_claim_is_carried_to_another_pose_as_the_plane_turns():
     scan = point_scan(IDS, np.array([[2.0, 1.0]]), CLAIM[None])
     larger = scan._replace(own=scan.own * [3.0, 3.0, 3.0, 1.0])
     back = np.array([0.3, -0.4, 0.5])
@@ -156,13 +156,13 @@ def test_a_claim_is_carried_to_another_pose_as_the_plane_turns() -> None:
     np.testing.assert_array_equal(mixed, own, "a scan without covariances says nothing of them")
 
 
-def test_scans_of_which_only_some_claim_say_so_row_by_row() -> None:
+def test_scans_of_which_only_some_claim_say_so_row_by_row():
     own = together([(2, unclaimed(2)), (1, np.array([[0.1, 0.0, 0.2, POLAR]]))])
     assert own[:, 3].tolist() == [-1.0, -1.0, POLAR]
     assert together([(2, unclaimed(2)), (1, unclaimed(1))]).shape == (3, 0)
 
 
-def test_claims_beyond_the_bounds_are_named() -> None:
+def test_claims_beyond_the_bounds_are_named():
     claims = np.array([[0.1, 0.0, 0.2], [1e-18, 0.0, 0.2], [0.1, 0.0, 1e30]])
     ranges = np.ones(3)
     scan = polar_scan(np.arange(3, dtype=np.uint32), ranges, np.zeros(3), claims)

@@ -2,7 +2,6 @@
 
 import re
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,11 +36,11 @@ BROKEN_NS = 17_000_000_000
 
 
 @pytest.fixture
-def brittle(monkeypatch: pytest.MonkeyPatch) -> None:
+def brittle(monkeypatch):
     """An estimator that raises at one odometry, in the middle of what it changes."""
     whole = HybridSlam.drive
 
-    def drive(self, interval, **how):  # type: ignore[no-untyped-def]
+    def drive(self, interval, **how):
         if interval.end_ns == BROKEN_NS:
             self.sequence += 7
             self._segmenter = None
@@ -58,8 +57,8 @@ def faults(samples: list[Sample]) -> list[m.Fault]:
 
 @pytest.mark.usefixtures("brittle")
 def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_not_been_there(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     samples = list(team_samples(thesis(45)))
     told = faults(samples)
     assert [(f.node, f.origin, f.message) for f in told] == [
@@ -87,7 +86,7 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
 
 
 @pytest.mark.usefixtures("brittle")
-def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measurement() -> None:
+def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measurement():
     measurements = published(stream("r1", 30))
     broken = next(r for r in measurements if isinstance(r, m.Odometry) and r.stamp_ns == BROKEN_NS)
     node, without = RobotNode(config()), RobotNode(config())
@@ -110,8 +109,8 @@ def submaps(out: list[Outgoing]) -> list[m.Message]:
 
 
 def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_in_the_map(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     whole = SubmapStore.add_submap
 
     def add(self: SubmapStore, of: m.Submap) -> str | None:
@@ -133,9 +132,7 @@ def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_i
     assert m.VersionEntry(robot="r1", incarnation=done.incarnation, sequence=1) in final.missing
 
 
-def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(monkeypatch):
     def conclude(self: MapPublisher, now_ns: int) -> list[Outgoing]:
         raise np.linalg.LinAlgError("singular")
 
@@ -147,9 +144,7 @@ def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says
     assert len(faults(samples)) == 1
 
 
-def test_running_maps_that_raise_take_nothing_from_the_final_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_running_maps_that_raise_take_nothing_from_the_final_one(monkeypatch):
     def advance(self: MapPublisher, closed_ns: float, now_ns: int) -> list[Outgoing]:
         raise np.linalg.LinAlgError("singular")
 
@@ -176,7 +171,7 @@ class Brittle:
 
 
 @pytest.fixture
-def heard() -> tuple[Shell, MemoryBus]:
+def heard():
     network = MemoryNetwork()
     sink = MemoryBus(network)
     for channel in (ch.FAULT, ch.STATUS):
@@ -188,9 +183,7 @@ def sampled(message: m.Message, key: str, counter: int = 0) -> Sample:
     return Sample(key, encoded(message), message.stamp_ns, 0, counter)
 
 
-def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(
-    heard: tuple[Shell, MemoryBus],
-) -> None:
+def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(heard):
     shell, sink = heard
     one, two = (sampled(submap(k), "robot/alpha/submap", k) for k in range(2))
     shell.take([one, two, one, two])
@@ -200,9 +193,7 @@ def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(
         shell.end(None)
 
 
-def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
-    heard: tuple[Shell, MemoryBus],
-) -> None:
+def test_a_status_that_raises_is_a_fault_and_the_status_says_that(heard):
     shell, sink = heard
     shell.report(last=True)
     fault, status = (opened(s)[2] for s in sink.receive())
@@ -213,7 +204,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(
     assert "status: RuntimeError at teamslam.team.shell:Shell.contained:" in status.warnings[-1]
 
 
-def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew() -> None:
+def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew():
     network = MemoryNetwork()
     centre, viewer = MemoryBus(network), MemoryBus(network)
     start = build.initial_pose()
@@ -230,9 +221,7 @@ def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_
     assert len(faults([s for s in viewer.receive() if s.key.endswith("fault")])) == 1
 
 
-def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
-    tmp_path: Path,
-) -> None:
+def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(tmp_path):
     network = MemoryNetwork()
     stranger = MemoryBus(network)
     stranger.declare_alive("robot/" + "a" * 25_000)
@@ -250,7 +239,7 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(
         assert loop.written == 0, "the key is of no channel"
 
 
-def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
+def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody():
     network = MemoryNetwork()
     shell = Shell(MemoryBus(network), CentralNode(CENTRE, ["r1"]), "central", threading.Event())
 
@@ -264,9 +253,7 @@ def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody() -> None:
     assert shell.boundary.faults == 1
 
 
-def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(monkeypatch):
     network = MemoryNetwork()
     bus, sink = MemoryBus(network), MemoryBus(network)
     sink.subscribe(ch.SUBMAP)
@@ -284,7 +271,7 @@ def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(
     assert [s.key for s in sink.receive()] == ["robot/alpha/fault", "robot/alpha/submap"]
 
 
-def test_an_interrupt_within_native_code_ends_the_run_and_is_no_fault() -> None:
+def test_an_interrupt_within_native_code_ends_the_run_and_is_no_fault():
     """A callback from native code turns it into a SystemError."""
 
     class Interrupted:

@@ -110,7 +110,7 @@ def centre() -> tuple[Boundary, CentralNode]:
     return Boundary("central"), node
 
 
-def test_a_centre_refuses_what_can_not_be_and_its_map_stays() -> None:
+def test_a_centre_refuses_what_can_not_be_and_its_map_stays():
     plain, node = centre()
     (wanted,) = of(given(plain, node, *run()), ch.FINAL_MAP)
     assert plain.refused == 0, plain.last_refused
@@ -130,7 +130,7 @@ def test_a_centre_refuses_what_can_not_be_and_its_map_stays() -> None:
     assert encoded(final) == encoded(wanted)
 
 
-def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submaps() -> None:
+def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submaps():
     def robot() -> tuple[Boundary, RobotNode]:
         return Boundary("robot/r1"), RobotNode(RobotConfig("r1"))
 
@@ -170,7 +170,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     assert of(out, ch.ROBOT_DONE) == of(wanted, ch.ROBOT_DONE)
 
 
-def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() -> None:
+def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own():
     streams = world_of(*STREAMS.values())
     announced = configured("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
@@ -197,7 +197,7 @@ def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own() 
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_what_a_team_can_say_is_refused_in_no_order(order: int) -> None:
+def test_what_a_team_can_say_is_refused_in_no_order(order):
     door = Door(["r1", "r2"])
     said = [message for _, _, message in run()]
     assert [door.refusal(message) for message in said[::order]] == [None] * len(said)
@@ -251,7 +251,7 @@ FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
 
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("what", FORGED)
-def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind) -> None:
+def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind):
     """The end and the last words that confirm each other are believed, whatever else was said."""
     (*said, end) = run()
     honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
@@ -264,7 +264,7 @@ def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, 
     assert encoded(misled.final) == encoded(honest.final)
 
 
-def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out() -> None:
+def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out():
     """Everything that the robot itself said was then years before its stream began."""
     node = CentralNode(CentralConfig(), list(STREAMS))
     boundary = Boundary("central")
@@ -273,7 +273,7 @@ def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source
     assert boundary.refused == 0
 
 
-def test_a_world_goes_on_when_others_took_what_a_stranger_has_published() -> None:
+def test_a_world_goes_on_when_others_took_what_a_stranger_has_published():
     """A robot, and the recorder, counted further than there is: their progress gave no credit."""
     streams = world_of(*STREAMS.values())
     announced = configured("world", 0, 0, RobotConfig("r1"))

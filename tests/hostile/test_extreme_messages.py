@@ -10,7 +10,6 @@ import resource
 import time
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from random import Random
 
 import numpy as np
@@ -80,7 +79,7 @@ def beginning() -> list[Sample]:
     return [Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, 0) for each in out]
 
 
-def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door() -> None:
+def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door():
     passed = {}
     for kind in CARRIED:
         sound = 0
@@ -95,7 +94,7 @@ def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door() -> No
 
 @pytest.mark.parametrize("kind", CARRIED, ids=m.tag_of)
 @pytest.mark.parametrize("name", NODES)
-def test_no_extreme_message_raises_in_a_node(name: str, kind: type[m.Message]) -> None:
+def test_no_extreme_message_raises_in_a_node(name, kind):
     def hand_over() -> tuple[float, float]:
         """CPU time [s] and growth of the peak of memory [MiB]."""
         node, boundary = NODES[name](), Boundary(name)
@@ -114,7 +113,7 @@ def test_no_extreme_message_raises_in_a_node(name: str, kind: type[m.Message]) -
     assert grown_mib < MOST_MIB
 
 
-def test_no_extreme_message_raises_in_the_viewer() -> None:
+def test_no_extreme_message_raises_in_the_viewer():
     viewer = ViewerNode()
     for kind in CARRIED:
         for sample in drawn(kind, COUNT):
@@ -125,7 +124,7 @@ def test_no_extreme_message_raises_in_the_viewer() -> None:
             viewer.handle(channel, message)
 
 
-def test_every_extreme_message_is_recorded_and_the_log_can_be_checked(tmp_path: Path) -> None:
+def test_every_extreme_message_is_recorded_and_the_log_can_be_checked(tmp_path):
     path = tmp_path / "log.mcap"
     with Recorder(path, "t", {}) as recorder:
         loop = RecordLoop(MemoryBus(MemoryNetwork()), recorder, ())

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +15,7 @@ MOST_MIB = 300
 """Growth of a process beyond what its imports take; the largest message alone has 64 MiB."""
 
 
-def test_no_command_lets_a_small_file_take_much_memory_or_end_in_a_traceback(
-    tmp_path: Path,
-) -> None:
+def test_no_command_lets_a_small_file_take_much_memory_or_end_in_a_traceback(tmp_path):
     files = [kind(tmp_path / f"{kind.__name__}.mcap") for kind in KINDS]
     assert max(file.stat().st_size for file in files) <= LARGEST_FILE
     done = subprocess.run(
@@ -38,9 +35,7 @@ def test_no_command_lets_a_small_file_take_much_memory_or_end_in_a_traceback(
     assert all(refused[n][0] == 2 for n in ("report", "rerun", "replay", "csv", "ledger", "view"))
 
 
-def test_a_chunk_of_millions_of_records_is_refused_before_they_are_objects(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_of_millions_of_records_is_refused_before_they_are_objects(tmp_path, monkeypatch):
     log = open_log(many_small(tmp_path / "log.mcap"))
     with pytest.raises(LogError, match="more than 250000 records"):
         list(log.samples())

@@ -1,7 +1,5 @@
 """Messages of a hostile or broken peer neither fill a robot nor keep it busy."""
 
-from pathlib import Path
-
 import msgspec
 import pytest
 
@@ -49,7 +47,7 @@ def asked_in(out: list) -> int:
     return sum(w.last - w.first + 1 for each in requests for w in each.requested)
 
 
-def test_a_node_that_gives_nothing_is_not_asked_for_more_and_more() -> None:
+def test_a_node_that_gives_nothing_is_not_asked_for_more_and_more():
     node = node_of()
     asked = 0
     for serial in range(100):
@@ -60,7 +58,7 @@ def test_a_node_that_gives_nothing_is_not_asked_for_more_and_more() -> None:
     assert asked_in(node.take_summary(summary_of(claim(), claim("r3")))) > 0
 
 
-def test_what_has_arrived_is_not_counted_as_owed() -> None:
+def test_what_has_arrived_is_not_counted_as_owed():
     node, honest = node_of(), PeerNode("robot/r2", ROBOTS)
     for each in (start("r2"), *(one for k in range(40) for one in parcel("r2", k, ["r3"]))):
         honest.take(each, "robot/r2")
@@ -72,7 +70,7 @@ def test_what_has_arrived_is_not_counted_as_owed() -> None:
     assert node._open["robot/r2"] == owed == 1  # the stream's own mark
 
 
-def test_a_summary_names_each_stream_once_and_no_more_than_a_team_can_have() -> None:
+def test_a_summary_names_each_stream_once_and_no_more_than_a_team_can_have():
     for twice in (summary_of(claim(), claim()), summary_of(claim("r3"), claim("r2"))):
         with pytest.raises(WireError, match="not ascending"):
             decoded(encoded(twice), m.SetSummary)
@@ -92,7 +90,7 @@ def test_a_summary_names_each_stream_once_and_no_more_than_a_team_can_have() -> 
     assert asked_in(node.take_summary(summary_of(claim(incarnation=MOST_LIVES + 1)))) == 0
 
 
-def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted() -> None:
+def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted():
     node = node_of()
     for each in (start("r2"), *parcel("r2", 0)):
         node.take(each, "robot/r2")
@@ -112,7 +110,7 @@ def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted() -> N
     assert centre.others == {"robot/r2"}
 
 
-def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path: Path) -> None:
+def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path):
     node = node_of()
     poses = [start(robot) for robot in ROBOTS]
     huge = bytes(5 * 2**20)
@@ -143,7 +141,7 @@ class _Signs:
         return True
 
 
-def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one() -> None:
+def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one():
     proofs = Proofs("r1", _Signs())
     pose = start("r3")
     for size, kept in ((LARGEST_OF_ROBOT + 1, b""), (72, bytes(72))):
@@ -152,7 +150,7 @@ def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one() -> None:
         assert proofs.of(member(ch.START, pose.message)) == kept
 
 
-def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> None:
+def test_a_question_that_names_a_robot_again_and_again_is_answered_once():
     node = node_of()
     last = build.done(robot="r2", measurements=1, submaps=1)
     node.take(member(ch.ROBOT_DONE, last), "robot/r2")
@@ -161,7 +159,7 @@ def test_a_question_that_names_a_robot_again_and_again_is_answered_once() -> Non
     assert len(decoded(reply, m.Members).keys) == 1
 
 
-def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold_as_often() -> None:
+def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold_as_often():
     team = ("r2",)
     node = PeerNode("robot/r1", team)
     fold = PeerFold(CentralConfig(), team, node)

@@ -10,7 +10,7 @@ from tests.keys.certificates import TEAM, Folders
 
 
 @pytest.fixture(scope="session")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Folders:
+def keys(tmp_path_factory):
     folders = Folders(*(tmp_path_factory.mktemp(name) for name in ("own", "strange", "ended")))
     nodes = [*nodes_of(["r1", "r2"])]
     make_keys(folders.own, TEAM, nodes)

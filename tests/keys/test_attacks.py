@@ -115,9 +115,7 @@ def arriving(bus: ZenohBus, last: str) -> list[str]:
 
 
 @pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
-def test_a_robot_that_was_taken_over_says_nothing_for_others(
-    keys: Folders, *, locked: bool
-) -> None:
+def test_a_robot_that_was_taken_over_says_nothing_for_others(keys, *, locked):
     with door(keys if locked else None) as enter:
         victim, robot = enter("recorder"), enter("robot-r2")
         said = [*(Outgoing(*attack) for attack in ATTACKS.values()), *on_every_row()]
@@ -150,8 +148,8 @@ OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
 
 @pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
 def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_elses(
-    keys: Folders, *, locked: bool
-) -> None:
+    keys, *, locked
+):
     """The final map of a team with a centre is the centre's, whatever a robot publishes before
     and after it, and garbage hides it from nobody."""
     true = msgspec.structs.replace(FINAL, dof=99)
@@ -200,9 +198,7 @@ def answers(asker: ZenohBus, channel: ch.Channel, name: str, request: m.Message)
 
 
 @pytest.mark.parametrize("locked", [True, False], ids=["keys", "open"])
-def test_a_robot_that_was_taken_over_answers_no_query_of_another(
-    keys: Folders, *, locked: bool
-) -> None:
+def test_a_robot_that_was_taken_over_answers_no_query_of_another(keys, *, locked):
     forged = [encoded(odometry(5, "r1"))]
     end = build.kept(key="central/final", payload=encoded(FINAL))
     wanted = build.measurements_request()
@@ -231,7 +227,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(
         assert [each.key for each in ended] == ([] if locked else [ch.FINAL_MAP.key()])
 
 
-def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys: Folders) -> None:
+def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys):
     with door(keys) as enter:
         robot, source = enter("robot-r1"), enter("source-r1")
         for k in range(5):
@@ -259,7 +255,7 @@ def test_a_team_works_with_keys_late_joiners_caches_tokens_and_queries(keys: Fol
         wait_until(driven, what="a measurement")
 
 
-def test_no_estimator_hears_the_truth(keys: Folders) -> None:
+def test_no_estimator_hears_the_truth(keys):
     truth = Outgoing(ch.TRUTH, "r1", example(m.Truth))
     with door(keys) as enter:
         world, robot, recorder = enter("world"), enter("robot-r1"), enter("recorder")
@@ -272,7 +268,7 @@ def test_no_estimator_hears_the_truth(keys: Folders) -> None:
         assert arriving(robot, "world/end") == []
 
 
-def test_a_token_with_an_endless_name_is_nobodys(keys: Folders) -> None:
+def test_a_token_with_an_endless_name_is_nobodys(keys):
     """Its own prefix lets a robot hold it; nobody takes it for a node's."""
     with door(keys) as enter:
         robot, centre = enter("robot-r2"), enter("central")
@@ -286,15 +282,13 @@ def test_a_token_with_an_endless_name_is_nobodys(keys: Folders) -> None:
 
 def refusal(endpoint: str, node: Path | None, **changed: object) -> tuple[str, float]:
     began = time.monotonic()
-    shown = node and replace(credentials_of(node, "robot-r1"), **changed)  # type: ignore[type-var]
+    shown = node and replace(credentials_of(node, "robot-r1"), **changed)
     with pytest.raises(BusError) as caught:
         ZenohBus(TEAM, endpoint, 4.0, shown or None)
     return str(caught.value), time.monotonic() - began
 
 
-def test_each_side_names_a_certificate_that_it_refuses(
-    keys: Folders, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_each_side_names_a_certificate_that_it_refuses(keys, monkeypatch, capfd):
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     own = credentials_of(keys.own, "router"), load_roster(keys.own)
     with router("tls/127.0.0.1:0", own) as endpoint:
@@ -336,9 +330,7 @@ def shut_out(bus: ZenohBus) -> tuple[str, float]:
     return "nothing", time.monotonic() - began
 
 
-def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_router_whose_certificate_ends_is_named_by_who_is_in(tmp_path, monkeypatch):
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     make_keys(tmp_path, TEAM, nodes_of(["r1"]))
     told, took = "", 0.0
@@ -358,9 +350,7 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(
     assert took < life_s + 20.0
 
 
-def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(tmp_path, monkeypatch):
     """Its link comes up again and delivers nothing; those of the others deliver."""
     monkeypatch.setattr(session, "LINK_S", 0.3)
     home, carried = tmp_path / "home", tmp_path / "carried"

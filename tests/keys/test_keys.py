@@ -19,7 +19,7 @@ from teamslam.team.wire.zenoh.access import owned
 from tests.keys.certificates import TEAM, Folders
 
 
-def test_each_file_is_for_its_owner_alone_and_the_team_is_in_the_roster(keys: Folders) -> None:
+def test_each_file_is_for_its_owner_alone_and_the_team_is_in_the_roster(keys):
     modes = {stat.S_IMODE(path.stat().st_mode) for path in keys.own.iterdir()}
     assert modes == {0o600}
     roster = load_roster(keys.own)
@@ -28,7 +28,7 @@ def test_each_file_is_for_its_owner_alone_and_the_team_is_in_the_roster(keys: Fo
     assert {roster.common_name(node) for node in roster.nodes} == set(roster.nodes)
 
 
-def test_a_nodes_files_are_enough_for_it(keys: Folders, tmp_path: Path) -> None:
+def test_a_nodes_files_are_enough_for_it(keys, tmp_path):
     for name in ("ca.pem", "robot-r1.pem", "robot-r1.key"):
         shutil.copy(keys.own / name, tmp_path)
     found = credentials_of(tmp_path, "robot-r1", TEAM)
@@ -47,12 +47,10 @@ def mixed(keys: Folders, tmp_path: Path, **files: Path) -> Path:
     return tmp_path
 
 
-def test_what_is_wrong_with_a_nodes_files_is_named_before_it_connects(
-    keys: Folders, tmp_path: Path
-) -> None:
+def test_what_is_wrong_with_a_nodes_files_is_named_before_it_connects(keys, tmp_path):
     def told(folder: Path, node: str = "robot-r1", **more: object) -> str:
         with pytest.raises(KeysError) as caught:
-            credentials_of(folder, node, **more)  # type: ignore[arg-type]
+            credentials_of(folder, node, **more)
         return str(caught.value)
 
     assert "robot-r9.pem: not found; robot-r9 needs ca.pem" in told(keys.own, "robot-r9")
@@ -75,14 +73,14 @@ def test_what_is_wrong_with_a_nodes_files_is_named_before_it_connects(
     assert "not valid before " in told(keys.own, now=now - timedelta(days=2))
 
 
-def test_a_certificate_that_ends_soon_is_spoken_of(keys: Folders) -> None:
+def test_a_certificate_that_ends_soon_is_spoken_of(keys):
     (warning,) = credentials_of(keys.own, "central").warnings(
         datetime.now(UTC) + timedelta(days=85)
     )
     assert "renew it by `teamslam keys mixed --renew central`" in warning
 
 
-def test_a_robot_is_added_and_what_there_is_stays(tmp_path: Path) -> None:
+def test_a_robot_is_added_and_what_there_is_stays(tmp_path):
     make_keys(tmp_path, TEAM, nodes_of(["r1"]))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     made = make_keys(tmp_path, TEAM, nodes_of(["r1", "r2"]))
@@ -99,7 +97,7 @@ def test_a_robot_is_added_and_what_there_is_stays(tmp_path: Path) -> None:
         make_keys(tmp_path, TEAM, nodes_of(["r3"]))
 
 
-def test_who_is_renewed_keeps_its_name_and_who_was_revoked_gets_another(tmp_path: Path) -> None:
+def test_who_is_renewed_keeps_its_name_and_who_was_revoked_gets_another(tmp_path):
     make_keys(tmp_path, TEAM, nodes_of(["r1", "r2"]))
     old = (tmp_path / "robot-r1.pem").read_bytes()
     assert make_keys(tmp_path, TEAM, [], renew=["robot-r1"]).made == ("robot-r1",)
@@ -115,7 +113,7 @@ def test_who_is_renewed_keeps_its_name_and_who_was_revoked_gets_another(tmp_path
         make_keys(tmp_path, TEAM, [], renew=["robot-r7"])
 
 
-def test_another_host_of_the_router_renews_its_certificate(tmp_path: Path) -> None:
+def test_another_host_of_the_router_renews_its_certificate(tmp_path):
     make_keys(tmp_path, TEAM, nodes_of([]))
     assert make_keys(tmp_path, TEAM, [], hosts=["lab.example", "10.0.0.7"]).made == ("router",)
     assert make_keys(tmp_path, TEAM, [], hosts=["lab.example"]).made == ()
@@ -123,7 +121,7 @@ def test_another_host_of_the_router_renews_its_certificate(tmp_path: Path) -> No
         make_keys(tmp_path, TEAM, [], hosts=["bücher.example"])
 
 
-def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors() -> None:
+def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors():
     """A row whose key nobody owns could not be published with keys."""
     nodes = nodes_of(["r1", "r2"])
 
@@ -154,7 +152,7 @@ def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors() ->
         ("tcp/lab.example:7447", False), ("unixsock-stream/run/zenoh", True), ("tcp/:7447", False),
     ],
 )  # fmt: skip
-def test_an_open_router_for_others_needs_a_word(listen: str, local: bool) -> None:
+def test_an_open_router_for_others_needs_a_word(listen, local):
     assert is_loopback(listen) is local
     if not local:
         for command in (["router"], ["replay", "nothing.mcap"]):
@@ -164,7 +162,7 @@ def test_an_open_router_for_others_needs_a_word(listen: str, local: bool) -> Non
             assert "--insecure" in refused.output
 
 
-def test_the_command_makes_keys_for_a_scenario_and_says_what_it_did(tmp_path: Path) -> None:
+def test_the_command_makes_keys_for_a_scenario_and_says_what_it_did(tmp_path):
     def run(*words: str) -> str:
         result = CliRunner().invoke(app, ["keys", "mapping", "-o", str(tmp_path / "k"), *words])
         assert result.exit_code == 0, result.output

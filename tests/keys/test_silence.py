@@ -16,13 +16,13 @@ from teamslam.team.wire.zenoh import session
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.handshake import examine
 from teamslam.team.wire.zenoh.router import router
-from tests.keys.certificates import TEAM, Folders
+from tests.keys.certificates import TEAM
 from tests.support import Link, submap, wait_until
 
 
 def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
-    keys: Folders, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    keys, monkeypatch, caplog
+):
     """Its machine is busy, its lid is closed, the radio is bad: connections stay, or are made, and
     nothing is answered.
     """
@@ -34,7 +34,7 @@ def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
     examined: list[str] = []
 
     def counted(*arguments: object) -> object:
-        found = examine(*arguments)  # type: ignore[arg-type]
+        found = examine(*arguments)
         examined.append(found.waits_for)
         return found
 
@@ -104,9 +104,7 @@ def answering(answer: bytes | None) -> Iterator[str]:
     ],
     ids=["silence", "end", "another alert", "alert about our certificate", "not TLS"],
 )
-def test_only_an_answer_about_certificates_refuses_a_link(
-    keys: Folders, answer: bytes | None, waits_for: str, refused: str
-) -> None:
+def test_only_an_answer_about_certificates_refuses_a_link(keys, answer, waits_for, refused):
     with answering(answer) as endpoint:
         found = examine(endpoint, credentials_of(keys.own, "robot-r1", TEAM), 0.3)
     assert waits_for in found.waits_for
@@ -115,7 +113,7 @@ def test_only_an_answer_about_certificates_refuses_a_link(
     assert bool(found.refused) == bool(refused)
 
 
-def test_a_pair_of_which_one_half_is_copied_yet_is_waited_for(keys: Folders) -> None:
+def test_a_pair_of_which_one_half_is_copied_yet_is_waited_for(keys):
     """A certificate is renewed while its process runs."""
     own = credentials_of(keys.own, "robot-r1", TEAM)
     half = credentials_of(keys.strange, "robot-r1", TEAM)
@@ -130,11 +128,8 @@ def test_a_pair_of_which_one_half_is_copied_yet_is_waited_for(keys: Folders) -> 
 
 @pytest.mark.parametrize("with_keys", [True, False], ids=["keys", "no keys"])
 def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
-    keys: Folders,
-    with_keys: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    keys, with_keys, monkeypatch, caplog
+):
     """A process of the team is restarted while the router stands still for longer than patience."""
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
     monkeypatch.setattr("teamslam.team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
@@ -163,9 +158,7 @@ def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
         starting.join()
 
 
-def test_a_process_that_waits_for_a_silent_router_ends_when_it_is_told_to(
-    keys: Folders, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_waits_for_a_silent_router_ends_when_it_is_told_to(keys, monkeypatch):
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
     stop = threading.Event()
     stop.set()

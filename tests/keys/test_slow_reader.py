@@ -21,7 +21,7 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from teamslam.team.wire.zenoh.session import client
-from tests.keys.certificates import TEAM, Folders
+from tests.keys.certificates import TEAM
 from tests.support import ROOT, Link, wait_until
 
 READERS = 3
@@ -64,7 +64,6 @@ def running(program: str, *arguments: str) -> Iterator[tuple[subprocess.Popen[st
         [sys.executable, "-c", program, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as process:
         try:
-            assert process.stdout is not None
             yield process, process.stdout.readline().strip()
         finally:
             process.kill()
@@ -75,7 +74,7 @@ def note_arrival(times: list[float], _: zenoh.Sample) -> None:
 
 
 @pytest.mark.parametrize("with_keys", [True, False], ids=["keys", "no keys"])
-def test_stopped_readers_do_not_stop_the_others(keys: Folders, with_keys: bool) -> None:
+def test_stopped_readers_do_not_stop_the_others(keys, with_keys):
     folder = str(keys.own) if with_keys else ""
 
     def own(node: str) -> Credentials | None:
@@ -118,7 +117,7 @@ def test_stopped_readers_do_not_stop_the_others(keys: Folders, with_keys: bool) 
         assert max(later - sooner for sooner, later in pairwise(times)) < MOST_S
 
 
-def test_a_reader_that_reads_again_fetches_what_was_dropped() -> None:
+def test_a_reader_that_reads_again_fetches_what_was_dropped():
     count = 300  # more than the queue and the sockets' buffers hold
     with (
         router() as endpoint,

@@ -40,9 +40,7 @@ def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
     [([ORDER], ("r2",)), ([GIVEN_UP], ()), ([ORDER, GIVEN_UP], ("r2",))],
     ids=["withdrawn", "given up and back", "both"],
 )
-def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(
-    extra: list[Member], withdrawn: tuple[str, ...]
-) -> None:
+def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(extra, withdrawn):
     """The robot is the last by name: its `Done` stood before the order, and behind that it was
     given up.
     """
@@ -64,7 +62,7 @@ def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(
     assert len(found) == 1
 
 
-def test_a_fold_is_given_submaps_in_the_order_of_time() -> None:
+def test_a_fold_is_given_submaps_in_the_order_of_time():
     """By robots, one after the other, it took back what it had and cost three times as much."""
     node = PeerNode("robot/r1", ROBOTS)
     for robot in reversed(ROBOTS):

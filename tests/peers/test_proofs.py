@@ -26,14 +26,14 @@ ROBOTS = ("r1", "r2", "r3")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     made: Path = tmp_path_factory.mktemp("keys")
     make_keys(made, "t", nodes_of(ROBOTS))
     return made
 
 
 @pytest.fixture(scope="module")
-def nodes(folder: Path) -> dict[str, PeerNode]:
+def nodes(folder):
     """Peers with keys; r2 has received members of r1."""
     found = {}
     for robot in ROBOTS:
@@ -58,9 +58,7 @@ def carried_to(node: PeerNode, carrier: PeerNode) -> list[Member]:
     ]
 
 
-def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(
-    nodes: dict[str, PeerNode],
-) -> None:
+def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(nodes):
     said = [start("r1"), *parcel("r1", 0), *parcel("r1", 1)]
     certificate = member(ch.CERTIFICATE, proofs_of(nodes["r1"]).certificate())
     for node in (nodes["r1"], nodes["r2"]):
@@ -81,7 +79,7 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(
     assert nodes["r2"].replica.submaps == 3
 
 
-def test_a_signature_of_somebody_else_proves_nothing(nodes: dict[str, PeerNode]) -> None:
+def test_a_signature_of_somebody_else_proves_nothing(nodes):
     forged = parcel("r1", 5)[0]
     signature = proofs_of(nodes["r2"])._signer.sign(forged.hash)
     batch = build.members(
@@ -91,9 +89,7 @@ def test_a_signature_of_somebody_else_proves_nothing(nodes: dict[str, PeerNode])
     assert "not signed by r1" in nodes["r3"].last_refused
 
 
-def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(
-    nodes: dict[str, PeerNode], folder: Path
-) -> None:
+def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(nodes, folder):
     order = build.withdrawal(reason="broken")
     said = member(ch.ORDER, order)
     carrier = Signer(credentials_of(folder, "robot-r2", "t"))
@@ -114,7 +110,7 @@ def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(
     assert said.payload in [each.payload for each in news]
 
 
-def test_a_certificate_of_another_robot_is_nobodys_proof(nodes: dict[str, PeerNode]) -> None:
+def test_a_certificate_of_another_robot_is_nobodys_proof(nodes):
     own = proofs_of(nodes["r2"]).certificate()
     as_r1 = member(
         ch.CERTIFICATE, m.Certificate(stamp_ns=0, robot="r1", certificate=own.certificate)
@@ -160,7 +156,7 @@ class Renewed:
         return len(self.r3.replica.share_of(("r1", 1)).complete)
 
 
-def test_a_certificate_that_is_renewed_while_the_team_runs_splits_nothing(tmp_path: Path) -> None:
+def test_a_certificate_that_is_renewed_while_the_team_runs_splits_nothing(tmp_path):
     team = Renewed(tmp_path)
     team.say(team.own(), start("r1"), *parcel("r1", 0), *parcel("r1", 1))
     make_keys(tmp_path, "t", [], renew=["robot-r1"])
@@ -172,9 +168,7 @@ def test_a_certificate_that_is_renewed_while_the_team_runs_splits_nothing(tmp_pa
     assert team.submaps_of_r3() == 4, "after r3 had the earlier ones"
 
 
-def test_what_a_revoked_key_has_signed_is_refused_until_its_author_signs_it_anew(
-    tmp_path: Path,
-) -> None:
+def test_what_a_revoked_key_has_signed_is_refused_until_its_author_signs_it_anew(tmp_path):
     """The next generation's certificate is the proof of the revocation: no roster is needed."""
     team = Renewed(tmp_path)
     stolen = team.own()
@@ -190,9 +184,7 @@ def test_what_a_revoked_key_has_signed_is_refused_until_its_author_signs_it_anew
     assert team.submaps_of_r3() == 2
 
 
-def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(
-    tmp_path: Path,
-) -> None:
+def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(tmp_path):
     team = Renewed(tmp_path)
     stolen = team.own()
     make_keys(tmp_path, "t", [], revoke=["robot-r1"])
@@ -203,9 +195,7 @@ def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(
     assert "revoked" in team.r3.last_refused
 
 
-def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_it_is_not(
-    tmp_path: Path,
-) -> None:
+def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_it_is_not(tmp_path):
     """The certificate of r1 ended a day ago; the time of the check does not matter."""
     now = datetime.now(UTC)
     make_keys(tmp_path, "t", nodes_of(ROBOTS), now=now - timedelta(days=3))
@@ -228,9 +218,7 @@ def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_i
     assert "stamped after the certificate of r1" in team.r3.last_refused
 
 
-def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one(
-    tmp_path: Path,
-) -> None:
+def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one(tmp_path):
     team = Renewed(tmp_path / "own")
     make_keys(tmp_path / "strange", "t", nodes_of(ROBOTS))
     strange = Proofs("r1", Signer(credentials_of(tmp_path / "strange", "robot-r1", "t")))
@@ -242,8 +230,8 @@ def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one
 
 
 def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_one_is_seen(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     team = Renewed(tmp_path)
     stolen = Signer(credentials_of(tmp_path, "operator", "t"))
     make_keys(tmp_path, "t", [], revoke=["operator"])
@@ -272,9 +260,7 @@ def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_o
     assert "stamped after the operator's certificate had ended" in with_roster.last_refused
 
 
-def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present_key(
-    tmp_path: Path,
-) -> None:
+def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present_key(tmp_path):
     team = Renewed(tmp_path)
     said = [start("r1"), *parcel("r1", 0)]
     make_keys(tmp_path, "t", [], revoke=["robot-r1"])
@@ -291,9 +277,7 @@ def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present
         assert own._signer.is_signed(own.certificate().certificate, each.hash, found)
 
 
-def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(
-    nodes: dict[str, PeerNode],
-) -> None:
+def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(nodes):
     (of_r1,) = parcel("r1", 7)
     hearing = proofs_of(nodes["r2"])
     hearing.take_signature(proofs_of(nodes["r1"]).signed(of_r1), "r1")

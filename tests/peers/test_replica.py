@@ -1,4 +1,4 @@
-"""The set of one peer: a union with bounds, its summary, and what is asked for given another's."""
+"""Replicas of the set: members, questions, storms, the end."""
 
 import random
 
@@ -7,6 +7,8 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.peers.fold import PeerFold
+from teamslam.central.peers.robot import PeerRobot
+from teamslam.team.config import RobotConfig
 from teamslam.team.door import MOST_COUNT
 from teamslam.team.peers.exchange import MOST_ASKED, make_answer, make_request
 from teamslam.team.peers.given import GIVEN_BYTES
@@ -15,9 +17,10 @@ from teamslam.team.peers.node import PeerNode
 from teamslam.team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
-from tests.peers.teams import done, member, parcel, said, start
+from tests.peers.teams import Storm, done, member, parcel, said, start
 from tests.support import example
 
 ROBOTS = ("r1", "r2")
@@ -39,7 +42,7 @@ def digest_of(replica: Replica) -> bytes:
     return replica.summary("", 0, 0).digest
 
 
-def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> None:
+def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
     """A liar claims every submap of everyone and gives nothing; r2 has four submaps."""
     node, honest = (
         PeerNode("robot/r1", ("r1", "r2", "r3")),
@@ -67,7 +70,7 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there() -> Non
     assert "not in this team" in node.last_refused
 
 
-def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
+def test_questions_without_end_are_given_so_many_bytes_a_second():
     node = PeerNode("robot/r1", ("r1", "r2"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
         node.take(each, "robot/r2")
@@ -81,7 +84,7 @@ def test_questions_without_end_are_given_so_many_bytes_a_second() -> None:
     assert sum(map(len, node.answer(request))) == one
 
 
-def test_questions_in_another_nodes_name_take_nothing_from_that_node() -> None:
+def test_questions_in_another_nodes_name_take_nothing_from_that_node():
     """Nothing proves the name in a request: what r3 asks for as r2 is not counted against r2."""
     node = PeerNode("robot/r1", ("r1", "r2", "r3"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
@@ -94,7 +97,7 @@ def test_questions_in_another_nodes_name_take_nothing_from_that_node() -> None:
     assert node.answer(request)
 
 
-def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_is_valid() -> None:
+def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_is_valid():
     replica = Replica(("r1", "r2"))
     last = build.concluded(serial=2**63 - 1)
     with pytest.raises(RefusedError, match="no peer has more than"):
@@ -109,7 +112,7 @@ def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_
     replica.add(member(ch.CONCLUDED, concluded))
 
 
-def test_the_order_of_arrival_and_duplicates_change_nothing() -> None:
+def test_the_order_of_arrival_and_duplicates_change_nothing():
     members = everything()
     first = replica_of(*members)
     for seed in range(20):
@@ -120,7 +123,7 @@ def test_the_order_of_arrival_and_duplicates_change_nothing() -> None:
         assert list(other.members()) == list(first.members())
 
 
-def test_of_two_members_of_one_name_the_same_stays_whichever_came_first() -> None:
+def test_of_two_members_of_one_name_the_same_stays_whichever_came_first():
     (one,) = parcel("r1", 0)
     assert isinstance(one.message, m.Submap)
     other = member(ch.SUBMAP, msgspec.structs.replace(one.message, gated=7))
@@ -130,7 +133,7 @@ def test_of_two_members_of_one_name_the_same_stays_whichever_came_first() -> Non
     assert all(each.share_of(("r1", 1)).submaps[0] is kept for each in sets)
 
 
-def test_more_inter_robot_measurements_than_a_submap_says_end_with_equal_sets() -> None:
+def test_more_inter_robot_measurements_than_a_submap_says_end_with_equal_sets():
     look, own = parcel("r1", 0, ["r2"])
     assert isinstance(look.message, m.SightingFactor)
     extra = member(ch.SIGHTING_FACTOR, msgspec.structs.replace(look.message, stamp_ns=1))
@@ -138,21 +141,19 @@ def test_more_inter_robot_measurements_than_a_submap_says_end_with_equal_sets() 
     assert len({digest_of(replica_of(start("r1"), *order)) for order in orders}) == 1
 
 
-def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks() -> None:
+def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks():
     parcels = [parcel("r1", k)[0] for k in range(9)]
     here = replica_of(start("r1"), *(parcels[k] for k in (0, 1, 4, 5, 8)))
     (holding,) = here.summary("", 0, 0).holdings
     assert holding.sequences == (0, 1, 4, 5, 8, 8)
     there = replica_of(*parcels[:7])
     asked = make_request(here, there.summary("robot/r2", 0, 0))
-    assert asked is not None
     assert [(w.start, w.first, w.last) for w in asked.requested] == [(False, 2, 3), (False, 6, 6)]
     back = make_request(there, here.summary("robot/r1", 0, 0))
-    assert back is not None
     assert [(w.start, w.first, w.last) for w in back.requested] == [(True, 8, 8)]
 
 
-def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
+def test_two_peers_that_ask_each_other_end_with_one_set():
     occasions = [*said("r1", 5, "r2"), *said("r2", 4, "r1")]
     one, other = (
         replica_of(*(each for occasion in occasions[k::2] for each in occasion)) for k in (0, 1)
@@ -167,7 +168,7 @@ def test_two_peers_that_ask_each_other_end_with_one_set() -> None:
     assert set(one.members()) == set(everything())
 
 
-def test_a_submap_without_its_inter_robot_measurements_is_not_told_as_here() -> None:
+def test_a_submap_without_its_inter_robot_measurements_is_not_told_as_here():
     look, own = parcel("r1", 0, ["r2"])
     replica = replica_of(start("r1"), own)
     assert replica.summary("", 0, 0).holdings[0].sequences == ()
@@ -175,7 +176,7 @@ def test_a_submap_without_its_inter_robot_measurements_is_not_told_as_here() -> 
     assert replica.summary("", 0, 0).holdings[0].sequences == (0, 0)
 
 
-def test_what_is_kept_is_bounded_by_robot() -> None:
+def test_what_is_kept_is_bounded_by_robot():
     with pytest.raises(RefusedError, match="of r9, not in this team"):
         replica_of(start("r9"))
     far = msgspec.structs.replace(parcel("r1", 0)[0].message, sequence=MOST_SEQUENCES)
@@ -188,7 +189,7 @@ def test_what_is_kept_is_bounded_by_robot() -> None:
     assert full.add(start("r2")) == "new"
 
 
-def test_what_is_no_member_is_refused_at_the_door() -> None:
+def test_what_is_no_member_is_refused_at_the_door():
     progress = build.progress(measurements=1)
     with pytest.raises(ValueError, match="no key of a set's members"):
         member_of("robot/r1/progress", encoded(progress))
@@ -199,7 +200,7 @@ def test_what_is_no_member_is_refused_at_the_door() -> None:
         member_of("robot/r2/done", own.payload)
 
 
-def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() -> None:
+def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn():
     first, second = (
         m.LocalLandmark(robot=robot, incarnation=1, sequence=0, local=3) for robot in ROBOTS
     )
@@ -221,3 +222,81 @@ def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn() 
     assert digest_of(one) == digest_of(other)
     assert {each.payload for each in one.members()} == {each.payload for each in told}
     assert make_request(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None
+
+
+ROBOTS_END = ("r1", "r2", "r3")
+ORDERS = {
+    "given up": (ch.GIVEN_UP, build.given_up(node="robot/r3", reason="lost")),
+    "withdrawn": (ch.ORDER, build.withdrawal(robot="r3", reason="broken")),
+}
+
+
+def ended(robot: str) -> Sample:
+    concluded = build.concluded(robot=robot, serial=1)
+    return Sample(ch.CONCLUDED.key(robot), encoded(concluded), 0, 0, 0)
+
+
+@pytest.fixture
+def peer():
+    return PeerRobot(RobotConfig("r2"), CentralConfig(), ROBOTS_END)
+
+
+def test_the_end_of_one_robot_is_not_the_end_of_the_team(peer):
+    assert not peer.is_left_alone
+    peer.take_end([ended("r1")])
+    assert not peer.is_left_alone
+    peer.take_end([ended("r3")])
+    assert peer.is_left_alone
+    assert not peer.peer.replica.concluded, "the set grows by what peers send"
+
+
+def test_an_end_in_another_robots_name_and_garbage_are_nobodys(peer):
+    forged = Sample(ch.CONCLUDED.key("r3"), ended("r1").payload, 0, 0, 0)
+    peer.take_end([ended("r1"), forged, Sample(forged.key, b"garbage", 0, 0, 0)])
+    assert not peer.is_left_alone
+
+
+def test_nobody_is_left_alone_while_another_is_there(peer):
+    peer.take_end([ended("r1"), ended("r3")])
+    peer.handle(build.liveliness(node="robot/r3"), 0)
+    assert not peer.is_left_alone
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_whom_an_operator_has_given_up_or_withdrawn_is_not_waited_for(peer, order):
+    peer.take_end([ended("r1")])
+    peer.keep([member(*ORDERS[order])])
+    assert peer.is_left_alone
+
+
+SCHEDULES = 200
+SHARE = 4
+
+
+@pytest.mark.parametrize("part", range(SHARE))
+def test_after_any_schedule_all_peers_have_the_whole_set(part):
+    for seed in range(part, SCHEDULES, SHARE):
+        storm = Storm(seed)
+        storm.run()
+        found = {storm.digest(name) for name in storm.names}
+        assert len(found) == 1, f"schedule {seed}: {len(found)} sets"
+        for node in storm.nodes.values():
+            whole = [share.count for share in node.replica.streams.values()]
+            assert whole == [4, 4, 4], f"schedule {seed}: a fold is given {whole} submaps"
+        assert not any(node.refused for node in storm.nodes.values()), seed
+
+
+def test_after_a_schedule_all_folds_are_handed_the_same_in_the_same_order():
+    storm = Storm(7)
+    storm.run()
+    first, *others = [list(storm.fed(name)) for name in storm.names]
+    assert len(first) == 3 * (1 + 4 + 1 + 1)
+    assert all(other == first for other in others)
+
+
+def test_without_questions_a_schedule_ends_with_different_sets():
+    """The mutant: what is lost stays lost where nobody asks."""
+    storm = Storm(7)
+    storm.spread = lambda name, out: None
+    storm.run()
+    assert len({storm.digest(name) for name in storm.names}) > 1

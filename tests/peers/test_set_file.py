@@ -30,7 +30,7 @@ def kept_in(path: Path, content: bytes) -> int:
     return len(store.members)
 
 
-def test_what_was_appended_is_there_again_and_goes_on(tmp_path: Path) -> None:
+def test_what_was_appended_is_there_again_and_goes_on(tmp_path):
     path = tmp_path / "r1.set"
     store = SetFile(path)
     store.append(MEMBERS[:3])
@@ -47,7 +47,7 @@ def test_what_was_appended_is_there_again_and_goes_on(tmp_path: Path) -> None:
     assert found.submaps == 4
 
 
-def test_a_torn_or_damaged_end_is_cut_off_and_nothing_before_it(tmp_path: Path) -> None:
+def test_a_torn_or_damaged_end_is_cut_off_and_nothing_before_it(tmp_path):
     records = [record_of(each) for each in MEMBERS]
     whole = MAGIC + b"".join(records)
     before = len(whole) - len(records[-1])
@@ -87,7 +87,7 @@ def check_recovered(path: Path, content: bytes, lost: set[int]) -> SetFile:
     return store
 
 
-def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path: Path) -> None:
+def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path):
     for size in (*range(ENDS[4]), *range(ENDS[-2], len(WHOLE))):
         cut = max(sum(end <= size for end in ENDS) - 1, 0)
         path = tmp_path / "set"
@@ -101,9 +101,7 @@ def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path: Path) -> N
         assert not store.lost
 
 
-def test_behind_flipped_bits_a_set_has_every_intact_record_and_names_the_loss(
-    tmp_path: Path,
-) -> None:
+def test_behind_flipped_bits_a_set_has_every_intact_record_and_names_the_loss(tmp_path):
     rng = random.Random(1)
     for _ in range(120):
         damaged = bytearray(WHOLE)
@@ -115,9 +113,7 @@ def test_behind_flipped_bits_a_set_has_every_intact_record_and_names_the_loss(
         assert store.lost or store.torn
 
 
-def test_behind_zeroed_blocks_a_set_has_every_intact_record_and_names_the_loss(
-    tmp_path: Path,
-) -> None:
+def test_behind_zeroed_blocks_a_set_has_every_intact_record_and_names_the_loss(tmp_path):
     rng = random.Random(2)
     for _ in range(80):
         size = rng.choice([16, 64, 512, 4096])
@@ -132,9 +128,7 @@ def test_behind_zeroed_blocks_a_set_has_every_intact_record_and_names_the_loss(
     assert check_recovered(tmp_path / "zeros", bytes(4096), set(range(99))).lost
 
 
-def test_what_is_known_to_be_lost_is_named_by_its_number(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_is_known_to_be_lost_is_named_by_its_number(tmp_path, caplog):
     submaps = [k for k, each in enumerate(MEMBERS) if isinstance(each.message, m.Submap)]
     damaged = bytearray(WHOLE)
     damaged[ENDS[submaps[1]] + 30] ^= 4
@@ -152,7 +146,7 @@ def test_what_is_known_to_be_lost_is_named_by_its_number(
     assert warning in caplog.text
 
 
-def test_a_record_within_a_damaged_one_is_not_taken(tmp_path: Path) -> None:
+def test_a_record_within_a_damaged_one_is_not_taken(tmp_path):
     """Its author has put it there: only what the process itself has written counts."""
     order = build.given_up(node="robot/r2", by="nobody", reason="")
     forged = member_of(ch.GIVEN_UP.key("robot/r2"), encoded(order))
@@ -166,9 +160,7 @@ def test_a_record_within_a_damaged_one_is_not_taken(tmp_path: Path) -> None:
     assert store.members == [MEMBERS[0]]
 
 
-def test_a_write_that_is_cut_short_is_finished_or_taken_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypatch, caplog):
     """A disk that becomes full takes a part without an error, and refuses the next write."""
     path = tmp_path / "r1.set"
     room = 5000
@@ -202,7 +194,7 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(
     assert again.members == several
 
 
-def test_another_file_is_not_overwritten(tmp_path: Path) -> None:
+def test_another_file_is_not_overwritten(tmp_path):
     other = tmp_path / "notes.txt"
     other.write_text("something of the user's")
     with pytest.raises(SetFileError, match="is not a peer's set: give --set another file"):

@@ -4,9 +4,6 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-
-import pytest
 
 from teamslam.team import shell
 from teamslam.team.recording.check import holes
@@ -57,9 +54,7 @@ def leaving(bus: ZenohBus) -> Iterator[threading.Thread]:
     assert not thread.is_alive()
 
 
-def test_a_centre_stays_until_a_slow_recorder_has_every_trajectory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_centre_stays_until_a_slow_recorder_has_every_trajectory(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.INFO, "teamslam")
     monkeypatch.setattr(shell, "REMIND_S", 0.1)
     path = tmp_path / "log.mcap"
@@ -74,7 +69,7 @@ def test_a_centre_stays_until_a_slow_recorder_has_every_trajectory(
     assert logged(path, c.TRAJECTORY) == len(TRAJECTORIES)
 
 
-def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path: Path) -> None:
+def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path):
     """Messages that the recorder missed come from the cache of the centre, which leaves last."""
     path = tmp_path / "log.mcap"
     with router() as at, ZenohBus("t", at) as centre, ZenohBus("t", at) as there:
@@ -86,9 +81,9 @@ def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path: Path) -> None:
             if sample.key in lost:  # the first time: the cache has it
                 lost.discard(sample.key)
                 return []
-            return arrived(sample, source)  # type: ignore[arg-type]
+            return arrived(sample, source)
 
-        there._recovery.arrived = lossy  # type: ignore[method-assign]
+        there._recovery.arrived = lossy
 
         def turn() -> None:
             loop.take(there.receive(0.02))
@@ -109,7 +104,7 @@ def sample(key: str, counter: int, wall_ns: int) -> Sample:
     return Sample(key, b"", 0, wall_ns, counter)
 
 
-def test_each_life_of_a_process_is_counted_by_itself_and_each_sample_once() -> None:
+def test_each_life_of_a_process_is_counted_by_itself_and_each_sample_once():
     key = c.STATUS.key("central")
     there = Received()
     for counter, wall_ns in ((0, 10), (1, 11), (3, 13), (2, 12), (1, 11), (3, 13)):
@@ -130,7 +125,7 @@ def test_each_life_of_a_process_is_counted_by_itself_and_each_sample_once() -> N
     assert lacks(4, set()) == {}, "its publisher does not have it any more"
 
 
-def test_a_recorder_that_was_started_again_counts_what_is_in_the_earlier_parts() -> None:
+def test_a_recorder_that_was_started_again_counts_what_is_in_the_earlier_parts():
     key = c.TRAJECTORY.key("r1")
     inventory = Inventory(has_earlier_parts=True)
     inventory.remember(sample(key, 0, 10))

@@ -5,7 +5,6 @@ import json
 import struct
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -41,11 +40,11 @@ def stream(count: int) -> list[Sample]:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "log.mcap"
 
 
-def test_every_recorded_message_comes_back_sound(path: Path) -> None:
+def test_every_recorded_message_comes_back_sound(path):
     log = recorded(path, [sample for _, _, sample in recorded_examples()])
     assert [opened(one)[2] for one in log.samples()] == [x for _, x, _ in recorded_examples()]
 
@@ -63,14 +62,12 @@ def test_every_recorded_message_comes_back_sound(path: Path) -> None:
         )
     )
 )
-def test_any_bytes_are_kept_as_they_came(
-    tmp_path_factory: pytest.TempPathFactory, samples: list[Sample]
-) -> None:
+def test_any_bytes_are_kept_as_they_came(tmp_path_factory, samples):
     path = tmp_path_factory.mktemp("any") / "log.mcap"
     assert list(recorded(path, samples).samples()) == samples
 
 
-def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
+def test_a_stamp_before_zero_comes_back_as_it_was(path):
     samples = [
         sampled(
             c.ODOMETRY,
@@ -91,7 +88,7 @@ def test_a_stamp_before_zero_comes_back_as_it_was(path: Path) -> None:
     assert sorted(log.samples(), key=lambda s: s.stamp_ns) == samples
 
 
-def test_counts_are_those_of_the_log(path: Path) -> None:
+def test_counts_are_those_of_the_log(path):
     with Recorder(path, "t", {}) as recorder:
         recorder.write(stream(100))
         recorder.close()
@@ -103,7 +100,7 @@ def test_counts_are_those_of_the_log(path: Path) -> None:
     )
 
 
-def test_metadata_names_team_and_provenance(path: Path) -> None:
+def test_metadata_names_team_and_provenance(path):
     log = recorded(path, [], seed="7", **provenance())
     assert log.team == "t"
     assert log.metadata["seed"] == "7"
@@ -113,7 +110,7 @@ def test_metadata_names_team_and_provenance(path: Path) -> None:
         assert log.metadata[name]
 
 
-def test_another_reader_finds_keys_schemas_and_times(path: Path) -> None:
+def test_another_reader_finds_keys_schemas_and_times(path):
     recorded(path, stream(20))
     with path.open("rb") as file:
         read = list(make_reader(file, validate_crcs=True).iter_messages(log_time_order=False))
@@ -121,7 +118,6 @@ def test_another_reader_finds_keys_schemas_and_times(path: Path) -> None:
         ("team/t/" + one.key, one.payload) for one in stream(20)
     ]
     schema, channel, message = read[0]
-    assert schema is not None
     assert (schema.name, schema.encoding, channel.message_encoding) == (
         "odometry/1", "jsonschema", "msgpack",
     )  # fmt: skip
@@ -131,32 +127,32 @@ def test_another_reader_finds_keys_schemas_and_times(path: Path) -> None:
     assert len(described["prefixItems"]) == 8
 
 
-def test_a_recorder_never_overwrites(path: Path) -> None:
+def test_a_recorder_never_overwrites(path):
     recorded(path, stream(1))
     with pytest.raises(RecorderError, match=r"log\.mcap exists: choose another name"):
         Recorder(path, "t", {})
 
 
-def test_a_log_is_found_by_the_folder_of_its_run(tmp_path: Path) -> None:
+def test_a_log_is_found_by_the_folder_of_its_run(tmp_path):
     recorded(tmp_path / "log.mcap", stream(10))
     assert open_log(tmp_path).path == tmp_path / "log.mcap"
     with pytest.raises(LogError, match=r"log\.mcap: not found; give the path .* folder of its run"):
         open_log(tmp_path.parent)
 
 
-def test_a_recorder_names_a_missing_folder(tmp_path: Path) -> None:
+def test_a_recorder_names_a_missing_folder(tmp_path):
     with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
         Recorder(tmp_path / "nowhere" / "log.mcap", "t", {})
 
 
-def test_a_closed_recorder_takes_nothing(path: Path) -> None:
+def test_a_closed_recorder_takes_nothing(path):
     recorder = Recorder(path, "t", {})
     recorder.close()
     with pytest.raises(RecorderError, match="is closed"):
         recorder.write(stream(1))
 
 
-def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path: Path) -> None:
+def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path):
     program = (
         "import resource; from tests.recording.test_log import stream\n"
         "from teamslam.team.recording.recorder import Recorder, RecorderError\n"
@@ -176,9 +172,7 @@ def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path: Path) -> N
     assert done.stderr.rstrip().endswith("what was flushed before can be repaired")
 
 
-def test_a_disk_that_is_full_at_once_is_told_at_once(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_full_at_once_is_told_at_once(path, monkeypatch):
     monkeypatch.setattr(Path, "open", lambda self, mode: open("/dev/full", "wb"))  # noqa: SIM115 - the recorder closes it
     with pytest.raises(RecorderError, match="No space left on device; choose another place"):
         Recorder(path, "t", {})
@@ -196,14 +190,13 @@ def killed(path: Path, count: int) -> Log:
     with subprocess.Popen(
         [sys.executable, "-c", program], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as child:
-        assert child.stdout is not None
         assert child.stdout.readline() == b"ready\n"
         wait_until(lambda: len(list(open_log(path).samples())) == 2 * count, what="the flush")
         child.kill()
     return open_log(path)
 
 
-def test_a_killed_recorders_log_is_read_and_repaired(path: Path, tmp_path: Path) -> None:
+def test_a_killed_recorders_log_is_read_and_repaired(path, tmp_path):
     log = killed(path, 500)
     assert not log.complete
     assert list(log.samples()) == stream(500)
@@ -229,7 +222,7 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
 
 
 @pytest.fixture(scope="module")
-def noise() -> list[Sample]:
+def noise():
     """Samples that do not compress, so that they fill several chunks of a megabyte."""
     return [
         Sample("view/noise", hashlib.shake_128(b"%d" % i).digest(40_000), i + 1, 0, i)
@@ -237,9 +230,7 @@ def noise() -> list[Sample]:
     ]
 
 
-def test_a_flipped_bit_is_named_and_the_other_chunks_are_saved(
-    path: Path, tmp_path: Path, noise: list[Sample]
-) -> None:
+def test_a_flipped_bit_is_named_and_the_other_chunks_are_saved(path, tmp_path, noise):
     recorded(path, noise)
     first, *rest = chunks_of(path)
     data = bytearray(path.read_bytes())
@@ -256,9 +247,7 @@ def test_a_flipped_bit_is_named_and_the_other_chunks_are_saved(
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.9, 0.999])
-def test_a_truncated_log_reads_up_to_its_last_whole_chunk(
-    path: Path, noise: list[Sample], part: float
-) -> None:
+def test_a_truncated_log_reads_up_to_its_last_whole_chunk(path, noise, part):
     recorded(path, noise)
     data = path.read_bytes()
     whole = sum(offset + length <= part * len(data) for offset, length in chunks_of(path))
@@ -270,14 +259,14 @@ def test_a_truncated_log_reads_up_to_its_last_whole_chunk(
     assert len(list(log.chunks())) == whole
 
 
-def test_zeros_behind_a_killed_log_are_its_end(path: Path, noise: list[Sample]) -> None:
+def test_zeros_behind_a_killed_log_are_its_end(path, noise):
     recorded(path, noise)
     path.write_bytes(path.read_bytes()[: sum(chunks_of(path)[0])] + bytes(4_096))
     assert not open_log(path).complete
     assert list(open_log(path).samples()) == noise[: len(list(open_log(path).samples()))] != []
 
 
-def test_a_damaged_index_does_not_keep_the_samples_away(path: Path) -> None:
+def test_a_damaged_index_does_not_keep_the_samples_away(path):
     recorded(path, stream(60))
     data = path.read_bytes()
     end = sum(chunks_of(path)[-1])
@@ -290,7 +279,7 @@ def test_a_damaged_index_does_not_keep_the_samples_away(path: Path) -> None:
     assert list(open_log(out).samples()) == stream(60)
 
 
-def test_repair_refuses_to_overwrite(path: Path) -> None:
+def test_repair_refuses_to_overwrite(path):
     recorded(path, stream(1))
     with pytest.raises(RecorderError, match="exists"):
         repair_log(path, path)
@@ -328,15 +317,13 @@ def bomb(path: Path, size: int, claimed: int) -> None:
         (lambda path: bomb(path, 2**26, 1_000), "two different sizes are claimed"),
     ],
 )
-def test_what_is_no_sound_log_is_refused_with_a_remedy(
-    path: Path, make: Callable[[Path], object], told: str
-) -> None:
+def test_what_is_no_sound_log_is_refused_with_a_remedy(path, make, told):
     make(path)
     with pytest.raises(LogError, match=f"{path}: .*{told}"):
         list(open_log(path).samples())
 
 
-def test_a_record_longer_than_any_of_ours_is_refused_unread(path: Path) -> None:
+def test_a_record_longer_than_any_of_ours_is_refused_unread(path):
     recorded(path, stream(1))
     data = path.read_bytes()
     head = data[: chunks_of(path)[0][0]]

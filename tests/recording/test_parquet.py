@@ -2,7 +2,6 @@
 
 import json
 import sys
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -23,7 +22,7 @@ from tests.support import odometry
 pq = pytest.importorskip("pyarrow.parquet", reason="pip install '.[parquet]'")
 
 
-def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
+def test_every_field_of_every_message_reads_back(tmp_path):
     kept = recorded_examples()
     samples = [sample for _, _, sample in kept]
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
@@ -48,7 +47,7 @@ def test_every_field_of_every_message_reads_back(tmp_path: Path) -> None:
                 assert type(back) is type(value)
 
 
-def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_table_is_written_in_groups(tmp_path, monkeypatch):
     monkeypatch.setattr(parquet_tables, "GROUP_ROWS", 10)
     samples = [sampled(c.ODOMETRY, "alpha", odometry(k), k) for k in range(35)]
     log = recorded(tmp_path / "log.mcap", samples)
@@ -63,9 +62,7 @@ def test_a_long_table_is_written_in_groups(tmp_path: Path, monkeypatch: pytest.M
     assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35
 
 
-def test_without_pyarrow_the_command_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyarrow_the_command_says_what_to_install(tmp_path, monkeypatch):
     log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     command = ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "parquet"]
     monkeypatch.setattr(cli_log, "find_spec", lambda name: None)
@@ -78,7 +75,7 @@ def test_without_pyarrow_the_command_says_what_to_install(
     assert "odometry.parquet: 1 row\n" in done.output
 
 
-def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path: Path) -> None:
+def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path):
     log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     refused = CliRunner().invoke(
         app, ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "tum"]

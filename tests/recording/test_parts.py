@@ -1,24 +1,29 @@
-"""A recorder that is started again, or had no room: the parts of its log are one in the end."""
+"""Parts of a log, a robot's own log, and flipped bits."""
 
 import os
+import random
 import resource
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
+from mcap.opcode import Opcode
 from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import dumps, load
 from teamslam.team.recording.check import check_log, holes
 from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.merge import merge
+from teamslam.team.recording.own_log import own_log
 from teamslam.team.recording.part_files import part_of, parts_of
 from teamslam.team.recording.parts import check_continues, join, next_part
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.recording.records import read_frames
+from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.recording.shell import RecordLoop, record
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
@@ -28,11 +33,11 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
 from tests.recording.test_shell import FINAL, POSE, Team, logged
-from tests.support import odometry, received, wait_until
+from tests.support import odometry, received, submap, wait_until
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "log.mcap"
 
 
@@ -44,7 +49,7 @@ def killed_part(path: Path, samples: list[Sample]) -> None:
     wait_until(lambda: len(list(open_log(path).samples())) == len(samples))
 
 
-def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path: Path) -> None:
+def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path):
     with router() as at, ZenohBus("t", at) as source:
         team = Team(source)
         source.declare_alive("robot/alpha")
@@ -90,7 +95,7 @@ def samples_of(count: int) -> list[Sample]:
     ]
 
 
-def test_what_an_earlier_part_has_is_not_written_again(path: Path) -> None:
+def test_what_an_earlier_part_has_is_not_written_again(path):
     killed_part(path, samples_of(5))
     recorder, inventory = next_part(path, "t", {"scenario": "s"})
     network = MemoryNetwork()
@@ -107,9 +112,7 @@ def test_what_an_earlier_part_has_is_not_written_again(path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["another scenario", "finished", "no log", "old"])
-def test_a_log_that_is_not_of_this_run_is_not_continued(
-    wrong: str, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_is_not_of_this_run_is_not_continued(wrong, path, monkeypatch):
     if wrong == "no log":
         path.write_bytes(b"my thesis")
     elif wrong == "finished":
@@ -145,7 +148,7 @@ def numbers(path: Path) -> list[int]:
     return [decoded(s.payload, m.Odometry).number for s in open_log(path).samples([c.ODOMETRY])]
 
 
-def test_the_parts_of_a_log_are_read_as_one(path: Path) -> None:
+def test_the_parts_of_a_log_are_read_as_one(path):
     in_two_parts(path)
     assert numbers(path) == list(range(10))
     log = open_log(path)
@@ -164,7 +167,7 @@ def test_a_robots_final_map_ends_the_log_of_a_team_without_a_centre_only(path: P
 
 
 @pytest.mark.parametrize("written", [0, 8, 500, 10**9])
-def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path: Path, written: int) -> None:
+def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path, written):
     in_two_parts(path)
     whole = path.with_name(f"{path.name}.joining")
     whole.write_bytes(part_of(path, 2).read_bytes()[:written])
@@ -179,8 +182,8 @@ def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path: Path, wr
 
 @pytest.mark.parametrize("removed", [0, 1])
 def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice(
-    path: Path, removed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    path, removed, monkeypatch
+):
     killed, _ = next_part(path, "t", {"scenario": "s"})
     killed.write(samples_of(10)[:3])
     wait_until(lambda: logged(path, c.ODOMETRY) == 3)
@@ -210,7 +213,7 @@ def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_log_that_was_joined_and_goes_on_gives_no_number_to_two_parts(path: Path) -> None:
+def test_a_log_that_was_joined_and_goes_on_gives_no_number_to_two_parts(path):
     in_two_parts(path)
     join(path)
     final_part(path, 3, samples_of(12)[10:])
@@ -219,7 +222,7 @@ def test_a_log_that_was_joined_and_goes_on_gives_no_number_to_two_parts(path: Pa
     assert numbers(path) == list(range(12))
 
 
-def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path: Path) -> None:
+def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path):
     in_two_parts(path)
     path.unlink()  # and its second part stays
     killed, _ = next_part(path, "t", {"scenario": "s"})
@@ -233,9 +236,7 @@ def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path: Path
 
 
 @pytest.mark.parametrize("step_s", [0.0, 7200.0])
-def test_a_clock_that_was_set_makes_no_log_another_run_s(
-    path: Path, step_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_that_was_set_makes_no_log_another_run_s(path, step_s, monkeypatch):
     before = time.time
     with monkeypatch.context() as wrong:  # two hours behind, until the network told the time
         wrong.setattr(time, "time", lambda: before() - step_s)
@@ -252,7 +253,7 @@ def test_a_clock_that_was_set_makes_no_log_another_run_s(
         assert check_continues(path, "t", {"scenario": "s"}, same_run=True)
 
 
-def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(path: Path) -> None:
+def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(path):
     scenario = "thesis"
     text = dumps(load(scenario))
     team = load(scenario).team
@@ -274,7 +275,7 @@ def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(pa
 
 
 @pytest.fixture
-def limit() -> Iterator[Callable[[int], None]]:
+def limit():
     """Sets the largest size of a file that this process may write: a full disk without a disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size < 0 else size, hard))
@@ -282,9 +283,8 @@ def limit() -> Iterator[Callable[[int], None]]:
 
 
 def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
-    path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+    path, limit, monkeypatch, caplog
+):
     monkeypatch.setattr("teamslam.team.recording.shell._RETRY_S", 0.0)
     network = MemoryNetwork()
     bus, world = MemoryBus(network), MemoryBus(network)
@@ -338,7 +338,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
     assert holes(log) == []
 
 
-def test_a_disk_that_stays_full_is_an_error_at_the_end(path: Path) -> None:
+def test_a_disk_that_stays_full_is_an_error_at_the_end(path):
     network = MemoryNetwork()
     stop = threading.Event()
     recorder = Recorder(path, "t", {})
@@ -349,3 +349,108 @@ def test_a_disk_that_stays_full_is_an_error_at_the_end(path: Path) -> None:
 
     with pytest.raises(RecorderError, match="No space left"):
         record(MemoryBus(network), recorder, (), None, more, lambda _: stop.set(), stop=stop)
+
+
+def test_what_a_bus_sends_and_receives_is_in_its_own_log_and_merged_there_once(tmp_path):
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    with (
+        router() as at, own_log(paths[0], "t") as a, own_log(paths[1], "t") as b,
+        ZenohBus("t", at) as robot, ZenohBus("t", at) as centre,
+    ):  # fmt: skip
+        robot.tap, centre.tap = a, b
+        centre.subscribe(c.SUBMAP)
+        for i in range(5):
+            robot.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
+            robot.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
+        received(centre, 5)
+    submaps, measurements = c.SUBMAP.key("alpha"), c.ODOMETRY.key("alpha")
+    found = [{k: n for k, (n, _) in open_log(path).counts().items()} for path in paths]
+    assert found == [{submaps: 5, measurements: 5}, {submaps: 5}]
+    merged = merge([open_log(path) for path in paths], tmp_path / "whole.mcap")
+    assert merged == (10, 5)
+
+
+def test_what_a_robot_has_asked_for_is_in_its_own_log_and_what_a_death_cost_it_is_known(tmp_path):
+    """Killed and started again, a robot had the measurements of its source, and its log had not."""
+    path = tmp_path / "a.mcap"
+    with router() as at, own_log(path, "t") as log, ZenohBus("t", at) as source:
+        source.answer(c.MEASUREMENTS, "alpha", lambda _: [encoded(odometry(i)) for i in (1, 2, 5)])
+        answering = threading.Event()
+        thread = threading.Thread(target=lambda: answers(source, answering))
+        thread.start()
+        with ZenohBus("t", at) as robot:
+            robot.tap = log
+            wanted = build.measurements_request(robot="alpha", first=1, last=5)
+            for _ in range(2):
+                assert len(robot.ask(c.MEASUREMENTS, "alpha", wanted, 10.0)) == 3
+        answering.set()
+        thread.join()
+        assert [(first, last) for _, first, last in log.lost("alpha")] == [(0, 0), (3, 4)]
+        assert log.lost("bravo") == []
+    assert {k: n for k, (n, _) in open_log(path).counts().items()} == {c.ODOMETRY.key("alpha"): 3}
+
+
+def answers(bus: ZenohBus, until: threading.Event) -> None:
+    """A node that does nothing but answer."""
+    while not until.is_set():
+        bus.receive(0.05)
+
+
+SECOND = 10**9
+RATE = 40
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The bytes of a log of 20 s, written much faster, and its samples."""
+    path = tmp_path_factory.mktemp("flips") / "log.mcap"
+    samples = [
+        Sample(c.ODOMETRY.key("alpha"), encoded(odometry(i)), i, 10**18 + i * SECOND // RATE, i)
+        for i in range(20 * RATE)
+    ]
+    late = [
+        Sample(c.SUBMAP.key("alpha"), encoded(submap(i)), i, 10**18 + i * SECOND // 2, i)
+        for i in range(20)
+    ]
+    with Recorder(path, "t", {"scenario": "s"}) as recorder:
+        recorder.write([*samples, *late])
+    return path.read_bytes(), [*samples, *late]
+
+
+def saved(path: Path) -> list[Sample]:
+    found: list[Sample] = []
+    for chunk in read_undamaged(open_log(path)):
+        if not isinstance(chunk, LogError):
+            found += chunk
+    return found
+
+
+def heads(path: Path) -> list[int]:
+    """Where the opcodes and the lengths of chunks and of their indices are."""
+    with path.open("rb") as file:
+        kinds = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
+        offsets = [frame.offset for frame in read_frames(file, path) if frame.opcode in kinds]
+    return [offset + k for offset in offsets for k in range(9)]
+
+
+@pytest.mark.parametrize("where", ["anywhere", "in the heads of records"])
+def test_a_flipped_bit_costs_a_second_of_recorded_time_at_the_most(where, recorded, tmp_path):
+    data, samples = recorded
+    path = tmp_path / "flipped.mcap"
+    path.write_bytes(data)
+    with path.open("rb") as file:
+        first = next(f.offset for f in read_frames(file, path) if f.opcode == Opcode.CHUNK)
+    places = list(range(first, len(data))) if where == "anywhere" else heads(path)
+    rng = random.Random(3)
+    losses = 0
+    for place in rng.sample(places, 60):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << rng.randrange(8)
+        path.write_bytes(flipped)
+        there = set(saved(path))
+        lost = [s for s in samples if s not in there]
+        losses += bool(lost)
+        regular = [s.wall_ns for s in lost if "odometry" in s.key]
+        assert max(regular, default=0) - min(regular, default=0) <= SECOND, f"bit at {place}"
+        assert len(lost) <= RATE, f"bit at {place}"
+    assert losses, "a flip that costs nothing at all shows nothing"

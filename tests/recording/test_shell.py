@@ -1,18 +1,22 @@
-"""The recorder and the replayer as processes see them: on a bus, until the team has finished."""
+"""The recorder's and the replayer's processes."""
 
+import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import count as count_from
 from pathlib import Path
 
 import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from teamslam.team.recording import recorder as recorder_module
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
+from teamslam.team.recording.replayer import schedule
 from teamslam.team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
@@ -27,12 +31,12 @@ FINAL = example(m.FusedMap)
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "log.mcap"
 
 
 @pytest.fixture
-def endpoint() -> Iterator[str]:
+def endpoint():
     with router() as bound:
         yield bound
 
@@ -42,7 +46,7 @@ def messages_of(samples: list[Sample], channel: c.Channel) -> list[m.Message]:
     return [message for of, _, message in found if of is channel]
 
 
-def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path: Path) -> None:
+def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path):
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     world.subscribe(c.RECORDER_PROGRESS)
@@ -66,9 +70,7 @@ GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 
 @pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
-def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(
-    path: Path, peers: tuple[str, ...]
-) -> None:
+def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(path, peers):
     """Without a centre all peers' conclusions do, but for who is given up; with one its map."""
     network = MemoryNetwork()
     team, bus = MemoryBus(network), MemoryBus(network)
@@ -87,9 +89,7 @@ def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(
         assert ends_by(Outgoing(c.FINAL_MAP, "", FINAL))
 
 
-def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(path, monkeypatch):
     """MCAP numbers a log's keys by 16 bits: more of them ended the recorder."""
     monkeypatch.setattr(recorder_module, "MOST_CHANNELS", 10)
     network = MemoryNetwork()
@@ -112,7 +112,7 @@ def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(
     assert holes(open_log(path)) == []
 
 
-def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
+def test_a_new_incarnation_counts_from_zero(path):
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     world.subscribe(c.RECORDER_PROGRESS)
@@ -137,7 +137,7 @@ def test_a_new_incarnation_counts_from_zero(path: Path) -> None:
     ]
 
 
-def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path: Path) -> None:
+def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path):
     network = MemoryNetwork()
     robot, bus = MemoryBus(network), MemoryBus(network)
     robot.subscribe(c.RECORDER_PROGRESS)
@@ -151,7 +151,7 @@ def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path: 
             assert (told.measurements, told.submaps) == (0, sequence + 1)
 
 
-def test_unsound_payloads_are_recorded_as_they_came(path: Path) -> None:
+def test_unsound_payloads_are_recorded_as_they_came(path):
     network = MemoryNetwork()
     world, bus = MemoryBus(network), MemoryBus(network)
     unsound = [
@@ -166,7 +166,7 @@ def test_unsound_payloads_are_recorded_as_they_came(path: Path) -> None:
     assert list(open_log(path).samples()) == unsound
 
 
-def test_absent_nodes_are_a_warning_until_they_appear(path: Path) -> None:
+def test_absent_nodes_are_a_warning_until_they_appear(path):
     network = MemoryNetwork()
     bus = MemoryBus(network)
     with Recorder(path, "t", {}) as recorder:
@@ -186,7 +186,7 @@ def team_of(source: Bus) -> list[Outgoing]:
     return out
 
 
-def test_a_recording_ends_with_the_final_map_and_the_last_token(path: Path, endpoint: str) -> None:
+def test_a_recording_ends_with_the_final_map_and_the_last_token(path, endpoint):
     statuses: list[m.Status] = []
     with ZenohBus("t", endpoint) as team, ZenohBus("t", endpoint) as bus:
         team.watch_alive("recorder")
@@ -266,9 +266,7 @@ def logged(path: Path, channel: c.Channel) -> int:
 
 
 @pytest.mark.parametrize("away", ["the router", "the recorder's link"])
-def test_what_is_said_while_the_recorder_is_cut_off_is_in_the_log(
-    path: Path, endpoint: str, away: str
-) -> None:
+def test_what_is_said_while_the_recorder_is_cut_off_is_in_the_log(path, endpoint, away):
     """Measurements are asked of their source, the rest of its publisher's cache: it is whole."""
     with (
         Link(endpoint) as link,
@@ -298,7 +296,7 @@ def test_what_is_said_while_the_recorder_is_cut_off_is_in_the_log(
     assert len(messages_of(samples, c.TALLY)) == 1
 
 
-def test_what_nobody_has_any_more_is_named(path: Path) -> None:
+def test_what_nobody_has_any_more_is_named(path):
     network = MemoryNetwork()
     bus, world = MemoryBus(network), MemoryBus(network)
     stop = threading.Event()
@@ -323,7 +321,7 @@ def test_what_nobody_has_any_more_is_named(path: Path) -> None:
     assert last.warnings == (f"missing: {lost}",)
 
 
-def test_what_a_restarted_world_publishes_again_is_written_once(path: Path) -> None:
+def test_what_a_restarted_world_publishes_again_is_written_once(path):
     network = MemoryNetwork()
     bus, world = MemoryBus(network), MemoryBus(network)
     with Recorder(path, "t", {}) as recorder:
@@ -349,7 +347,7 @@ def flows(source: ZenohBus, path: Path) -> None:
 PROBE = build.sightings(robot="probe", incarnation=0)
 
 
-def test_a_recording_ends_when_asked(path: Path) -> None:
+def test_a_recording_ends_when_asked(path):
     stop = threading.Event()
     network = MemoryNetwork()
     bus, world = MemoryBus(network), MemoryBus(network)
@@ -364,7 +362,7 @@ def test_a_recording_ends_when_asked(path: Path) -> None:
     assert messages_of(list(log.samples()), c.ODOMETRY) == [odometry(1)]
 
 
-def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them() -> None:
+def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them():
     stop = threading.Event()
     published: list[float] = []
 
@@ -378,3 +376,37 @@ def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them() -> None:
     began = time.monotonic()
     assert replay(Watched(MemoryNetwork()), samples, 2.0, stop) == 3
     assert published[2] - began >= 0.1
+
+
+def at(*stamps: int) -> list[Sample]:
+    return [Sample("k", b"", stamp, 0, i) for i, stamp in enumerate(stamps)]
+
+
+def test_spacing_is_team_time_over_speed():
+    delays = [delay for delay, _ in schedule(at(5 * 10**9, 6 * 10**9, 8 * 10**9), speed=2.0)]
+    assert delays == [0.0, 0.5, 1.0]
+
+
+def test_a_sample_older_than_what_went_before_goes_at_once_and_costs_nothing():
+    delays = [delay for delay, _ in schedule(at(0, 2 * 10**9, 10**9, 3 * 10**9), speed=1.0)]
+    assert delays == [0.0, 2.0, 0.0, 1.0]
+
+
+def test_an_infinite_speed_never_waits():
+    assert {delay for delay, _ in schedule(at(0, 10**12, 10**15), math.inf)} == {0.0}
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
+def test_a_speed_that_is_none_is_refused(speed):
+    with pytest.raises(ValueError, match=r"speed .* is not positive"):
+        list(schedule(at(0), speed))
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(-(2**62), 2**62)), st.floats(1e-3, 1e6))
+def test_order_is_kept_and_delays_add_up_to_the_time_that_passed(stamps, speed):
+    planned = list(schedule(at(*stamps), speed))
+    assert [sample for _, sample in planned] == at(*stamps)
+    assert all(delay >= 0.0 for delay, _ in planned)
+    passed = 1e-9 * (max(stamps) - stamps[0]) / speed if stamps else 0.0
+    assert math.isclose(sum(delay for delay, _ in planned), passed, rel_tol=1e-9)

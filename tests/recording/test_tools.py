@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import json
-import random
 import struct
 from pathlib import Path
 
@@ -57,12 +56,12 @@ def found(log: Log) -> list[str]:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / "log.mcap"
 
 
 @pytest.fixture
-def whole(path: Path) -> Log:
+def whole(path):
     samples = sorted([*drive("alpha", 6), *drive("bravo", 6)], key=lambda s: s.stamp_ns)
     return recorded(path, samples, seed="7")
 
@@ -158,17 +157,17 @@ FOUND: dict[str, tuple[list[Sample], list[str]]] = {
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_the_check_names_every_loss_and_nothing_else(path: Path, case: str) -> None:
+def test_the_check_names_every_loss_and_nothing_else(path, case):
     samples, expected = FOUND[case]
     assert found(recorded(path, samples)) == expected
 
 
 @pytest.mark.parametrize("samples", [TWO[6:], [*ONE, DONE]], ids=["beginning", "end"])
-def test_a_cut_log_lacks_nothing_outside_of_its_cut(path: Path, samples: list[Sample]) -> None:
+def test_a_cut_log_lacks_nothing_outside_of_its_cut(path, samples):
     assert found(recorded(path, samples, cut="said")) == []
 
 
-def test_a_process_without_a_last_word_is_named(path: Path) -> None:
+def test_a_process_without_a_last_word_is_named(path):
     """A killed robot's second life reports its totals; those of the first are unknown."""
 
     def status(counter: int, wall_s: int) -> Sample:
@@ -194,9 +193,7 @@ def test_a_process_without_a_last_word_is_named(path: Path) -> None:
 
 @settings(deadline=None, max_examples=150)
 @given(st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4), st.randoms())
-def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(
-    lives: list[set[int]], rng: random.Random
-) -> None:
+def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(lives, rng):
     """One life of a publisher after the other, each with its message 0 first."""
     samples = [
         Sample("source/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
@@ -241,9 +238,7 @@ def missing_in(path: Path, samples: list[Sample]) -> list[str]:
 
 @pytest.mark.parametrize("after", [1, 30, 99])
 @pytest.mark.parametrize("seconds", [1, 10, 3_600, -3_600])
-def test_a_clock_that_is_set_in_a_run_makes_nothing_missing(
-    path: Path, after: int, seconds: int
-) -> None:
+def test_a_clock_that_is_set_in_a_run_makes_nothing_missing(path, after, seconds):
     """Ten seconds back made 495 messages missing of 100 that were all there."""
     run = set_back(spoken("robot/alpha", 100, 10**6), after, seconds)
     assert missing_in(path, run) == []
@@ -257,7 +252,7 @@ def test_a_clock_that_is_set_in_a_run_makes_nothing_missing(
     ]
 
 
-def test_a_clock_that_is_set_between_two_lives_hides_no_loss_in_either(path: Path) -> None:
+def test_a_clock_that_is_set_between_two_lives_hides_no_loss_in_either(path):
     first = set_back(spoken("robot/alpha", 60, 10**6), 20, 15)
     second = spoken("robot/alpha", 50, 10**6 + 30)
     assert missing_in(path, [*first, *second]) == []
@@ -276,9 +271,7 @@ def test_a_clock_that_is_set_between_two_lives_hides_no_loss_in_either(path: Pat
     st.integers(0, 60),
     st.integers(-100, 100),
 )
-def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(
-    lives: list[set[int]], after: int, seconds: int
-) -> None:
+def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(lives, after, seconds):
     """A message a second, in the order of arrival; each life is known by its message 0."""
     samples = [
         Sample("robot/alpha/status", b"", 0, (40 * life + counter) * 10**9, counter)
@@ -293,7 +286,7 @@ def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(
     assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
 
 
-def test_a_publication_that_came_as_a_reply_is_not_missing() -> None:
+def test_a_publication_that_came_as_a_reply_is_not_missing():
     """Without its counter it is one of those published; which one does not matter."""
     counters = Counters()
     counters.take(Sample("central/final", b"", 0, 5, NO_COUNTER))
@@ -301,7 +294,7 @@ def test_a_publication_that_came_as_a_reply_is_not_missing() -> None:
     assert counters.findings(part=False, totals=(2,)) == ["2 messages missing: 0–1"]
 
 
-def test_unsound_messages_are_counted_and_the_first_is_explained(path: Path) -> None:
+def test_unsound_messages_are_counted_and_the_first_is_explained(path):
     samples = drive("alpha", 1)
     samples[3] = msgspec.structs.replace(samples[3], payload=samples[3].payload[:-1])
     samples[4] = msgspec.structs.replace(samples[4], payload=encoded(odometry(4, "bravo")))
@@ -319,7 +312,7 @@ def flip(path: Path, offset: int) -> None:
     path.write_bytes(data)
 
 
-def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole: Log) -> None:
+def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole):
     ((offset, length),) = chunks_of(whole.path)
     flip(whole.path, offset + length - 5)
     assert found(whole)[0].startswith(f"file: damaged chunk at offset {offset}")
@@ -330,14 +323,14 @@ def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole: Log) -> None:
     assert "file: the CRC of its index does not match" in found(whole)
 
 
-def test_a_log_without_its_end_is_told(whole: Log) -> None:
+def test_a_log_without_its_end_is_told(whole):
     whole.path.write_bytes(whole.path.read_bytes()[:-40])
     (said,) = found(open_log(whole.path))
     assert said == "file: its recorder did not finish it; `teamslam repair` completes it"
 
 
 @pytest.fixture(scope="module")
-def once_recorded(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def once_recorded(tmp_path_factory):
     """The bytes of one log: of another its recorder may end a chunk elsewhere, by the clock."""
     path = tmp_path_factory.mktemp("once") / "log.mcap"
     return recorded(path, drive("alpha", 2)).path.read_bytes()
@@ -345,9 +338,7 @@ def once_recorded(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @settings(deadline=None, max_examples=120)
 @given(st.data())
-def test_a_damaged_log_is_told_of_and_never_a_crash(
-    tmp_path_factory: pytest.TempPathFactory, once_recorded: bytes, data: st.DataObject
-) -> None:
+def test_a_damaged_log_is_told_of_and_never_a_crash(tmp_path_factory, once_recorded, data):
     path = tmp_path_factory.getbasetemp() / "checked.mcap"
     damaged = bytearray(once_recorded)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -389,9 +380,7 @@ OTHER = schema_of(m.Submap).replace(b'"integer"', b'"number"')
         ("view/scene", "protobuf", "foxglove.SceneUpdate", b"", None),
     ],
 )
-def test_a_schema_is_held_against_its_channel(
-    path: Path, key: str, encoding: str, schema: str, text: bytes, told: str | None
-) -> None:
+def test_a_schema_is_held_against_its_channel(path, key, encoding, schema, text, told):
     found = find_misdeclaration(read_declarations(foreign(path, key, encoding, schema, text))[key])
     assert found is None if told is None else found is not None and found.startswith(told)
 
@@ -399,7 +388,7 @@ def test_a_schema_is_held_against_its_channel(
 # Summary.
 
 
-def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole: Log) -> None:
+def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole):
     summary = summarise_log(whole)
     of = {each.key: each for each in summary.keys}
     assert {key: each.messages for key, each in of.items()} == {
@@ -416,9 +405,7 @@ def test_a_summary_counts_and_its_span_is_that_of_the_measurements(whole: Log) -
 
 @settings(deadline=None, max_examples=15)
 @given(st.integers(-SECOND, 7 * SECOND))
-def test_two_parts_of_a_log_merge_to_the_log_in_time_order(
-    tmp_path_factory: pytest.TempPathFactory, at_ns: int
-) -> None:
+def test_two_parts_of_a_log_merge_to_the_log_in_time_order(tmp_path_factory, at_ns):
     folder = tmp_path_factory.mktemp("parts")
     log = recorded(folder / "log.mcap", [*drive("bravo", 6), *drive("alpha", 6)])
     parts = []
@@ -436,9 +423,7 @@ def test_two_parts_of_a_log_merge_to_the_log_in_time_order(
     assert [line for part in [*parts, again] for line in found(part)] == []
 
 
-def test_a_cut_has_its_stretch_its_channels_and_what_holds_in_it(
-    whole: Log, tmp_path: Path
-) -> None:
+def test_a_cut_has_its_stretch_its_channels_and_what_holds_in_it(whole, tmp_path):
     count = cut(whole, tmp_path / "a.mcap", 2.0, 4.0, [c.ODOMETRY, c.ROBOT_CONFIG])
     part = list(open_log(tmp_path / "a.mcap").samples())
     assert count == len(part) == 2 + 2 * 20
@@ -450,9 +435,7 @@ def test_a_cut_has_its_stretch_its_channels_and_what_holds_in_it(
 
 
 @pytest.mark.parametrize("bounds", [(6.0, None), (None, 0.0), (2.01, 2.02)])
-def test_a_cut_with_nothing_in_it_is_refused(
-    tmp_path: Path, bounds: tuple[float | None, float | None]
-) -> None:
+def test_a_cut_with_nothing_in_it_is_refused(tmp_path, bounds):
     log = recorded(tmp_path / "log.mcap", [s for s in drive("alpha", 6) if "config" not in s.key])
     with pytest.raises(
         LogError, match=r"nothing of it is in this cut; its measurements are .* 5\.900"
@@ -461,7 +444,7 @@ def test_a_cut_with_nothing_in_it_is_refused(
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_damage_is_told_before_a_new_log_is_made(whole: Log, tmp_path: Path) -> None:
+def test_damage_is_told_before_a_new_log_is_made(whole, tmp_path):
     ((offset, length),) = chunks_of(whole.path)
     flip(whole.path, offset + length - 5)
     with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
@@ -471,14 +454,14 @@ def test_damage_is_told_before_a_new_log_is_made(whole: Log, tmp_path: Path) -> 
     assert not (tmp_path / "a.mcap").exists()
 
 
-def test_neither_overwrites(whole: Log) -> None:
+def test_neither_overwrites(whole):
     with pytest.raises(RecorderError, match="exists"):
         cut(whole, whole.path)
     with pytest.raises(RecorderError, match="exists"):
         merge([whole], whole.path)
 
 
-def test_robots_own_logs_merge_once_and_stably(tmp_path: Path) -> None:
+def test_robots_own_logs_merge_once_and_stably(tmp_path):
     a = recorded(tmp_path / "a.mcap", drive("alpha", 3), seed="7", host="x")
     b = recorded(tmp_path / "b.mcap", [*drive("alpha", 1), *drive("bravo", 3)], seed="7", host="y")
     merged = merge([a, b], tmp_path / "m.mcap")
@@ -491,7 +474,7 @@ def test_robots_own_logs_merge_once_and_stably(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path: Path) -> None:
+def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path):
     first = drive("alpha", 1)[0]
     twice = [first, msgspec.structs.replace(first, wall_ns=first.wall_ns + 10**9)]
     log = recorded(tmp_path / "a.mcap", twice)
@@ -499,7 +482,7 @@ def test_what_a_robot_says_again_after_a_restart_is_no_duplicate(tmp_path: Path)
     assert list(open_log(tmp_path / "m.mcap").samples()) == twice
 
 
-def test_logs_of_two_teams_are_not_merged(whole: Log, tmp_path: Path) -> None:
+def test_logs_of_two_teams_are_not_merged(whole, tmp_path):
     with Recorder(tmp_path / "u.mcap", "u", {}) as recorder:
         recorder.write(drive("alpha", 1))
     with pytest.raises(LogError, match=r"u\.mcap: a log of team 'u', not 't' as .*log\.mcap is"):
@@ -520,9 +503,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         st.tuples(st.integers(0, 2**31 - 1), st.floats(0, 1e9), st.floats(-3.14, 3.14)), max_size=5
     )
 )
-def test_numbers_read_back_from_csv_are_the_same(
-    tmp_path_factory: pytest.TempPathFactory, seen: list[tuple[int, float, float]]
-) -> None:
+def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
     folder = tmp_path_factory.mktemp("csv")
     ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
     message = build.observations(
@@ -543,7 +524,7 @@ def test_numbers_read_back_from_csv_are_the_same(
         assert from_floats(back) == getattr(message, name)
 
 
-def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path: Path) -> None:
+def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):
     kept = recorded_examples()
     samples = [sample for _, _, sample in kept]
     samples.append(msgspec.structs.replace(samples[0], payload=b"\x90"))

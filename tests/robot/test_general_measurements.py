@@ -11,7 +11,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.recorded.chains import Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.batch_reference.reference import NoiseKind, batch_map
+from teamslam.sim.studies.batch_reference.reference import batch_map
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.rejection import Rejection
@@ -53,7 +53,6 @@ def run(of: Scenario) -> list[Sample]:
 
 def rmse(of: Scenario, samples: list[Sample]) -> float:
     truth = streams_of(of)
-    assert truth.landmarks is not None
     ids, means = translate.landmarks_of(final_map(samples))
     error = means - truth.landmarks[ids.astype(np.int64) - 1]
     return float(np.sqrt((error**2).sum(axis=1).mean()))
@@ -62,7 +61,7 @@ def rmse(of: Scenario, samples: list[Sample]) -> float:
 @pytest.mark.parametrize(
     ("estimator", "fusion"), [("hybrid", "join"), ("hybrid", "batch"), ("fastslam2", "alone")]
 )
-def test_a_team_of_mounted_sensors_that_claim_is_mapped(estimator: str, fusion: str) -> None:
+def test_a_team_of_mounted_sensors_that_claim_is_mapped(estimator, fusion):
     of = scenario(estimator, fusion)
     samples = run(of)
     if fusion != "alone":
@@ -73,18 +72,17 @@ def test_a_team_of_mounted_sensors_that_claim_is_mapped(estimator: str, fusion: 
     for robot, pose in last.items():
         stamps, path = truth[robot]
         assert stamps is not None
-        assert path is not None
         there = path[int(np.searchsorted(stamps, pose.stamp_ns))]
         here = np.frombuffer(pose.pose, "<f8")
         assert np.hypot(*(here - there)[:2]) < 0.6, "the base's pose, not the sensor's"
 
 
-def test_what_they_said_is_computed_again_to_the_last_bit(tmp_path) -> None:
+def test_what_they_said_is_computed_again_to_the_last_bit(tmp_path):
     of = scenario()
     assert verify(written(tmp_path / "log.mcap", run(of))).first is None
 
 
-def test_the_batch_reference_takes_claims() -> None:
+def test_the_batch_reference_takes_claims():
     seen = np.array([7], np.uint32), np.ones(1), np.zeros(1)
     claimed = Scan(*seen, np.array([[0.1, 0.02, 0.3, 0.0]]))
     np.testing.assert_array_equal(claimed.noise(0, Sensor(), 1.0), [[0.1, 0.02], [0.02, 0.3]])
@@ -104,7 +102,7 @@ def told(of: Scenario, samples: list[Sample]) -> list[Sample]:
 
 
 @pytest.mark.parametrize("noise", ["white", "profile"])
-def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise: NoiseKind) -> None:
+def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise):
     of = scenario()
     found = batch_map(run(of), noise)
     chains = chains_of(run(of), of)
@@ -122,7 +120,7 @@ def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise: NoiseKind
     assert mutant.cost > 1.5 * found.cost
 
 
-def test_an_estimator_that_takes_no_claims_says_so() -> None:
+def test_an_estimator_that_takes_no_claims_says_so():
     samples = run(scenario("ekf-slam", "alone", steps=20))
     done = [x for x in (opened(s)[2] for s in samples) if isinstance(x, m.Done)]
     counted = {each.disposition: each.measurements for each in done[0].ledger}

@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -19,7 +18,7 @@ from tests.support import odometry
 from tests.teams import config, published, stream, submaps_of
 
 
-def test_a_second_process_of_a_robot_is_refused_and_says_nothing_to_the_team() -> None:
+def test_a_second_process_of_a_robot_is_refused_and_says_nothing_to_the_team():
     network = MemoryNetwork()
     first, viewer = MemoryBus(network), MemoryBus(network)
     first.declare_alive(ch.robot_node("r1"))
@@ -30,7 +29,7 @@ def test_a_second_process_of_a_robot_is_refused_and_says_nothing_to_the_team() -
     assert viewer.receive() == []
 
 
-def test_a_robot_whose_earlier_life_has_gone_begins() -> None:
+def test_a_robot_whose_earlier_life_has_gone_begins():
     network = MemoryNetwork()
     first, viewer = MemoryBus(network), MemoryBus(network)
     first.declare_alive(ch.robot_node("r1"))
@@ -83,7 +82,7 @@ def lived(
     return shell
 
 
-def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone() -> None:
+def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone():
     """One message of a stranger made a robot leave its stream, and wait for another for ever."""
     network = MemoryNetwork()
     source = Source(network)
@@ -99,7 +98,7 @@ def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone() -> None:
     assert "of incarnation 4, of which its source knows nothing" in warnings
 
 
-def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path: Path) -> None:
+def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path):
     network = MemoryNetwork()
     source = Source(network)
     bus = MemoryBus(network)
@@ -114,7 +113,7 @@ def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path:
     assert not any(first > 0 for _, first, _ in source.asked), "it asks for these itself"
 
 
-def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source() -> None:
+def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source():
     """A stranger published more measurements than there are: the robot waited for ever."""
 
     class Ending(Source):
@@ -142,7 +141,7 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
     assert decoded(said.payload, m.Done).measurements == 1
 
 
-def test_a_source_that_has_published_nothing_yet_is_asked_again() -> None:
+def test_a_source_that_has_published_nothing_yet_is_asked_again():
     """A stranger who was there before the world made the robot begin at the stranger's word."""
     network = MemoryNetwork()
     source = Source(network)
@@ -153,7 +152,7 @@ def test_a_source_that_has_published_nothing_yet_is_asked_again() -> None:
     assert source.asked
 
 
-def test_where_no_source_answers_the_message_itself_is_believed() -> None:
+def test_where_no_source_answers_the_message_itself_is_believed():
     network = MemoryNetwork()
     source = Source(network)
     network.answers.clear()  # a replayed log
@@ -171,7 +170,7 @@ class Published(Source):
         return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
 
 
-def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> None:
+def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
     """A stranger's far end made the robot wait for ever; an early one made it leave."""
 
     network = MemoryNetwork()
@@ -195,7 +194,7 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on() -> N
 
 
 @pytest.mark.parametrize("state", ["ended", "open"])
-def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state: str) -> None:
+def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
     """A stranger's head of a driver that is not there: the robot waited, and asked for nothing."""
 
     network = MemoryNetwork()
@@ -214,7 +213,7 @@ def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state: str) ->
     assert decoded(said.payload, m.Done).measurements == 2, "measurement 1 was asked for"
 
 
-def test_a_stream_begins_where_its_source_says() -> None:
+def test_a_stream_begins_where_its_source_says():
     """A stranger was there first, years away: everything of the source was refused after that."""
     network = MemoryNetwork()
     source = Source(network)
@@ -229,7 +228,7 @@ def test_a_stream_begins_where_its_source_says() -> None:
     assert (shell.node.next_measurement, shell.shell.boundary.refused) == (2, 0)
 
 
-def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_over() -> None:
+def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_over():
     network = MemoryNetwork()
     source, centre = Source(network), MemoryBus(network)
     forged = msgspec.structs.replace(source.start, incarnation=7)
@@ -240,7 +239,7 @@ def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_o
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number: int) -> None:
+def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
     """One odometry as measurement 0 of incarnation 7 made a robot leave its stream for ever."""
     network = MemoryNetwork()
     source = Source(network)
@@ -257,7 +256,7 @@ def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number: int) 
     assert "the initial pose is measurement 0" in shell.shell.boundary.last_refused
 
 
-def test_a_stream_whose_clock_leaps_by_decades_goes_on_to_its_end() -> None:
+def test_a_stream_whose_clock_leaps_by_decades_goes_on_to_its_end():
     """A board without a clock is set by the network: the robot refused all that came after, asked
     for it, refused the answer, and the team waited for ever.
     """

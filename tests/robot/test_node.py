@@ -443,7 +443,7 @@ def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkey
     ]
 
 
-def test_running_maps_and_particles_go_out_for_the_windows_with_a_multiple_of_pose_s() -> None:
+def test_running_maps_and_particles_go_out_for_the_windows_with_a_multiple_of_pose_s():
     """Windows end at 3, 6, 9 and 12 s; the maps are those of a robot that sends them all."""
     every = driven(RobotNode(config()), MEASUREMENTS)
     some = driven(RobotNode(config(pose_s=4.0)), MEASUREMENTS)

@@ -32,18 +32,18 @@ def met(seed: int, exchange: str = "rendezvous") -> Team:
 
 
 @pytest.fixture(scope="module")
-def continuous() -> Team:
+def continuous():
     return met(0, "continuous")
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_final_map_is_that_of_a_continuous_exchange_to_the_last_bit(continuous, seed) -> None:
+def test_the_final_map_is_that_of_a_continuous_exchange_to_the_last_bit(continuous, seed):
     team = met(seed)
     assert encoded(team.final) == encoded(continuous.final)
     assert all(node.finished for node in team.nodes.values())
 
 
-def test_a_robot_that_keeps_what_it_holds_is_found_out(continuous, monkeypatch) -> None:
+def test_a_robot_that_keeps_what_it_holds_is_found_out(continuous, monkeypatch):
     """The mutant: the comparison above sees a submap that was never sent."""
     monkeypatch.setattr(RobotNode, "_release", lambda *_: [])
     assert encoded(met(1).final) != encoded(continuous.final)
@@ -53,7 +53,7 @@ def sent_by(measurements: list[m.Message], exchange: str = "rendezvous", end: bo
     return driven(RobotNode(CONFIG, exchange), measurements, end=end)
 
 
-def test_nothing_is_sent_until_a_teammate_is_seen_and_then_all_of_it() -> None:
+def test_nothing_is_sent_until_a_teammate_is_seen_and_then_all_of_it():
     first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
     before = sent_by(MEASUREMENTS[:first], end=False)
     there = sent_by(MEASUREMENTS[: first + 1], end=False)
@@ -67,7 +67,7 @@ def test_nothing_is_sent_until_a_teammate_is_seen_and_then_all_of_it() -> None:
     assert told.waited_s == pytest.approx(1e-9 * (MEASUREMENTS[first].stamp_ns - held[0].stamp_ns))
 
 
-def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else() -> None:
+def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else():
     first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
     for teammates, count in (((CONFIG.id,), 1), (("r9",), 0)):
         node = RobotNode(CONFIG, "rendezvous")
@@ -86,14 +86,14 @@ def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else() -> None:
             assert of(out, ch.RENDEZVOUS)[0].teammates == ()
 
 
-def test_a_held_submap_holds_back_the_team_time_that_its_robot_has_passed() -> None:
+def test_a_held_submap_holds_back_the_team_time_that_its_robot_has_passed():
     first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
     reports = of(sent_by(MEASUREMENTS[:first], end=False), ch.ROBOT_PROGRESS)
     assert {report.submaps for report in reports} == {0}
     assert max(report.stamp_ns for report in reports) <= MEASUREMENTS[0].stamp_ns
 
 
-def test_at_the_end_of_the_stream_everything_is_sent() -> None:
+def test_at_the_end_of_the_stream_everything_is_sent():
     alone = [r for r in MEASUREMENTS if not isinstance(r, m.Sightings)]
     alone = [msgspec.structs.replace(r, number=k) for k, r in enumerate(alone)]
     out, usual = sent_by(alone), sent_by(alone, "continuous")
@@ -102,7 +102,7 @@ def test_at_the_end_of_the_stream_everything_is_sent() -> None:
     assert of(out, ch.ROBOT_DONE) == of(usual, ch.ROBOT_DONE)
 
 
-def test_a_recorded_rendezvous_is_computed_again_to_the_last_bit(tmp_path) -> None:
+def test_a_recorded_rendezvous_is_computed_again_to_the_last_bit(tmp_path):
     samples = list(run_team(at_rendezvous(SCENARIO), STREAMS))
     usual = list(run_team(SCENARIO, STREAMS))
     assert encoded(final_map(samples)) == encoded(final_map(usual))
@@ -112,7 +112,7 @@ def test_a_recorded_rendezvous_is_computed_again_to_the_last_bit(tmp_path) -> No
     assert found.first is None
 
 
-def test_a_scenario_says_how_robots_exchange_and_only_submaps_can_wait() -> None:
+def test_a_scenario_says_how_robots_exchange_and_only_submaps_can_wait():
     scenario = at_rendezvous(SCENARIO)
     assert loads(dumps(scenario)).exchange == "rendezvous"
     fields = msgspec.to_builtins(scenario) | {"fusion": "kalman"}

@@ -31,7 +31,7 @@ def request(**wanted: int) -> bytes:
     return encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
 
 
-def test_a_stored_submap_has_the_bits_of_the_window_that_closed() -> None:
+def test_a_stored_submap_has_the_bits_of_the_window_that_closed():
     windows: list[ClosedWindow] = []
     node = RobotNode(config(), on_window=windows.append)
     driven(node, published(stream("r1", 30)))
@@ -49,7 +49,7 @@ def local_maps() -> int:
     return sum(isinstance(each, LocalMap) for each in gc.get_objects())
 
 
-def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages() -> None:
+def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages():
     """The number of local maps is that of the submaps that a prior lacks, at most 2 · CONDENSED."""
     before = local_maps()
     node = RobotNode(config())
@@ -72,7 +72,7 @@ def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages() -> None:
     assert 0 < local_maps() - before <= 2 * CONDENSED
 
 
-def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on() -> None:
+def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on():
     submaps = Submaps("r1", "continuous")
     for incarnation in (1, 2):
         submaps.begin(start(incarnation))
@@ -86,7 +86,7 @@ def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on() -> None:
     assert submaps.answer(request(incarnation=3)) == []
 
 
-def test_a_member_that_is_restored_twice_is_held_once() -> None:
+def test_a_member_that_is_restored_twice_is_held_once():
     submaps = Submaps("r1", "rendezvous")
     submaps.begin(start(1))
     for message in 2 * (start(1), sent(0, 1)):

@@ -32,14 +32,14 @@ def prior(sequence: int) -> m.Prior:
     )
 
 
-def test_the_map_that_is_kept_is_the_one_that_is_made_anew() -> None:
+def test_the_map_that_is_kept_is_the_one_that_is_made_anew():
     kept, told = TeamMap(), prior(1)
     for known in range(2, 7):
         again = TeamMap().join(told, LOCALS[:known])
         assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
 
 
-def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch):
     """The oldest submaps are condensed, by their order alone, whenever it is asked for."""
     submaps = [each.local for each in team(1, robots=1, submaps=5 * CONDENSED).submaps]
     first = submaps[0]  # its frame is the team's
@@ -66,7 +66,7 @@ def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch: pytest.M
     np.testing.assert_allclose(np.diag(last.covariance), np.diag(covariance), rtol=0.01)
 
 
-def test_a_pose_is_told_with_the_covariance_of_its_arc() -> None:
+def test_a_pose_is_told_with_the_covariance_of_its_arc():
     told = prior(5)
     alone = translate.prior_of(told).whole
     expected = curved(PoseGaussian(alone.mean[:3], alone.covariance[:3, :3])).covariance
@@ -75,7 +75,7 @@ def test_a_pose_is_told_with_the_covariance_of_its_arc() -> None:
     assert (posed.covariance[0, 0], posed.covariance[1, 1]) > tuple(np.diag(alone.covariance)[:2])
 
 
-def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() -> None:
+def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already():
     """The prior has submaps 0 to 4; the robot, started again, has sent three of them so far."""
     kept, told = TeamMap(), prior(4)
     alone = translate.prior_of(told).whole
@@ -85,9 +85,7 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already() 
     assert kept.join(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
 
 
-def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(monkeypatch):
     tried: list[int] = []
 
     def unsolvable(whole, pending):
@@ -115,9 +113,7 @@ def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(
         (2, 1.0, 0.1, None),
     ],
 )
-def test_a_prior_beyond_the_bounds_is_refused(
-    at: int, value: float, sigma: float, why: str | None
-) -> None:
+def test_a_prior_beyond_the_bounds_is_refused(at, value, sigma, why):
     mean = np.zeros(7)
     mean[at] = value
     refused = prior_beyond(mean, sigma**2 * np.eye(7), Bounds())

@@ -1,7 +1,6 @@
 """The network of a ROS 2 robot: a Zenoh router that is not ours."""
 
 import socket
-from collections.abc import Iterator
 
 import pytest
 import zenoh
@@ -11,7 +10,7 @@ Network = tuple[zenoh.Session, str]
 
 
 @pytest.fixture
-def network() -> Iterator[Network]:
+def network():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"

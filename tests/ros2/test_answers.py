@@ -1,7 +1,6 @@
 """Results for ROS 2: the right numbers in the right frames, read by readers that are not ours."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from teamslam.team.translate import landmark_blocks_of
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.zenoh.foreign import ForeignKeys
-from tests.ros2.conftest import Network
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import example, packed, spd, wait_until
 
@@ -40,7 +38,7 @@ def by_topic(answers):
     return {answer.topic: answer for answer in answers}
 
 
-def test_map_from_odom_takes_the_odometry_s_pose_to_the_pose_in_the_map() -> None:
+def test_map_from_odom_takes_the_odometry_s_pose_to_the_pose_in_the_map():
     answers = Answers(NAMES)
     answers.add_odometry(1 * S, (1.0, 0.0, 0.0))
     answers.add_odometry(2 * S, (2.0, 0.0, 0.2))
@@ -53,7 +51,7 @@ def test_map_from_odom_takes_the_odometry_s_pose_to_the_pose_in_the_map() -> Non
     np.testing.assert_allclose(compose(at, half_way), (10.0, 5.0, math.pi / 2), atol=1e-12)
 
 
-def test_a_pose_outside_of_the_team_s_frame_is_not_published_and_the_last_transform_stays() -> None:
+def test_a_pose_outside_of_the_team_s_frame_is_not_published_and_the_last_transform_stays():
     answers = Answers(NAMES)
     answers.add_odometry(1 * S, (1.0, 0.0, 0.0))
     assert answers.transform(1 * S) == []
@@ -63,13 +61,13 @@ def test_a_pose_outside_of_the_team_s_frame_is_not_published_and_the_last_transf
     assert decoded(kept).transforms[0].transform.translation.x == pytest.approx(2.0)
 
 
-def test_a_pose_without_odometry_at_its_time_has_no_transform() -> None:
+def test_a_pose_without_odometry_at_its_time_has_no_transform():
     answers = Answers(NAMES)
     answers.add_odometry(5 * S, (0.0, 0.0, 0.0))
     assert "/r1/tf" not in by_topic(answers.convert(posed(1 * S, (3.0, 0.0, 0.0))))
 
 
-def test_a_pose_has_its_covariance_in_six_dimensions() -> None:
+def test_a_pose_has_its_covariance_in_six_dimensions():
     out = by_topic(Answers(NAMES).convert(posed(3 * S + 7, (3.0, -2.0, 1.0))))
     found = decoded(out["/r1/team_pose"])
     assert (found.header.frame_id, found.header.stamp.sec, found.header.stamp.nanosec) == (
@@ -82,7 +80,7 @@ def test_a_pose_has_its_covariance_in_six_dimensions() -> None:
     assert np.count_nonzero(P) == 3
 
 
-def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
+def test_landmarks_have_ellipses_of_two_sigma_and_their_ids():
     fused = example(m.FusedMap)
     out = by_topic(Answers(NAMES).convert(fused))
     markers = decoded(out["/r1/team_landmarks"]).markers
@@ -98,7 +96,7 @@ def test_landmarks_have_ellipses_of_two_sigma_and_their_ids() -> None:
 
 
 @pytest.mark.parametrize("joint", [True, False])
-def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> None:
+def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint):
     P, ids = spd(6), from_ids([1, 2, 3])
     blocks = np.array([P[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)])
     data = packed(P) if joint else from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
@@ -106,7 +104,7 @@ def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint: bool) -> Non
     np.testing.assert_array_equal(landmark_blocks_of(example(m.FusedMap, **changed)), blocks)
 
 
-def test_an_ellipse_has_the_directions_of_its_covariance() -> None:
+def test_an_ellipse_has_the_directions_of_its_covariance():
     turn, axes = 0.7, np.array([3.0, 0.5])
     R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
     major, minor, direction = ellipse(R @ np.diag(axes**2) @ R.T)
@@ -122,14 +120,12 @@ def test_an_ellipse_has_the_directions_of_its_covariance() -> None:
         ("/alpha/odom", "odom", "/alpha", "/alpha/tf"),
     ],
 )
-def test_a_robot_s_topics_are_beside_its_odometry(topic, frame, namespace, tf) -> None:
+def test_a_robot_s_topics_are_beside_its_odometry(topic, frame, namespace, tf):
     names = names_of("r1", topic, frame, "base_link")
     assert (names.namespace, names.tf) == (namespace, tf)
 
 
-def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types(
-    network: Network,
-) -> None:
+def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types(network):
     router, endpoint = network
     live = LiveAnswers("r1", RobotTopics(odometry="/r1/odom"))
     with (
@@ -164,7 +160,7 @@ def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types
         assert any(each.endswith("/NN/%/%/teamslam_r1") for each in graph)
 
 
-def test_a_late_subscriber_receives_the_newest_path_and_map(network: Network) -> None:
+def test_a_late_subscriber_receives_the_newest_path_and_map(network):
     _, endpoint = network
     with ForeignKeys(endpoint, [], []) as session:
         publisher = RosPublisher(session, "teamslam_r1", 0)
@@ -182,7 +178,7 @@ def test_a_late_subscriber_receives_the_newest_path_and_map(network: Network) ->
     assert received[0].startswith("0/r1/team_path/nav_msgs::msg::dds_::Path_/RIHS01_")
 
 
-def test_a_log_becomes_a_bag_that_another_reader_opens(tmp_path: Path) -> None:
+def test_a_log_becomes_a_bag_that_another_reader_opens(tmp_path):
     log = written(tmp_path / "log.mcap", team_samples(thesis(45)))
     counts = export_rosbag2(log, tmp_path / "bag")
     with AnyReader([tmp_path / "bag"]) as reader:

@@ -73,12 +73,12 @@ def samples() -> dict[str, Any]:
 SAMPLES = samples()
 
 
-def test_there_is_a_sample_of_each_type() -> None:
+def test_there_is_a_sample_of_each_type():
     assert set(SAMPLES) == set(d.READERS)
 
 
 @pytest.mark.parametrize("kind", SAMPLES)
-def test_each_type_is_decoded(kind: str) -> None:
+def test_each_type_is_decoded(kind):
     record = d.decode(kind, ros.cdr(kind, SAMPLES[kind]))
     match record:
         case d.OdometryRecord():
@@ -99,7 +99,7 @@ def test_each_type_is_decoded(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SAMPLES)
-def test_damaged_bytes_are_an_error_and_nothing_else(kind: str) -> None:
+def test_damaged_bytes_are_an_error_and_nothing_else(kind):
     chance = random.Random(kind)
     sound = ros.cdr(kind, SAMPLES[kind])
     refused = 0
@@ -115,7 +115,7 @@ def test_damaged_bytes_are_an_error_and_nothing_else(kind: str) -> None:
     assert refused > 50
 
 
-def test_numbers_that_are_not_finite_are_damage() -> None:
+def test_numbers_that_are_not_finite_are_damage():
     for bad in (ros.pose(float("nan")), ros.pose(y=float("inf"))):
         with pytest.raises(d.DamagedError, match="not finite"):
             d.decode(
@@ -130,7 +130,7 @@ def test_numbers_that_are_not_finite_are_damage() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, -3.0, np.pi, 3.1])
-def test_a_heading_is_the_yaw_of_its_quaternion(yaw: float) -> None:
+def test_a_heading_is_the_yaw_of_its_quaternion(yaw):
     q = (0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
     assert heading(q) == pytest.approx(yaw)
     assert heading((0.0, 0.0, -q[2], -q[3])) == pytest.approx(yaw)
@@ -141,7 +141,7 @@ def translator(**options: Any) -> Translator:
     return Translator(RobotTopics(**{**topics, **options}))
 
 
-def test_a_camera_s_tags_are_points_ahead_and_left_of_where_it_sits() -> None:
+def test_a_camera_s_tags_are_points_ahead_and_left_of_where_it_sits():
     frames = Frames()
     frames.take(d.Transform(0, "base_link", "mast", (0.2, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)))
     frames.take(d.Transform(0, "mast", "lens_optical", (0.1, 0.0, 0.0), OPTICAL))
@@ -154,7 +154,7 @@ def test_a_camera_s_tags_are_points_ahead_and_left_of_where_it_sits() -> None:
     assert abs(robot.mounts["lens_optical"].pose[2]) == pytest.approx(np.pi)
 
 
-def test_a_sensor_whose_place_is_not_known_is_said() -> None:
+def test_a_sensor_whose_place_is_not_known_is_said():
     robot = translator()
     tag = d.Tag("7", (1.0, 2.0, 3.0), None)
     (found,) = robot.take("/tags", d.TagsRecord(AT, "cam_optical_frame", (tag,)))
@@ -168,7 +168,7 @@ def test_a_sensor_whose_place_is_not_known_is_said() -> None:
     assert told.said == []
 
 
-def test_tags_are_landmarks_teammates_or_strangers_by_their_names() -> None:
+def test_tags_are_landmarks_teammates_or_strangers_by_their_names():
     robot = translator(teammates={"5": "r2"}, landmarks={"dock": 900})
     tags = [d.Tag(name, (1.0, 0.0, 0.0), None) for name in ("36h11:7", "5", "dock", "chair", "1e3")]
     landmarks, mates = robot.take("/tags", d.TagsRecord(AT, "base_link", tuple(tags)))
@@ -178,11 +178,11 @@ def test_tags_are_landmarks_teammates_or_strangers_by_their_names() -> None:
     assert sum(robot.dropped.values()) == 2
 
 
-def test_an_empty_detection_says_that_it_looked() -> None:
+def test_an_empty_detection_says_that_it_looked():
     assert translator().take("/tags", d.TagsRecord(AT, "base_link", ())) == [Seen(AT, (), ())]
 
 
-def test_odometry_is_a_pose_or_speeds_or_a_transform() -> None:
+def test_odometry_is_a_pose_or_speeds_or_a_transform():
     record = d.OdometryRecord(
         stamp_ns=AT,
         frame="odom",

@@ -2,9 +2,7 @@
 
 import struct
 import time
-from collections.abc import Callable
 from decimal import Decimal
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,7 +23,6 @@ from teamslam.team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driv
 from teamslam.team.wire.digest import configured
 from teamslam.team.wire.zenoh.foreign import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
-from tests.ros2.conftest import Network
 from tests.support import wait_until
 
 S = 10**9
@@ -89,9 +86,7 @@ EXPECTED = [
 
 
 @pytest.mark.parametrize("key", [by_rmw, by_bridge])
-def test_topics_on_zenoh_become_a_driver_s_calls(
-    network: Network, key: Callable[[str, str], str]
-) -> None:
+def test_topics_on_zenoh_become_a_driver_s_calls(network, key):
     router, endpoint = network
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
@@ -121,7 +116,7 @@ def test_topics_on_zenoh_become_a_driver_s_calls(
     assert driver.dropped == {"/r1/odom: damaged": 1, "/r1/odom: refused": 1}
 
 
-def test_messages_before_their_type_is_told_are_kept() -> None:
+def test_messages_before_their_type_is_told_are_kept():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
     driver.take(ForeignSample("r1/tags", tags(1)))
@@ -132,7 +127,7 @@ def test_messages_before_their_type_is_told_are_kept() -> None:
     assert [call[0] for call in robot.calls] == ["points", "sight"]
 
 
-def test_hostile_payloads_are_counted_and_nothing_more() -> None:
+def test_hostile_payloads_are_counted_and_nothing_more():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
     random = np.random.default_rng(3)
@@ -151,7 +146,7 @@ def test_hostile_payloads_are_counted_and_nothing_more() -> None:
     assert len(robot.calls) + refused == 300
 
 
-def test_a_static_transform_says_where_the_sensor_sits() -> None:
+def test_a_static_transform_says_where_the_sensor_sits():
     robot = Robot()
     driver = Ros2Driver(robot, RobotTopics(odometry="/odom", detections=("/tf",)))
     turned = (0.0, 0.0, 1.0, 0.0)
@@ -165,9 +160,7 @@ def test_a_static_transform_says_where_the_sensor_sits() -> None:
 
 
 @pytest.mark.parametrize("topic", ["/tf_static", "/r1/tf_static"])
-def test_what_was_published_once_before_the_driver_began_is_received(
-    network: Network, topic: str
-) -> None:
+def test_what_was_published_once_before_the_driver_began_is_received(network, topic):
     router, endpoint = network
     robot = Robot()
     driver = Ros2Driver(robot, RobotTopics(odometry="/r1/odom", detections=("/r1/tags",)))
@@ -201,7 +194,7 @@ def test_what_was_published_once_before_the_driver_began_is_received(
     assert "at (0.2, 0, 3.142) on the base by its frames, and the scenario has it at (0," in warning
 
 
-def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path: Path) -> None:
+def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path):
     node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
     mounted = RobotConfig("r1", sensor=Sensor(mount=(0.2, 0.0, 1.0)))
     node.handle(configured("robot/r2", 0, 0, RobotConfig("r2")), 0)
@@ -213,7 +206,7 @@ def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path: Path)
     assert node.models is None
 
 
-def test_a_sensor_whose_place_comes_late_is_there_from_then_on() -> None:
+def test_a_sensor_whose_place_comes_late_is_there_from_then_on():
     robot = Robot()
     driver = Ros2Driver(robot, RobotTopics(odometry="/odom", detections=("/tags",)))
     kind = "tf2_msgs/msg/TFMessage"
@@ -226,7 +219,7 @@ def test_a_sensor_whose_place_comes_late_is_there_from_then_on() -> None:
     assert found == [0.2]
 
 
-def test_keys_name_topic_and_type() -> None:
+def test_keys_name_topic_and_type():
     assert of_rmw(by_rmw("/r1/odom", ODOMETRY), 0) == ("/r1/odom", ODOMETRY)
     humble = "7/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported"
     assert of_rmw(humble, 7) == ("/odom", ODOMETRY)
@@ -249,7 +242,7 @@ def test_keys_name_topic_and_type() -> None:
         ("[robots.R1]\nodometry = '/odom'", "matching regex"),
     ],
 )
-def test_a_mistake_in_a_file_of_topics_is_named(tmp_path: Path, text: str, words: str) -> None:
+def test_a_mistake_in_a_file_of_topics_is_named(tmp_path, text, words):
     (tmp_path / "topics.toml").write_text(text)
     with pytest.raises(TopicsError) as error:
         load_topics(tmp_path / "topics.toml")
@@ -257,7 +250,7 @@ def test_a_mistake_in_a_file_of_topics_is_named(tmp_path: Path, text: str, words
     assert "topics.toml" in str(error.value)
 
 
-def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_goes_on() -> None:
+def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_goes_on():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
     key = by_rmw("/r1/odom", ODOMETRY)
@@ -265,16 +258,16 @@ def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_
     def broken(topic: str, record: object) -> list[Measured]:
         raise ZeroDivisionError("no such rotation")
 
-    whole, driver._translator.take = driver._translator.take, broken  # type: ignore[method-assign]
+    whole, driver._translator.take = driver._translator.take, broken
     driver.take(ForeignSample(key, odometry(1)))
-    driver._translator.take = whole  # type: ignore[method-assign]
+    driver._translator.take = whole
     for k in range(2, 4):
         driver.take(ForeignSample(key, odometry(k)))
     assert driver.dropped == {"/r1/odom: set aside": 1}
     assert len(robot.calls) == 2
 
 
-def test_the_reasons_that_are_told_apart_are_bounded() -> None:
+def test_the_reasons_that_are_told_apart_are_bounded():
     driver = Ros2Driver(Robot(), TOPICS)
     for k in range(2 * MOST_REASONS):
         driver.take(ForeignSample(f"0/r1/odom/what::msg::dds_::Ever{k}_/RIHS01_0", b""))
@@ -293,9 +286,7 @@ def plainly_numbered(number: int, gid: bytes = b"a" * 16) -> bytes:
 
 
 @pytest.mark.parametrize("attached", [numbered, plainly_numbered])
-def test_messages_that_never_came_are_counted_by_their_publisher_s_numbers(
-    attached: Callable[..., bytes],
-) -> None:
+def test_messages_that_never_came_are_counted_by_their_publisher_s_numbers(attached):
     driver = Ros2Driver(Robot(), TOPICS)
     key = by_rmw("/r1/odom", ODOMETRY)
     for k in (1, 2, 5, 6):
@@ -310,7 +301,7 @@ def test_messages_that_never_came_are_counted_by_their_publisher_s_numbers(
     assert "keep_all" in said
 
 
-def test_hostile_numbers_lose_nothing_and_fill_nothing() -> None:
+def test_hostile_numbers_lose_nothing_and_fill_nothing():
     lost = Lost()
     random = np.random.default_rng(5)
     for k in range(2 * MOST_PUBLISHERS):
@@ -326,7 +317,7 @@ def test_hostile_numbers_lose_nothing_and_fill_nothing() -> None:
     assert number_of(numbered(7).replace(b"sequence", b"sequense")) is None
 
 
-def test_what_waits_is_handed_over_in_the_order_of_its_stamps() -> None:
+def test_what_waits_is_handed_over_in_the_order_of_its_stamps():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
     for k in range(1, 400):  # all odometry first, as a reader that fell behind finds it
@@ -340,9 +331,7 @@ def test_what_waits_is_handed_over_in_the_order_of_its_stamps() -> None:
     assert times == sorted(times)
 
 
-def test_a_driver_that_falls_behind_says_so_in_its_status(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_driver_that_falls_behind_says_so_in_its_status(tmp_path, monkeypatch):
     monkeypatch.setattr("teamslam.team.ros2.arrivals.MOST_WAITING", 3)
     driver = Ros2Driver(Robot(), TOPICS)
     for k in range(1, 6):
@@ -359,9 +348,7 @@ def test_a_driver_that_falls_behind_says_so_in_its_status(
     assert "/r1/odom: 2 messages were dropped" in said
 
 
-def test_odometry_that_does_not_come_is_named_with_what_to_look_at(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_odometry_that_does_not_come_is_named_with_what_to_look_at(monkeypatch):
     silent, heard = Ros2Driver(Robot(), TOPICS), Ros2Driver(Robot(), TOPICS)
     heard.put(ForeignSample(by_rmw("/r1/odom", ODOMETRY), odometry(1)))
     heard.deliver()
@@ -373,7 +360,7 @@ def test_odometry_that_does_not_come_is_named_with_what_to_look_at(
     assert "/r1/odom: no message yet: look at its name, at `domain`" in said
 
 
-def test_of_a_shared_tf_a_driver_takes_what_its_own_robot_saw() -> None:
+def test_of_a_shared_tf_a_driver_takes_what_its_own_robot_saw():
     kind = "tf2_msgs/msg/TFMessage"
     level = (0.0, 0.0, 0.0, 1.0)
     others = {

@@ -1,7 +1,5 @@
 """A ROS 2 robot live and its bag as a data set are one stream of measurements, byte for byte."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -40,8 +38,8 @@ def drive() -> list[ros.Message]:
 
 
 @pytest.mark.parametrize("use", ["pose", "twist"])
-def test_live_and_as_a_bag_it_is_one_stream(tmp_path: Path, use: str) -> None:
-    topics = RobotTopics(odometry="/odom", detections=("/tags",), use=use)  # type: ignore[arg-type]
+def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
+    topics = RobotTopics(odometry="/odom", detections=("/tags",), use=use)
     drove = drive()
     bag = ros.write_bag(tmp_path / "bag", drove)
     (tables,) = import_bag(bag, Topics(robots={"r1": topics}), None).robots

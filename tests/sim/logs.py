@@ -44,7 +44,6 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
 
 def streams(of: Scenario) -> WorldStreams:
     """The world's streams of a scenario."""
-    assert isinstance(of.world, SimulatedWorld)
     return simulated(of.world, of.robots, of.seed)
 
 
@@ -109,8 +108,6 @@ def joined_log(of: Scenario, deviation: float) -> list[Sample]:
     assert world.landmarks is not None
     out = []
     for stream in world.streams:
-        assert stream.truth is not None
-        assert stream.truth_ns is not None
         poses = stream.truth[5::5] + deviation * np.array([0.5, -0.5, 0.1])
         out.append(trajectory(stream.robot, stream.truth_ns[5::5].tolist(), poses, 0.1))
     count = len(world.landmark_ids)

@@ -106,7 +106,7 @@ def held_cost(chain: Chain) -> float:
 
 
 @pytest.mark.parametrize("mutant", [False, True], ids=["as declared", "mutant: all white"])
-def test_the_error_states_eliminated_are_the_processes_covariance(mutant: bool) -> None:
+def test_the_error_states_eliminated_are_the_processes_covariance(mutant):
     shares = (1.0, 1.0) if mutant else (LASTING.bearing_white, LASTING.range_white)
     same = held_cost(standing(LASTING)) == pytest.approx(
         marginal_cost(standing(LASTING), shares), rel=1e-4
@@ -119,7 +119,7 @@ def mounted(chain: Chain, mount: tuple[float, float, float]) -> Chain:
     return replace(chain, config=msgspec.structs.replace(chain.config, sensor=sensor))
 
 
-def test_the_derivatives_are_those_of_the_residuals() -> None:
+def test_the_derivatives_are_those_of_the_residuals():
     chain = standing(LASTING)
     poses = [np.array([[0.1 * i, 0.2, 0.3 * i] for i in range(4)])]
     graph = profile_graph(gtsam, [chain], poses, LANDMARKS, None, BiasSigmas())
@@ -137,7 +137,7 @@ def test_the_derivatives_are_those_of_the_residuals() -> None:
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.5, -0.2, 0.3)])
-def test_a_sighting_ties_the_bases_poses_of_one_time(mount: tuple[float, float, float]) -> None:
+def test_a_sighting_ties_the_bases_poses_of_one_time(mount):
     there = np.array([3.0, 4.0, 1.0])
     seen = NodeSighting(
         2 * 10**9, "r2", np.array([5.5, 0.9]), np.array([[0.04, 0.001], [0.001, 0.01]]), (1,)
@@ -174,12 +174,10 @@ def lasting_scenario(seed: int) -> Scenario:
 
 
 @pytest.mark.parametrize("kind", ["profile", "white"], ids=["profile", "mutant: white"])
-def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_white(
-    kind: str,
-) -> None:
+def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_white(kind):
     """The mutant is found among a quarter of the runs."""
     runs = [
-        batch_map(joined_log(lasting_scenario(seed), 0.02), kind)  # type: ignore[arg-type]
+        batch_map(joined_log(lasting_scenario(seed), 0.02), kind)
         for seed in range(100, 150 if kind == "white" else 300)
     ]
     errors = [run.errors for run in runs if run.errors is not None]
@@ -189,13 +187,13 @@ def test_the_map_is_consistent_where_errors_last_and_not_if_they_are_taken_as_wh
     assert inside == (kind == "profile"), f"NEES/dof {total / dof:.3f} over {dof}"
 
 
-def test_the_figures_name_the_noise_and_stand_beside_the_teams() -> None:
+def test_the_figures_name_the_noise_and_stand_beside_the_teams():
     figures = batch_map(joined_log(scenario(), 1.0), "profile").to_json()
     assert figures["noise"] == "profile"
     assert figures["landmark_rmse_m"] < figures["team"]["landmark_rmse_m"]
 
 
-def test_the_chains_have_poses_at_the_grids_times_if_sightings_are_asked_for() -> None:
+def test_the_chains_have_poses_at_the_grids_times_if_sightings_are_asked_for():
     of = scenario()
     robots = tuple(
         msgspec.structs.replace(

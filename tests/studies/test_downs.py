@@ -6,10 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.sim.datasets.utias import utias
-from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments import downs_minima
 from teamslam.sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
@@ -19,13 +16,12 @@ from teamslam.sim.studies.experiments.downs_simulated import (
 )
 from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.sim.world.config import UtiasWorld
 from teamslam.team.estimation.map_joining.alignment import procrustes
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
 
-def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances() -> None:
+def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances():
     scenario = with_options(load("downs-100"), robots=2)
     world = msgspec.structs.replace(scenario.world, steps=60)
     result = spherical_task(msgspec.structs.replace(scenario, world=world)).run()
@@ -52,7 +48,7 @@ def _results(ekf: float, joined: float) -> Results:
     return Results({name: result(task.label) for name, task in tasks.items()})
 
 
-def test_the_paired_test_tells_maps_that_differ_from_those_that_do_not() -> None:
+def test_the_paired_test_tells_maps_that_differ_from_those_that_do_not():
     options = Options((1,), datasets=(SET_1,))
     apart = TABLE_5_3.outcome(options, _results(0.4, 0.03)).figures["t_tests"][HIS]
     same = TABLE_5_3.outcome(options, _results(0.4, 0.4)).figures["t_tests"][
@@ -65,7 +61,7 @@ def test_the_paired_test_tells_maps_that_differ_from_those_that_do_not() -> None
     assert same["mean_after_m"] == pytest.approx(0.0347, abs=5e-4)
 
 
-def test_the_team_is_compared_set_by_set_and_one_set_has_no_p() -> None:
+def test_the_team_is_compared_set_by_set_and_one_set_has_no_p():
     options = Options((1,), datasets=(SET_1,))
     tests = TABLE_5_5.outcome(options, _results(0.4, 0.03)).figures["t_tests"]
     assert tests[HIS]["pairs"] == 1
@@ -81,7 +77,7 @@ def _map(points: np.ndarray, sigma: float) -> Figures:
     }
 
 
-def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_form() -> None:
+def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_form():
     points = np.array([[0.0, 0.0], [5.0, 1.0], [2.0, 7.0], [-4.0, 3.0]])
     turned = points @ np.array([[0.0, -1.0], [1.0, 0.0]]) + [3.0, -2.0]
     turned[2] += 0.3
@@ -96,13 +92,7 @@ def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_f
     np.testing.assert_allclose(weighted, 2.0 * alike / (0.1**2 + 0.2**2), rtol=1e-9)
 
 
-def test_a_curve_with_two_minima_is_said_to_have_two() -> None:
-    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
-    assert downs_minima.minima(np.cos(2.0 * turns)) == 2
-    assert downs_minima.minima(np.cos(turns)) == 1
-
-
-def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_path: Path) -> None:
+def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_path):
     options = Options((1, 2), quick=True)
     short = SIMULATED_5_1.tasks(options)
     assert len(short) == 2 * len(WORLDS)
@@ -122,20 +112,3 @@ def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_pat
     for picture in outcome.pictures:
         picture.draw(tmp_path / "picture.png")
         assert (tmp_path / "picture.png").stat().st_size > 10_000
-
-
-def test_his_simulator_is_written_as_a_data_set_that_reads_the_same(tmp_path: Path) -> None:
-    scenario = load("downs-10")
-    world = msgspec.structs.replace(scenario.world, steps=120)
-    written = streams_of(msgspec.structs.replace(scenario, world=world))
-    write_utias(written, tmp_path)
-    read = utias(UtiasWorld(path=str(tmp_path)), scenario.robots)
-    (there,), (here,) = written.streams, read.streams
-    np.testing.assert_allclose(here.intervals.forward, there.intervals.forward, atol=1e-8)
-    np.testing.assert_allclose(here.intervals.yaw_rate, there.intervals.yaw_rate, atol=1e-8)
-    seen = there.landmark_detections
-    np.testing.assert_allclose(here.landmark_detections.ranges, seen.ranges, atol=1e-8)
-    assert len(seen.ranges) > 20
-    told = there.intervals
-    turned = np.abs(told.yaw_rate) > 0.05
-    assert (np.abs(told.forward[turned]) < 0.05).all(), "it turns, then drives"

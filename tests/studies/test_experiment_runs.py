@@ -1,4 +1,4 @@
-"""Runs of experiments: in processes of their own, kept as they come, none lost by another's end."""
+"""Runs of experiments, and shards that are computed apart."""
 
 import json
 import threading
@@ -10,18 +10,20 @@ from pathlib import Path
 import msgspec
 import pytest
 from joblib.externals.loky.process_executor import TerminatedWorkerError
+from typer.testing import CliRunner
 
+from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.studies.experiments import xu_localisation
+from teamslam.sim.studies.experiments import runner, xu_localisation
 from teamslam.sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
 from teamslam.sim.studies.experiments.output import write
 from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
+from teamslam.sim.studies.experiments.shards import Shard, tasks_of
 from teamslam.sim.studies.experiments.task import ROOTS, Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
-from teamslam.sim.world.config import SimulatedWorld
 from teamslam.team.sources import sources_of
 
 WORK = "json:loads"
@@ -34,13 +36,12 @@ def counted(rmse: float) -> Task:
 
 def short(steps: int) -> Scenario:
     scenario = load("thesis")
-    assert isinstance(scenario.world, SimulatedWorld)
     world = msgspec.structs.replace(scenario.world, steps=steps)
     return msgspec.structs.replace(scenario, world=world)
 
 
 @pytest.mark.parametrize("estimator", ["localisation", "ekf-slam"])
-def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator: str) -> None:
+def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator):
     scenario = with_options(short(20), estimator=estimator, fusion="alone")
     figures = team_run(msgspec.to_builtins(scenario), batch=False)
     assert figures["final_map_sha256"] is not None, "it came to its end"
@@ -73,16 +74,15 @@ def silent(tasks: Sequence[Task], kept: int) -> Iterator[Callable[[Done], None]]
     yield lambda _: None
 
 
-def test_a_run_in_a_worker_gives_the_bits_of_a_run_here(tmp_path: Path) -> None:
+def test_a_run_in_a_worker_gives_the_bits_of_a_run_here(tmp_path):
     task = team_task(short(24))
     (done,) = Cases(tmp_path).run([task], 1)
     here = team_run(**task.parameters)
-    assert done.result is not None
     assert done.result["final_map_sha256"] == here["final_map_sha256"]
     assert done.result["rmse"] == here["rmse"]
 
 
-def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path: Path) -> None:
+def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path):
     wrong = Task(WORK, {"no_such": 1}, "wrong")
     dead = Task("os:_exit", {"status": 3}, "dead")
     good = [counted(1.0), counted(5.0)]
@@ -94,7 +94,7 @@ def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path: Path
     assert "Traceback" in (tmp_path / FAILURES).read_text()
 
 
-def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path: Path) -> None:
+def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path):
     computed([plan(counted(1.0), Task("os:_exit", {"status": 3}, "dead"))], tmp_path, 1, silent)
     asked: list[Task] = []
 
@@ -110,9 +110,7 @@ def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path: Path)
     assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
 
-def test_a_result_of_another_program_does_not_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     (done,) = Cases(tmp_path).run([counted(1.0)], 1)
     assert done.result == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
@@ -121,7 +119,7 @@ def test_a_result_of_another_program_does_not_count(
     assert Cases(tmp_path).found(counted(1.0)) is None
 
 
-def test_a_result_that_was_cut_off_is_computed_again(tmp_path: Path) -> None:
+def test_a_result_that_was_cut_off_is_computed_again(tmp_path):
     list(Cases(tmp_path).run([counted(1.0), counted(2.0)], 1))
     for kept in (tmp_path / FOLDER).rglob("output.pkl"):
         kept.write_bytes(kept.read_bytes()[:-9])
@@ -129,14 +127,14 @@ def test_a_result_that_was_cut_off_is_computed_again(tmp_path: Path) -> None:
     assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
 
-def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies() -> None:
+def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies():
     assert counted(1.0).name == counted(1.0).name
     assert counted(1.0).name != counted(2.0).name
     there, here = (Task(WORK, {"a": 1}, "", local={"path": path}) for path in ("/there", "/here"))
     assert there.name == here.name
 
 
-def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
+def test_the_program_of_a_run_is_every_source_that_it_imports():
     sources = sources_of("teamslam.sim.studies.experiments.team_runs", ROOTS)
     wanted = {
         "teamslam.team.estimation.hybrid_slam.outliers",
@@ -150,7 +148,7 @@ def test_the_program_of_a_run_is_every_source_that_it_imports() -> None:
     assert not {name for name in sources if name.partition(".")[0] == "numpy"}
 
 
-def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
+def test_leaving_early_ends_the_long_run_too(tmp_path):
     begun = time.monotonic()
     slow = Task("subprocess:run", {"args": ["sleep", "300"]}, "slow")
     runs = Cases(tmp_path).run([counted(1.0), slow], 2)
@@ -160,9 +158,7 @@ def test_leaving_early_ends_the_long_run_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyError, ValueError])
-def test_leaving_while_a_case_is_handed_over_leaves_no_error(
-    error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_leaving_while_a_case_is_handed_over_leaves_no_error(error, tmp_path, monkeypatch):
     """The pool's thread fails with a KeyError on that case; another error is shown."""
     task = counted(1.0)
 
@@ -189,12 +185,12 @@ def test_leaving_while_a_case_is_handed_over_leaves_no_error(
     assert [each.exc_type for each in shown] == [each for each in [error] if each is not KeyError]
 
 
-def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path: Path) -> None:
+def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path):
     with pytest.raises(SchedulerError, match="--scheduler"):
         list(Cases(tmp_path).run([counted(1.0)], 1, "tcp://127.0.0.1:1"))
 
 
-def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:
+def test_a_data_set_is_known_by_its_content(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "Barcodes.dat").write_text("1 5\n")
@@ -207,9 +203,7 @@ def test_a_data_set_is_known_by_its_content(tmp_path: Path) -> None:
         dataset(tmp_path / "c")
 
 
-def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(
-    tmp_path: Path,
-) -> None:
+def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(tmp_path):
     entry = next(each for each in ENTRIES if each.name == "xu-3.5")
     options = Options((1, 2), quick=True)
     tasks = tuple(xu_localisation.tasks(options)[:3])
@@ -226,3 +220,96 @@ def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_no
         assert (folder / "xu-3.5.json").exists()
     assert pages[0] == pages[1]
     assert sum(count for _, count, _ in resumed.kinds) == len(tasks)
+
+
+RUN = CliRunner()
+
+
+def task(value: float, cost: float = 1.0) -> Task:
+    return Task("json:loads", {"s": json.dumps({"rmse": value})}, f"run {value}", cost)
+
+
+class Values:
+    """An experiment whose runs return their parameter."""
+
+    def tasks(self, options: Options) -> list[Task]:
+        return [task(seed / 8, 1.0 + seed) for seed in options.seeds]
+
+    def outcome(self, options: Options, results: Results) -> Outcome:
+        found = [results.of(each)["rmse"] for each in self.tasks(options) if results.of(each)]
+        return Outcome("values", {"values": found}, (Table("t", ("v",), ((str(found),),)),))
+
+
+@pytest.fixture(autouse=True)
+def _values_instead_of_filters(monkeypatch):
+    def planned(entry: Entry, options: Options) -> Plan:
+        experiment = Values()
+        return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
+
+    monkeypatch.setattr(runner, "planned", planned)
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("xu-4.4*")}
+
+
+def experiment(*words: object) -> str:
+    done = RUN.invoke(app, ["experiment", *map(str, words)])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_merged_shards_are_the_whole_byte_for_byte(tmp_path):
+    options = ("xu-4.4", "--seeds", 7, "--first", 3, "--jobs", 1)
+    experiment(*options, "-o", tmp_path / "whole")
+    shards = [tmp_path / f"shard-{k}" for k in (1, 2, 3)]
+    for k, folder in enumerate(shards, 1):
+        said = experiment(*options, "-o", folder, "--shard", f"{k}/3")
+        assert f"{3 if k == 1 else 2} of 7 runs" in said
+        assert written(folder) == {}, "a part has no page"
+    experiment("merge", *reversed(shards), "-o", tmp_path / "merged", "--jobs", 1)
+    whole = written(tmp_path / "whole")
+    assert {*whole} == {"xu-4.4.html", "xu-4.4.json"}
+    assert written(tmp_path / "merged") == whole
+    assert json.loads(whole["xu-4.4.json"])["values"] == [k / 8 for k in range(3, 10)]
+
+
+def test_shards_that_are_not_all_or_not_of_one_study_are_refused(tmp_path):
+    def shard(k: int, seeds: int) -> Path:
+        folder = tmp_path / f"{k}-{seeds}"
+        experiment("xu-4.4", "--seeds", seeds, "--jobs", 1, "--shard", f"{k}/2", "-o", folder)
+        return folder
+
+    first, other = shard(1, 2), shard(2, 3)
+    for folders, said in (
+        ([first], "shard 2 of 2 is not among the folders"),
+        ([first, other], "they differ in seeds"),
+        ([tmp_path], "is no finished shard"),
+    ):
+        words = [*map(str, folders), "-o", str(tmp_path / "out")]
+        refused = RUN.invoke(app, ["experiment", "merge", *words])
+        assert refused.exit_code == 2
+        assert said in " ".join(refused.output.split())
+    file = first / "shard.json"
+    file.write_text(file.read_text().replace('"json:loads": "', '"json:loads": "0'))
+    second = shard(2, 2)
+    file = second / "shard.json"
+    file.write_text(file.read_text().replace('"json:loads": "', '"json:loads": "0'))
+    words = [str(first), str(second), "-o", str(tmp_path / "out")]
+    refused = RUN.invoke(app, ["experiment", "merge", *words])
+    assert refused.exit_code == 2
+    assert "another version of the program" in refused.output
+
+
+@pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "1/0"])
+def test_a_shard_is_a_number_of_a_number(text):
+    refused = RUN.invoke(app, ["experiment", "xu-4.4", "--shard", text])
+    assert refused.exit_code == 2
+    assert "as 2/8" in refused.output
+
+
+def test_every_run_is_in_one_shard_and_long_runs_are_spread():
+    tasks = {each.name: each for each in (task(k, float(k)) for k in range(10))}
+    parts = [tasks_of(tasks, Shard(k, 3)) for k in (1, 2, 3)]
+    assert sorted(name for part in parts for name in part) == sorted(tasks)
+    assert [max(each.cost for each in part.values()) for part in parts] == [9.0, 8.0, 7.0]

@@ -1,7 +1,6 @@
 """Experiments: figures over seeds, goals, the page, the command line."""
 
 import json
-from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -34,7 +33,7 @@ def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1
     return figures
 
 
-def test_errors_are_root_mean_squares_and_all_else_means() -> None:
+def test_errors_are_root_mean_squares_and_all_else_means():
     figures = over_seeds([run(3.0, 0.8), run(4.0, 1.6)])
     assert figures["seeds"] == 2
     assert figures["rmse"] == pytest.approx(12.5**0.5)
@@ -42,12 +41,7 @@ def test_errors_are_root_mean_squares_and_all_else_means() -> None:
     assert figures["in_band"] == 1.0
 
 
-def test_a_figure_that_no_run_has_is_none_and_one_that_some_have_is_theirs() -> None:
-    assert over_seeds([{"rmse": None}, {"rmse": 2.0}])["rmse"] == 2.0
-    assert over_seeds([{"rmse": None}])["rmse"] is None
-
-
-def test_the_ratio_is_of_the_rms_over_the_same_seeds_to_the_batch_of_the_default_pair() -> None:
+def test_the_ratio_is_of_the_rms_over_the_same_seeds_to_the_batch_of_the_default_pair():
     runs = {
         "hybrid + join": [run(0.6), run(0.8, batch=1.0, seed=2)],
         "hybrid + kalman": [run(2.0, 9.0, None)],
@@ -62,11 +56,11 @@ def test_the_ratio_is_of_the_rms_over_the_same_seeds_to_the_batch_of_the_default
     ("value", "passed"),
     [(1.0, True), (1.2, False), (0.7, False), (float("nan"), False), (None, None)],
 )
-def test_a_goal_is_passed_within_its_bounds_only(value: float | None, passed: bool | None) -> None:
+def test_a_goal_is_passed_within_its_bounds_only(value, passed):
     assert Goal("nees", value, 0.8, 1.15).passed == passed
 
 
-def test_a_team_that_counts_measurements_twice_misses_the_goals() -> None:
+def test_a_team_that_counts_measurements_twice_misses_the_goals():
     options = Options((1,), quick=True)
     tasks = accuracy_worlds.tasks(options)
     honest = Results({task.name: run(0.5) | _POSES for task in tasks})
@@ -83,7 +77,7 @@ def test_a_team_that_counts_measurements_twice_misses_the_goals() -> None:
 _POSES = {"final_pose_nees": 1.0, "online_pose_nees": 1.0, "each_once": True}
 
 
-def test_every_experiment_plans_runs_and_lives_without_any_result() -> None:
+def test_every_experiment_plans_runs_and_lives_without_any_result():
     for entry in ENTRIES:
         options = Options((1, 2), quick=True)
         plan = planned(entry, options)
@@ -107,7 +101,7 @@ def concluded() -> Concluded:
     return Concluded(Entry("some", "", "Something."), Options((3, 4)), outcome, 2, {"run": "why"})
 
 
-def test_the_json_has_the_figures_the_goals_and_what_is_missing_and_no_nan(tmp_path: Path) -> None:
+def test_the_json_has_the_figures_the_goals_and_what_is_missing_and_no_nan(tmp_path):
     content = to_json(concluded(), {"version.numpy": "2"})
     assert content["rmse"] is None
     assert content["all"] == [1.0, None]
@@ -118,7 +112,7 @@ def test_the_json_has_the_figures_the_goals_and_what_is_missing_and_no_nan(tmp_p
     json.dumps(content, allow_nan=False)
 
 
-def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None:
+def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path):
     page = write([concluded()], tmp_path, "index", {"version.numpy": "2"}).read_text()
     assert "&lt;0.5&gt;" in page
     assert "data:image/png;base64," in page
@@ -130,7 +124,7 @@ def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path: Path) -> None
     assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
 
 
-def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario() -> None:
+def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario():
     scenario = with_particles(with_options(load("thesis"), seed=7, robots=1), 50)
     tasks = [curves_task(with_options(scenario, seed=seed), label="t") for seed in (1, 2)]
     ((label, count, said),) = kinds_of(tasks)
@@ -140,7 +134,7 @@ def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario() 
     assert said.endswith("thesis, as it is")
 
 
-def test_help_lists_every_experiment() -> None:
+def test_help_lists_every_experiment():
     shown = CliRunner().invoke(app, ["experiment", "--help"], terminal_width=100)
     assert shown.exit_code == 0
     for entry in ENTRIES:
@@ -155,7 +149,7 @@ def test_help_lists_every_experiment() -> None:
         (["accuracy", "--json", "nowhere/at/all.json"], "no such folder"),
     ],
 )
-def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments: list[str], said: str) -> None:
+def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments, said):
     refused = CliRunner().invoke(app, ["experiment", *arguments])
     assert refused.exit_code == 2
     assert said in refused.output
@@ -188,8 +182,8 @@ SURVEYED = ["another map fits about as well"]
     ],
 )
 def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(
-    run: Figures, wrong: int, silent: int, beyond: int, untold: int, alarms: int
-) -> None:
+    run, wrong, silent, beyond, untold, alarms
+):
     figures = accuracy_few.few_figures([run])
     names = ("wrong", "silent", "beyond", "beyond_silent", "alarms")
     assert tuple(figures[name] for name in names) == (wrong, silent, beyond, untold, alarms)

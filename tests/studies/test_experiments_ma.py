@@ -1,7 +1,5 @@
 """Ma & Ma's figures on a small set in the UTIAS format, written from a simulated world."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,29 +7,28 @@ from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments import ma, ma_errors, ma_maps
-from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.runner import dataset
-from teamslam.sim.studies.experiments.team_runs import Figures
 
 FRAMES = 300
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp("small")
     write_utias(streams_of(load("waypoints")), folder)
     return dataset(folder)
 
 
 @pytest.fixture(scope="module")
-def runs(small: Dataset) -> dict[str, Figures]:
+def runs(small):
     methods = (ma.DEAD_RECKONING, ma.SINGLE, ma.MULTI_3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ma, "FRAMES", FRAMES)
         return {method.name: ma.ma_task(small, method, 1).run() for method in methods}
 
 
-def test_fastslam_says_its_particles_and_dead_reckoning_has_none(runs: dict[str, Figures]) -> None:
+def test_fastslam_says_its_particles_and_dead_reckoning_has_none(runs):
     assert runs[ma.DEAD_RECKONING.name]["clouds"] == []
     assert runs[ma.DEAD_RECKONING.name]["map"] is None
     single = runs[ma.SINGLE.name]
@@ -44,7 +41,7 @@ def test_fastslam_says_its_particles_and_dead_reckoning_has_none(runs: dict[str,
         assert np.hypot(*cloud.std(axis=0)) < 5.0
 
 
-def test_errors_are_told_over_frames_from_the_first_pose_on(runs: dict[str, Figures]) -> None:
+def test_errors_are_told_over_frames_from_the_first_pose_on(runs):
     for run in runs.values():
         for robot in run["robots"].values():
             frames = robot["curve"]["time_s"]
@@ -53,9 +50,7 @@ def test_errors_are_told_over_frames_from_the_first_pose_on(runs: dict[str, Figu
     assert list(runs[ma.MULTI_3.name]["robots"]) == ["r1", "r2", "r3"]
 
 
-def test_the_last_error_of_the_map_is_the_mean_distance_of_its_landmarks(
-    runs: dict[str, Figures],
-) -> None:
+def test_the_last_error_of_the_map_is_the_mean_distance_of_its_landmarks(runs):
     for name in (ma.SINGLE.name, ma.MULTI_3.name):
         found = runs[name]["map"]
         truth = np.array(runs[name]["truth"])
@@ -63,9 +58,7 @@ def test_the_last_error_of_the_map_is_the_mean_distance_of_its_landmarks(
         assert found["curve"]["error_m"][-1] == pytest.approx(np.mean(nearest), rel=1e-3)
 
 
-def test_the_figures_of_a_set_are_tables_and_pictures(
-    small: Dataset, runs: dict[str, Figures], tmp_path: Path
-) -> None:
+def test_the_figures_of_a_set_are_tables_and_pictures(small, runs, tmp_path):
     options = Options((1,), datasets=(small,))
     results = Results(
         {
@@ -83,6 +76,6 @@ def test_the_figures_of_a_set_are_tables_and_pictures(
         assert path.stat().st_size > 10_000
 
 
-def test_without_a_set_the_figures_say_where_to_get_one() -> None:
+def test_without_a_set_the_figures_say_where_to_get_one():
     for experiment in (ma_errors.FIGURE_6A, ma_maps.FIGURE_5):
         assert "MRCLAM" in experiment.outcome(Options((1,)), Results({})).missing[0]

@@ -148,15 +148,6 @@ def test_how_it_has_grown_does_not_matter():
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-6)
 
 
-def test_before_any_turn_it_is_the_start_poses():
-    alone = converged(batch.initial_state({"r1": (STARTS["r1"], UNSURE)}, None), [])
-    mean, covariance = batch.pose_gaussian(alone, "r1")
-    np.testing.assert_allclose(mean, STARTS["r1"], atol=1e-12)
-    np.testing.assert_allclose(covariance, UNSURE, rtol=1e-9)
-    assert len(batch.landmark_gaussian(alone).ids) == 0
-    assert alone.dof == 0
-
-
 def test_a_robot_without_a_start_is_refused():
     rounds, _ = team_run(1, steps=1)
     with pytest.raises(ValueError, match="r2 has no start"):

@@ -31,7 +31,7 @@ def world(
     return made, island, dict(enumerate(made.landmarks)), paths
 
 
-def test_a_map_of_sound_submaps_is_in_the_minimum_of_the_truth() -> None:
+def test_a_map_of_sound_submaps_is_in_the_minimum_of_the_truth():
     rises = []
     for seed in range(8):
         _, island, landmarks, paths = world(seed)
@@ -43,7 +43,7 @@ def test_a_map_of_sound_submaps_is_in_the_minimum_of_the_truth() -> None:
     assert 0.6 < np.mean(rises) < 1.5, "the likelihood ratio is χ² of what is held"
 
 
-def test_a_map_that_is_folded_wrongly_is_another_minimum() -> None:
+def test_a_map_that_is_folded_wrongly_is_another_minimum():
     wrong = 0
     sparse = {"size": 60.0, "reach": 15.0, "sigmas": (0.3, 0.15, 1.0)}
     for seed in range(8):
@@ -59,7 +59,7 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum() -> None:
 
 
 @pytest.mark.parametrize(("bearing_sigma", "lower"), [(30.0, False), (0.02, True)])
-def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool) -> None:
+def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
     """Two places that are equally likely, and one that the measurements exclude."""
     island, across = mirrored(bearing_sigma, OPTIONS)
     stamps = np.array([1000, 2000, 3000, 4000, 5000])
@@ -74,7 +74,7 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma: float, lower: bool)
     assert (found.lower > 1.0) == lower
 
 
-def test_submaps_that_deny_the_truth_are_found() -> None:
+def test_submaps_that_deny_the_truth_are_found():
     _, island, landmarks, paths = world(3)
     moved = {id_: place + np.array([2.0, 0.0]) * (id_ == 1) for id_, place in landmarks.items()}
     found = judged(island, moved, paths)
@@ -82,18 +82,17 @@ def test_submaps_that_deny_the_truth_are_found() -> None:
     assert not found.wrong
 
 
-def test_a_run_is_asked_for_its_own_final_map() -> None:
+def test_a_run_is_asked_for_its_own_final_map():
     scenario = short(120)
     samples = list(run_team(scenario, streams_of(scenario)))
     fold = final_fold(samples)
     assert fold.main.cost == pytest.approx(final_map(samples).chi2, rel=1e-6)
     found = true_minimum(samples, evaluate(samples))
-    assert found is not None
     assert not found.wrong
     assert not found.excluded
 
 
-def test_a_map_that_is_not_at_rest_is_wrong() -> None:
+def test_a_map_that_is_not_at_rest_is_wrong():
     """The map is judged as published, without a further solution by the team's solver."""
     _, island, landmarks, paths = world(2)
     off = island.state.copy()
@@ -106,7 +105,7 @@ def test_a_map_that_is_not_at_rest_is_wrong() -> None:
     assert found.lower == pytest.approx(3.0, abs=0.1)
 
 
-def test_the_judge_s_cost_is_the_map_joining_s() -> None:
+def test_the_judge_s_cost_is_the_map_joining_s():
     """Two programs, one cost: with inter-robot measurements, pose nodes, an uncertain start."""
     met = meeting(3)
     starts = [replace(each, covariance=np.diag([0.04, 0.04, 0.01])) for each in met.starts]

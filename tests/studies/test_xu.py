@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,7 +15,6 @@ from teamslam.sim.studies.experiments.curves import a_step_late, curves_run
 from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu_errors import FIGURE_4_4, FIGURE_5_2
-from teamslam.sim.world.config import SimulatedWorld
 
 STEPS = 40
 
@@ -33,7 +31,7 @@ def short(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def runs() -> dict[tuple[str, str], Figures]:
+def runs():
     """By panel and method, of figures 4.4 and 5.2."""
     panels = [("4.4", panel) for panel in FIGURE_4_4.panels]
     panels += [("5.2", panel) for panel in FIGURE_5_2.panels]
@@ -51,18 +49,14 @@ def largest(run: Figures) -> float:
     return float(max(run["poses"]["r1"]["error_m"]))
 
 
-def test_as_coded_the_errors_are_far_below_those_as_stated(
-    runs: dict[tuple[str, str], Figures],
-) -> None:
+def test_as_coded_the_errors_are_far_below_those_as_stated(runs):
     stated = largest(runs["4.4 as stated", xu.HYBRID.name])
     exact = largest(runs["4.4 true controls", xu.HYBRID.name])
     coded = largest(runs["4.4 as coded", xu.HYBRID_CODED.name])
     assert stated > 1.5 * exact > 3.0 * coded
 
 
-def test_the_poses_of_multi_fastslam_are_those_of_the_centres_filter(
-    runs: dict[tuple[str, str], Figures],
-) -> None:
+def test_the_poses_of_multi_fastslam_are_those_of_the_centres_filter(runs):
     curve = runs["5.2 as coded", xu.MULTI_FASTSLAM.name]["poses"]["r1"]
     # With exact odometry the robot's own dead reckoning would be exact.
     assert max(curve["error_m"]) > 0.0
@@ -71,17 +65,15 @@ def test_the_poses_of_multi_fastslam_are_those_of_the_centres_filter(
 
 def scenario(**change: object) -> Scenario:
     made = with_options(load("thesis"), robots=1)
-    assert isinstance(made.world, SimulatedWorld)
     return msgspec.structs.replace(made, world=msgspec.structs.replace(made.world, **change))
 
 
-def test_the_coded_inputs_are_the_appendix_numbers() -> None:
+def test_the_coded_inputs_are_the_appendix_numbers():
     coded = xu.as_coded(scenario())
     robot = coded.robots[0]
     assert robot.motion.forward.per_s == pytest.approx(0.0025)
     assert math.degrees(robot.motion.turn.per_s) == pytest.approx(0.157, abs=1e-3)
     assert math.degrees(robot.sensor.bearing_sigma) == pytest.approx(5.64, abs=1e-2)
-    assert isinstance(coded.world, SimulatedWorld)
     assert coded.world.visible_from_m == 0.0
     panel = next(p for p in FIGURE_4_4.panels if p.reading == "coded")
     parameters = xu.task(panel, xu.EKF, 1).parameters
@@ -90,7 +82,7 @@ def test_the_coded_inputs_are_the_appendix_numbers() -> None:
     assert parameters["late"]
 
 
-def test_late_measurements_are_those_of_the_step_before() -> None:
+def test_late_measurements_are_those_of_the_step_before():
     streams = streams_of(scenario(steps=30, observe_at_start=True))
     now, late = (s.streams[0].landmark_detections for s in (streams, a_step_late(streams)))
     np.testing.assert_array_equal(late.stamps_ns, now.stamps_ns[1:])
@@ -99,7 +91,7 @@ def test_late_measurements_are_those_of_the_step_before() -> None:
         np.testing.assert_array_equal(late.ranges[late.rows(k)], now.ranges[now.rows(k)])
 
 
-def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only() -> None:
+def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only():
     options = Options((1, 2))
     task = xu_localisation.tasks(options)[0]
     run = task.run()
@@ -114,7 +106,7 @@ def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only(
     assert resampled["distance_m"] == pytest.approx(weighed["distance_m"], abs=0.5)
 
 
-def test_a_start_anywhere_is_found(tmp_path: Path) -> None:
+def test_a_start_anywhere_is_found(tmp_path):
     options = Options((3,))
     tasks = xu_localisation.tasks(options)[:2]
     results = {task.name: task.run() for task in tasks}

@@ -77,9 +77,7 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
         ),
     ],
 )
-async def test_wrong_use_is_told_with_what_to_do(
-    arguments: list[str], parts: list[str], team: Processes
-) -> None:
+async def test_wrong_use_is_told_with_what_to_do(arguments, parts, team):
     message = await refused(team, *arguments)
     assert [part for part in parts if part not in message] == [], message
 
@@ -94,31 +92,27 @@ async def test_wrong_use_is_told_with_what_to_do(
         ("steps =", ["not valid TOML"]),
     ],
 )
-async def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(
-    text: str, parts: list[str], team: Processes
-) -> None:
+async def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(text, parts, team):
     (team.folder / "mine.toml").write_text(text)
     message = await refused(team, "launch", "mine.toml")
     assert [part for part in ["mine.toml: ", *parts] if part not in message] == [], message
 
 
 @pytest.fixture
-def dataset(team: Processes) -> Path:
+def dataset(team):
     """A small data set of three robots."""
     folder = team.folder / "MRCLAM_Dataset0"
     write_utias(streams_of(load(short(team.folder, "waypoints", 40))), folder)
     return folder
 
 
-async def test_a_file_that_is_no_zip_is_told(team: Processes) -> None:
+async def test_a_file_that_is_no_zip_is_told(team):
     (team.folder / "set.zip").write_bytes(b"PK\3\4 and no more")
     message = await refused(team, "launch", "--dataset", "set.zip")
     assert "set.zip: not a zip, or a damaged one" in message
 
 
-async def test_a_damaged_line_of_a_data_set_is_told_with_file_and_line(
-    dataset: Path, team: Processes
-) -> None:
+async def test_a_damaged_line_of_a_data_set_is_told_with_file_and_line(dataset, team):
     path = dataset / "Robot2_Odometry.dat"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:9], "1.0  fast  0.0", *lines[10:]]))
@@ -139,8 +133,8 @@ async def launch(team: Processes, dataset: Path) -> tuple[Process, dict[str, obj
 
 
 async def test_a_data_set_without_ground_truth_works_and_says_what_can_not_be_computed(
-    dataset: Path, team: Processes
-) -> None:
+    dataset, team
+):
     for path in dataset.glob("*Groundtruth.dat"):
         path.unlink()
     process, result = await launch(team, dataset)
@@ -155,9 +149,7 @@ async def test_a_data_set_without_ground_truth_works_and_says_what_can_not_be_co
         assert robot["measurements_consumed"] == robot["measurements_published"] > 0
 
 
-async def test_a_robot_without_odometry_is_told_and_the_others_run(
-    dataset: Path, team: Processes
-) -> None:
+async def test_a_robot_without_odometry_is_told_and_the_others_run(dataset, team):
     (dataset / "Robot2_Odometry.dat").unlink()
     process, result = await launch(team, dataset)
     assert "note: r2: no odometry" in process.said()
@@ -169,7 +161,7 @@ async def test_a_robot_without_odometry_is_told_and_the_others_run(
         assert robot["measurements_consumed"] == robot["measurements_published"] > 0
 
 
-async def test_a_port_that_is_taken_is_told(team: Processes) -> None:
+async def test_a_port_that_is_taken_is_told(team):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         for command in (["router"], ["launch", "thesis", "--output", "run"]):
@@ -177,7 +169,7 @@ async def test_a_port_that_is_taken_is_told(team: Processes) -> None:
             assert f"can not listen at {endpoint}: the port is taken" in message
 
 
-async def test_a_router_that_is_not_there_is_told(team: Processes) -> None:
+async def test_a_router_that_is_not_there_is_told(team):
     commands = (["robot", "thesis", "r1"], ["central", "thesis"], ["world", "thesis"])
     recorder = ["record", "thesis", "--output", "log.mcap"]
     with nobody_listens() as endpoint:
@@ -201,8 +193,6 @@ EMPTY, FOREIGN = b"", (ROOT / "README.md").read_bytes()
         (["repair", "--output", "out"], FOREIGN, "not an MCAP file"),
     ],
 )
-async def test_what_is_no_log_is_told(
-    command: list[str], content: bytes, what: str, team: Processes
-) -> None:
+async def test_what_is_no_log_is_told(command, content, what, team):
     (team.folder / "mine.mcap").write_bytes(content)
     assert f"mine.mcap: {what}" in await refused(team, *command, "mine.mcap")

@@ -37,7 +37,7 @@ def digests() -> list[str]:
     return said.stdout.split()
 
 
-def test_two_processes_factor_and_invert_a_big_system_to_the_same_bits() -> None:
+def test_two_processes_factor_and_invert_a_big_system_to_the_same_bits():
     first, second = digests(), digests()
     assert len(first) == 3
     assert first == second

@@ -2,13 +2,12 @@
 
 import signal
 
-from tests.system.processes import Processes
 from tests.system.scenarios import short
 
 
 async def test_a_world_that_waits_for_a_robot_with_other_options_says_so_and_goes_on_without_them(
-    team: Processes,
-) -> None:
+    team,
+):
     scenario = short(team.folder, steps=20)
     there = ["--connect", await team.router()]
     world = await team.start("world", scenario, *there, "--speed", "max")

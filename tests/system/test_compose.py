@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
 
@@ -16,18 +15,18 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 from tests.namespaces import network
 from tests.support import ROOT
-from tests.system.processes import PROGRAM, Process, Processes
+from tests.system.processes import PROGRAM, Process
 from tests.system.scenarios import short
 
 
 @pytest.fixture(scope="module")
-def services() -> dict[str, Any]:
+def services():
     found: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]
     return found
 
 
 @pytest.fixture
-def names(services: dict[str, Any]) -> Iterator[dict[str, str]]:
+def names(services):
     """The services' namespaces; skips where this machine does not permit them."""
     if shutil.which("ip") is None or os.geteuid():
         pytest.skip("network namespaces need iproute2 and root")
@@ -40,8 +39,8 @@ def names(services: dict[str, Any]) -> Iterator[dict[str, str]]:
 
 
 async def test_the_services_on_a_network_of_their_own_bring_the_fused_map_to_every_robot(
-    services: dict[str, Any], names: dict[str, str], team: Processes
-) -> None:
+    services, names, team
+):
     """The commands as they stand, but for a short world at 20 × real time and the log's folder."""
     scenario = short(team.folder, "waypoints", 80)
 
@@ -77,9 +76,7 @@ async def test_the_services_on_a_network_of_their_own_bring_the_fused_map_to_eve
         assert digests <= broadcast, "each names a map that was broadcast"
 
 
-async def test_the_router_s_health_check_passes_once_it_listens(
-    services: dict[str, Any], names: dict[str, str], team: Processes
-) -> None:
+async def test_the_router_s_health_check_passes_once_it_listens(services, names, team):
     kind, program, *arguments = services["router"]["healthcheck"]["test"]
     assert (kind, program) == ("CMD", "python")
     check = ["ip", "netns", "exec", names["router"], PROGRAM[0], *arguments]

@@ -40,7 +40,7 @@ def submaps_in(log: Path) -> int:
         return 0
 
 
-async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: Processes) -> None:
+async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team):
     """A robot, the centre, the recorder, the world and the router, one after the other."""
     launch, folder = await launched(team, "4")
     killed = []
@@ -53,7 +53,7 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team: 
         assert Path(f"/proc/{pid}/fd/0").readlink() == Path(os.devnull)
         os.kill(pid, signal.SIGKILL)
         killed.append(f"{name} (pid {pid}) was ended by SIGKILL: it is started again")
-        await until(lambda text=killed[-1]: text in launch.said(), killed[-1])  # type: ignore[misc]
+        await until(lambda text=killed[-1]: text in launch.said(), killed[-1])
     assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
     assert "Traceback" not in launch.said()
@@ -80,8 +80,8 @@ def other(team: Processes, words: tuple[str, ...]) -> int | None:
 
 
 async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map_is_provisional(
-    team: Processes,
-) -> None:
+    team,
+):
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--no-report", "--output", folder),
@@ -120,9 +120,7 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
     assert {member.robot for member in final.members} == {"r2"}
 
 
-async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that_is_wished(
-    team: Processes,
-) -> None:
+async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that_is_wished(team):
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--speed", PACE, "--no-report", "--end-silent", "11"),
@@ -143,9 +141,7 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-async def test_an_interrupt_ends_every_process_and_completes_the_log(
-    number: signal.Signals, team: Processes
-) -> None:
+async def test_an_interrupt_ends_every_process_and_completes_the_log(number, team):
     launch, folder = await launched(team)
     launch.signal(number)
     assert await launch.ended() == 1
@@ -157,7 +153,7 @@ async def test_an_interrupt_ends_every_process_and_completes_the_log(
     assert submaps_in(folder / "log.mcap") > 0
 
 
-async def test_no_process_outlives_a_launch_that_is_killed(team: Processes) -> None:
+async def test_no_process_outlives_a_launch_that_is_killed(team):
     launch, folder = await launched(team)
     assert len(team.alive()) == 8, "the launch and its seven processes"
     launch.signal(signal.SIGKILL)

@@ -10,13 +10,13 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.hostile.drawing import OF_THE_RUN, mutated, payloads
-from tests.system.processes import Processes, until
+from tests.system.processes import until
 from tests.system.scenarios import short
 
 MESSAGES = 500
 
 
-async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team: Processes) -> None:
+async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team):
     """A tenth of it is mutated. Afterwards the centre and a robot still report their status."""
     scenario = short(team.folder)
     endpoint = await team.router()

@@ -23,7 +23,7 @@ PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 OFFLINE = ("--no-deps", "--no-index")
 
 
-async def test_a_user_s_own_folders_do_not_shadow_ours(team: Processes) -> None:
+async def test_a_user_s_own_folders_do_not_shadow_ours(team):
     for package in (*FOLDERS, "teamslam"):
         folder = team.folder / package
         folder.mkdir()
@@ -46,7 +46,7 @@ async def done(team: Processes, name: str, command: Sequence[object]) -> str:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """The wheel, built from a copy with the build tools at hand, so that nothing is fetched."""
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -69,7 +69,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def test_the_wheel_holds_one_package_and_nothing_else(wheel: Path) -> None:
+def test_the_wheel_holds_one_package_and_nothing_else(wheel):
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     about = f"teamslam-{version}.dist-info/"
     with zipfile.ZipFile(wheel) as archive:
@@ -91,7 +91,7 @@ def test_the_wheel_holds_one_package_and_nothing_else(wheel: Path) -> None:
     assert shipped - modules == {name for name in expected if "team/core/building/" not in name}
 
 
-async def test_the_wheel_runs_in_an_environment_of_its_own(team: Processes, wheel: Path) -> None:
+async def test_the_wheel_runs_in_an_environment_of_its_own(team, wheel):
     """Our dependencies are lent by the environment of the tests; nothing is fetched."""
     fresh = team.folder / "fresh"
     await done(team, "venv", [sys.executable, "-m", "venv", "--without-pip", fresh])

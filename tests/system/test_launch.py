@@ -32,7 +32,7 @@ ROBOT_FIGURES = (
 )  # fmt: skip
 
 
-def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched: Launched) -> None:
+def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched):
     assert launched.exit == 0, launched.said
     processes = launched.result["processes"]
     assert {name: process["exit"] for name, process in processes.items()} == dict.fromkeys(
@@ -42,7 +42,7 @@ def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched: Lau
     assert launched.result["failures"] == []
 
 
-def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
+def test_the_json_of_a_launch_has_every_figure(launched):
     result = launched.result
     assert {name for name in FIGURES if result.get(name) is None} == set()
     assert sorted(result["robots"]) == ["r1", "r2"]
@@ -54,7 +54,7 @@ def test_the_json_of_a_launch_has_every_figure(launched: Launched) -> None:
         assert result["channels"][key]["messages"] > 0
 
 
-def test_every_published_measurement_is_consumed_once(launched: Launched) -> None:
+def test_every_published_measurement_is_consumed_once(launched):
     for name, robot in launched.result["robots"].items():
         assert robot["measurements_published"] == robot["measurements_consumed"] > 2 * STEPS
         assert robot["measurements_used_once"]
@@ -65,7 +65,7 @@ def test_every_published_measurement_is_consumed_once(launched: Launched) -> Non
         assert sent == robot["measurements_published"], "the log has each measurement once"
 
 
-def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched: Launched) -> None:
+def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched):
     log = open_log(launched.log)
     assert log.complete
     assert log.metadata["seed"] == "1"
@@ -76,9 +76,7 @@ def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched: Launched) -
     }
 
 
-def test_a_launch_tells_its_result_and_where_log_report_and_pictures_are(
-    launched: Launched,
-) -> None:
+def test_a_launch_tells_its_result_and_where_log_report_and_pictures_are(launched):
     assert f"log   {launched.log}" in launched.said
     assert "landmark RMSE" in launched.said
     written = [line[6:] for line in launched.said.splitlines() if line.startswith("wrote ")]
@@ -86,9 +84,7 @@ def test_a_launch_tells_its_result_and_where_log_report_and_pictures_are(
     assert all(Path(path).stat().st_size > 0 for path in written)
 
 
-def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(
-    launched: Launched,
-) -> None:
+def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(launched):
     samples = open_log(launched.log).samples()
     payload = final_map([(sample.key, sample.payload) for sample in samples])
     assert payload == map_in_memory(launched.scenario)
@@ -110,9 +106,7 @@ async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, ob
 @pytest.mark.parametrize(
     ("estimator", "rule"), [("hybrid-thesis", "kalman-per-axis"), ("dead-reckoning", "batch")]
 )
-async def test_every_kind_of_pair_ends_with_the_bytes_of_a_team_in_memory(
-    estimator: str, rule: str, team: Processes
-) -> None:
+async def test_every_kind_of_pair_ends_with_the_bytes_of_a_team_in_memory(estimator, rule, team):
     scenario = short(team.folder, more=f'estimator = "{estimator}"\nfusion = "{rule}"', steps=30)
     result = await launch(team, scenario, "--seed", "2")
     assert (result["estimator"], result["fusion"], result["seed"]) == (estimator, rule, 2)
@@ -142,15 +136,13 @@ async def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     return Watched(terminal.shown, json.loads((team.folder / "result.json").read_text()))
 
 
-def test_a_terminal_shows_a_live_table_of_the_robots(watched: Watched) -> None:
+def test_a_terminal_shows_a_live_table_of_the_robots(watched):
     for text in ("short, seed 1", "σ [m]", "mapping", "team map by join", "world ended"):
         assert text in watched.shown, watched.shown
     assert "Traceback" not in watched.shown
 
 
-def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(
-    launched: Launched, watched: Watched
-) -> None:
+def test_a_second_launch_at_another_pace_ends_with_the_same_bytes(launched, watched):
     assert watched.result["final_map_sha256"] == launched.result["final_map_sha256"]
 
 
@@ -168,8 +160,8 @@ def keep_another_runs_set(launched: Launched, file: Path) -> None:
 
 
 async def test_a_launch_with_keys_in_another_runs_folder_sends_the_same_bytes_as_final_map(
-    team: Processes, launched: Launched
-) -> None:
+    team, launched
+):
     keep_another_runs_set(launched, team.folder / "run" / "central.set")
     make_keys(team.folder / "keys", "short", nodes_of(["r1", "r2"]))
     result = await launch(team, launched.scenario, "--keys", "keys")

@@ -16,7 +16,7 @@ from teamslam.team.recording.reader import open_log
 from teamslam.team.wire.channels import FINAL_MAP
 from tests.support import ROOT, Link
 from tests.system.observer import endpoint_of
-from tests.system.processes import Processes, until
+from tests.system.processes import until
 from tests.system.scenarios import final_map, short
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text("utf-8")
@@ -37,9 +37,7 @@ def recorded(folder: Path) -> bytes:
     return final_map([(sample.key, sample.payload) for sample in samples])
 
 
-async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(
-    team: Processes,
-) -> None:
+async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(team):
     expected = recorded(team.folder)
     launch = await team.start(
         *("launch", "lab.toml", "--listen", "tcp/127.0.0.2:0", "--output", "run"),

@@ -6,8 +6,6 @@ Skipped where there is no Chromium; `make test` installs one where it may (tests
 import asyncio
 import re
 import signal
-from collections.abc import Iterator
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
@@ -17,7 +15,7 @@ from teamslam.team.recording.recorder import Recorder
 from tests.browser import Page, browsing, chromium
 from tests.crowd import crowd
 from tests.support import wait_until
-from tests.system.processes import Processes, until
+from tests.system.processes import until
 from tests.system.scenarios import short
 
 PROGRAM = chromium()
@@ -29,13 +27,13 @@ READY = "window.teamslam !== undefined && teamslam.store.complete && teamslam.ma
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Page]:
+def browser():
     with browsing(PROGRAM or "") as page:
         yield page
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def url(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "log.mcap"
     with Recorder(path, "crowd", {}) as recorder:
         recorder.write(crowd(ROBOTS, LANDMARKS, SECONDS))
@@ -44,7 +42,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.fixture
-def page(browser: Page, url: str) -> Page:
+def page(browser, url):
     """The page on a recorded log, fully read, on a desktop."""
     browser.errors.clear()
     browser.size(1280, 800)
@@ -199,16 +197,13 @@ def test_it_fits_a_phone(page):
     )
 
 
-async def test_a_live_team_is_followed_and_the_page_stays_until_ctrl_c(
-    team: Processes, tmp_path: Path, browser: Page
-) -> None:
+async def test_a_live_team_is_followed_and_the_page_stays_until_ctrl_c(team, tmp_path, browser):
     launch = await team.start(
         *("launch", short(tmp_path), "--speed", "10", "--output", tmp_path / "run"),
         *("--view", "--no-browser", "--foxglove-port", "0", "--no-report"),
     )
     await launch.says("page  ")
     found = re.search(r"page\s+(http://\S+)", launch.said())
-    assert found is not None
     browser.errors.clear()
     browser.size(1280, 800)
     await asyncio.to_thread(browser.open, found[1])

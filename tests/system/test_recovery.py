@@ -59,9 +59,7 @@ async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Proce
     return await team.start("robot", found.scenario, "r1", "--connect", endpoint, name=name)
 
 
-async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(
-    team: Processes,
-) -> None:
+async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(team):
     found = await assembled(team, "10")  # it must die before its end, on a busy machine too
     first = await robot(team, found, found.endpoint, "r1")
     with Observer(found.endpoint, [ch.SUBMAP]) as seen:
@@ -75,9 +73,7 @@ async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(
     assert found.final_map() == map_in_memory(found.scenario)
 
 
-async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
-    team: Processes,
-) -> None:
+async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(team):
     """The link is cut until the world has ended."""
     found = await assembled(team, "10")
     with (
@@ -94,9 +90,7 @@ async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
     assert found.final_map() == map_in_memory(found.scenario)
 
 
-async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(
-    team: Processes,
-) -> None:
+async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(team):
     found = await assembled(team, "4")  # the order takes a process, and comes before the end
     found.robots["r1"] = await robot(team, found, found.endpoint, "r1")
     there = ["--connect", found.endpoint]
@@ -122,8 +116,8 @@ async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(
 
 
 async def test_a_centre_that_is_started_again_gets_what_a_resumed_robot_sent_in_its_earlier_life(
-    team: Processes,
-) -> None:
+    team,
+):
     found = await assembled(team, "4")  # r1 comes back, and the centre goes, before the end
     there = ["--connect", found.endpoint]
     first = await robot(team, found, found.endpoint, "r1")

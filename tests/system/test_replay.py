@@ -11,7 +11,7 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.zenoh.attachment import Attachment, pack
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.system.conftest import Launched
-from tests.system.processes import Processes, until
+from tests.system.processes import until
 
 Arrived = list[tuple[str, bytes, bytes]]
 """(key, payload, attachment) in the order of arrival."""
@@ -48,9 +48,7 @@ def recorded(launched: Launched) -> Arrived:
     ]
 
 
-async def test_a_replay_arrives_byte_by_byte_in_the_order_of_the_log(
-    launched: Launched, team: Processes
-) -> None:
+async def test_a_replay_arrives_byte_by_byte_in_the_order_of_the_log(launched, team):
     endpoint = await team.router()
     expected = recorded(launched)
     with plain_subscriber(endpoint) as arrived, ZenohBus("probe", endpoint) as probe:
@@ -71,9 +69,7 @@ async def test_a_replay_arrives_byte_by_byte_in_the_order_of_the_log(
         assert played() == expected
 
 
-async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(
-    launched: Launched, team: Processes
-) -> None:
+async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(launched, team):
     replay = await team.start(
         *("replay", launched.log, "--speed", "max"), *("--listen", "tcp/127.0.0.1:0", "--wait", "8")
     )
@@ -88,8 +84,8 @@ async def test_a_replay_can_be_its_own_router_and_waits_for_who_listens(
 
 
 async def test_a_log_that_is_cut_is_replayed_and_reported_with_a_hint_and_completed_by_repair(
-    team: Processes, launched: Launched
-) -> None:
+    team, launched
+):
     cut = team.folder / "cut.mcap"
     whole = launched.log.read_bytes()
     cut.write_bytes(whole[: len(whole) * 3 // 4])

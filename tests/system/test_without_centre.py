@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-from pathlib import Path
 
 from teamslam.central.desk.verification.verification import verify
 from teamslam.team.recording.reader import open_log
@@ -10,7 +9,7 @@ from tests.system.processes import PROGRAM
 from tests.system.scenarios import map_in_memory, sha256, short
 
 
-def test_without_a_centre_every_robots_final_map_is_that_of_a_central_run(tmp_path: Path) -> None:
+def test_without_a_centre_every_robots_final_map_is_that_of_a_central_run(tmp_path):
     scenario = short(tmp_path, steps=40)
     done = subprocess.run(
         [*PROGRAM, "launch", str(scenario), "--without-centre", "--no-report", "--no-views",

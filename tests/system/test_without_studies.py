@@ -53,9 +53,7 @@ async def done(
     return process.said()
 
 
-async def test_the_product_launches_records_reruns_reports_and_shows_without_them(
-    team: Processes,
-) -> None:
+async def test_the_product_launches_records_reruns_reports_and_shows_without_them(team):
     sources = without_studies(team.folder / "sources")
     scenario = short(team.folder, steps=30)
     await done(team, sources, "launch", ["launch", scenario, "--output", "run"])
@@ -71,3 +69,5 @@ async def test_the_product_launches_records_reruns_reports_and_shows_without_the
     chosen = ["launch", scenario, "--estimator", "ekf-slam", "--fusion", "latest"]
     said = await done(team, sources, "absent", chosen, status=2)
     assert "ekf-slam is not installed" in said
+    study = await done(team, sources, "study", ["batch-reference", log], status=2)
+    assert "`teamslam batch-reference` is a study" in study

@@ -1,19 +1,18 @@
-"""Arrivals of a publisher: each once, in order, and the missing ones are listed."""
+"""Order and gaps of what arrives, and intervals of numbers."""
 
 import itertools
+from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from teamslam.team.wire.intervals import IntervalSet
 from teamslam.team.wire.zenoh import arrivals as module
 from teamslam.team.wire.zenoh.arrivals import DELAY_S, PATIENCE_S, Arrivals
 
 
 @given(st.permutations(range(8)), st.lists(st.integers(0, 7), max_size=8))
-def test_whatever_the_order_each_is_delivered_once_and_in_order(
-    order: list[int], again: list[int]
-) -> None:
+def test_whatever_the_order_each_is_delivered_once_and_in_order(order, again):
     arrivals: Arrivals[int] = Arrivals(0)
     delivered = [n for number in [*order, *again] for n in arrivals.take(number, number)]
     assert delivered == list(range(8))
@@ -21,7 +20,7 @@ def test_whatever_the_order_each_is_delivered_once_and_in_order(
 
 
 @given(st.sets(st.integers(0, 7)), st.integers(0, 7))
-def test_what_has_not_come_is_missing(come: set[int], newest: int) -> None:
+def test_what_has_not_come_is_missing(come, newest):
     arrivals: Arrivals[int] = Arrivals(0)
     for number in sorted(come):
         arrivals.take(number, number)
@@ -31,7 +30,7 @@ def test_what_has_not_come_is_missing(come: set[int], newest: int) -> None:
     assert arrivals.missing == ((min(lost), max(lost)) if lost else None)
 
 
-def test_a_gap_is_asked_for_after_a_while_and_again_later_and_later() -> None:
+def test_a_gap_is_asked_for_after_a_while_and_again_later_and_later():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(3, 3)
     asked = []
@@ -46,7 +45,7 @@ def test_a_gap_is_asked_for_after_a_while_and_again_later_and_later() -> None:
     assert waits == sorted(waits)
 
 
-def test_the_tail_that_only_a_heartbeat_speaks_of_is_asked_for() -> None:
+def test_the_tail_that_only_a_heartbeat_speaks_of_is_asked_for():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(0, 0)
     arrivals.know(2)
@@ -54,7 +53,7 @@ def test_the_tail_that_only_a_heartbeat_speaks_of_is_asked_for() -> None:
     assert arrivals.due(PATIENCE_S) == (1, 2)
 
 
-def test_what_waits_behind_a_gap_goes_on_after_a_while() -> None:
+def test_what_waits_behind_a_gap_goes_on_after_a_while():
     arrivals: Arrivals[int] = Arrivals(0)
     assert arrivals.take(1, 1) == arrivals.take(2, 2) == []
     arrivals.due(0.0)
@@ -64,7 +63,7 @@ def test_what_waits_behind_a_gap_goes_on_after_a_while() -> None:
     assert arrivals.take(0, 0) == [0]
 
 
-def test_what_the_publisher_has_no_more_is_gone_and_named() -> None:
+def test_what_the_publisher_has_no_more_is_gone_and_named():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(1, 1)
     arrivals.take(4, 4)
@@ -73,7 +72,7 @@ def test_what_the_publisher_has_no_more_is_gone_and_named() -> None:
     assert arrivals.lacking == [(0, 0), (2, 3)]
 
 
-def test_numbers_of_32_bits_cost_no_memory_and_no_time() -> None:
+def test_numbers_of_32_bits_cost_no_memory_and_no_time():
     """A heartbeat and a reply name them; a set of them asked for 240 GB."""
     newest = 2**32 - 2
     arrivals: Arrivals[int] = Arrivals(0)
@@ -85,9 +84,7 @@ def test_numbers_of_32_bits_cost_no_memory_and_no_time() -> None:
     assert arrivals.missing is None
 
 
-def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(monkeypatch):
     monkeypatch.setattr(module, "MOST_GAPS", 10)
     arrivals: Arrivals[int] = Arrivals(0)
     delivered = []
@@ -99,7 +96,7 @@ def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(
     assert set(range(0, 2_000, 2)) <= lost
 
 
-def test_a_number_that_the_publisher_never_had_is_unlearnt() -> None:
+def test_a_number_that_the_publisher_never_had_is_unlearnt():
     """A heartbeat of another key that came under this one: the cache's reply corrects it."""
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(0, 0)
@@ -111,7 +108,7 @@ def test_a_number_that_the_publisher_never_had_is_unlearnt() -> None:
     assert arrivals.take(1, 1) == [1]
 
 
-def test_a_heartbeat_that_comes_during_the_reply_is_not_unlearnt() -> None:
+def test_a_heartbeat_that_comes_during_the_reply_is_not_unlearnt():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(0, 0)
     arrivals.know(1)
@@ -121,9 +118,69 @@ def test_a_heartbeat_that_comes_during_the_reply_is_not_unlearnt() -> None:
     assert arrivals.lacking == [(1, 1), (2, 2)]
 
 
-def test_of_the_newest_alone_nothing_older_is_asked_for_or_waited_for() -> None:
+def test_of_the_newest_alone_nothing_older_is_asked_for_or_waited_for():
     arrivals: Arrivals[int] = Arrivals(5, in_order=False)
     assert arrivals.take(6, 6) == [6]
     assert arrivals.take(4, 4) == [4]
     arrivals.due(0.0)
     assert arrivals.due(1.0) == (5, 5)
+
+
+numbers = st.integers(-5, 40)
+pairs = st.lists(st.tuples(numbers, numbers), max_size=20)
+
+
+def both(of: list[tuple[int, int]]) -> tuple[IntervalSet, set[int]]:
+    intervals, model = IntervalSet(), set[int]()
+    for first, last in of:
+        intervals.add(first, last)
+        model |= set(range(first, last + 1))
+    return intervals, model
+
+
+def expanded(intervals: list[tuple[int, int]]) -> list[int]:
+    return [n for first, last in intervals for n in range(first, last + 1)]
+
+
+@given(pairs)
+def test_intervals_are_the_set_in_ascending_disjoint_pieces_that_do_not_touch(of):
+    intervals, model = both(of)
+    assert expanded(list(intervals)) == sorted(model)
+    assert len(intervals) == len(list(intervals)) == sum(n - 1 not in model for n in model)
+
+
+@given(pairs, numbers)
+def test_membership_and_the_nearest_absent_numbers_are_those_of_the_set(of, number):
+    intervals, model = both(of)
+    assert (number in intervals) == (number in model)
+    assert intervals.next_absent(number) == next(n for n in range(number, 99) if n not in model)
+    assert intervals.last_absent(number) == next(
+        n for n in range(number, -99, -1) if n not in model
+    )
+
+
+@given(pairs, numbers, numbers)
+def test_gaps_are_the_complement_within_their_bounds(of, first, last):
+    intervals, model = both(of)
+    gaps = intervals.gaps(first, last)
+    assert expanded(gaps) == [n for n in range(first, last + 1) if n not in model]
+    assert all(a[1] + 1 < b[0] for a, b in pairwise(gaps))
+
+
+def test_four_billion_numbers_are_one_interval():
+    intervals = IntervalSet()
+    intervals.add(0, 2**32 - 1)
+    intervals.add(2**40, 2**63)
+    assert list(intervals) == [(0, 2**32 - 1), (2**40, 2**63)]
+    assert intervals.gaps(0, 2**41) == [(2**32, 2**40 - 1)]
+
+
+@given(pairs, st.integers(1, 9))
+def test_joined_first_intervals_are_a_superset_that_keeps_the_last_ones(of, count):
+    intervals, model = both(of)
+    before = list(intervals)
+    intervals.join_first(count)
+    assert len(intervals) == min(len(before), count)
+    assert model <= set(expanded(list(intervals)))
+    assert list(intervals)[1:] == before[len(before) - len(intervals) + 1 :]
+    assert intervals.last == max(model, default=-1)

@@ -1,7 +1,7 @@
 """Contract of a bus, tested for the bus in memory and for the bus over Zenoh."""
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from itertools import count
 
@@ -31,13 +31,13 @@ TEAMS = count()
 
 
 @pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
+def endpoint():
     with router() as bound:
         yield bound
 
 
 @pytest.fixture(params=["memory", "zenoh"])
-def joined(request: pytest.FixtureRequest) -> Iterator[Joined]:
+def joined(request):
     """Each call joins one more bus to the same team."""
     with ExitStack() as stack:
         if request.param == "memory":
@@ -67,7 +67,7 @@ def until_heard(source: Bus, sink: Bus) -> None:
         pass
 
 
-def test_what_is_published_arrives_with_its_stamps_and_counter(joined: Joined) -> None:
+def test_what_is_published_arrives_with_its_stamps_and_counter(joined):
     robot, centre = joined(), joined()
     centre.subscribe(c.SUBMAP)
     send(robot, (c.SUBMAP, "alpha", submap(0)), (c.SUBMAP, "alpha", submap(1)))
@@ -77,7 +77,7 @@ def test_what_is_published_arrives_with_its_stamps_and_counter(joined: Joined) -
     assert (second.payload, second.counter) == (encoded(submap(1)), 1)
 
 
-def test_a_bus_does_not_receive_what_it_publishes(joined: Joined) -> None:
+def test_a_bus_does_not_receive_what_it_publishes(joined):
     robot, other = joined(), joined()
     robot.subscribe(c.SUBMAP)
     send(robot, (c.SUBMAP, "alpha", submap(0)))
@@ -85,7 +85,7 @@ def test_a_bus_does_not_receive_what_it_publishes(joined: Joined) -> None:
     assert [sample.key for sample in received(robot, 1)] == ["robot/bravo/submap"]
 
 
-def test_a_subscription_by_name_hears_that_robot_only(joined: Joined) -> None:
+def test_a_subscription_by_name_hears_that_robot_only(joined):
     source, sink = joined(), joined()
     sink.subscribe(c.SUBMAP, "bravo")
     send(source, (c.SUBMAP, "alpha", submap(0)), (c.SUBMAP, "bravo", submap(1, "bravo")))
@@ -93,7 +93,7 @@ def test_a_subscription_by_name_hears_that_robot_only(joined: Joined) -> None:
     assert sink.receive(0.0) == []
 
 
-def test_a_node_channel_hears_nodes_of_any_depth(joined: Joined) -> None:
+def test_a_node_channel_hears_nodes_of_any_depth(joined):
     source, sink = joined(), joined()
     sink.subscribe(c.STATUS)
     for node in ("central", "robot/alpha"):
@@ -101,7 +101,7 @@ def test_a_node_channel_hears_nodes_of_any_depth(joined: Joined) -> None:
     assert {sample.key for sample in received(sink, 2)} == {"central/status", "robot/alpha/status"}
 
 
-def test_subscribing_twice_delivers_once(joined: Joined) -> None:
+def test_subscribing_twice_delivers_once(joined):
     source, sink = joined(), joined()
     for name in ("*", "alpha", "*"):
         sink.subscribe(c.SUBMAP, name)
@@ -110,7 +110,7 @@ def test_subscribing_twice_delivers_once(joined: Joined) -> None:
     assert sink.receive(0.1) == []
 
 
-def test_a_late_joiner_gets_every_message_of_an_all_channel(joined: Joined) -> None:
+def test_a_late_joiner_gets_every_message_of_an_all_channel(joined):
     source = joined()
     send(source, *[(c.SUBMAP, "alpha", submap(i)) for i in range(600)])
     late = joined()
@@ -118,7 +118,7 @@ def test_a_late_joiner_gets_every_message_of_an_all_channel(joined: Joined) -> N
     assert [sample.counter for sample in received(late, 600)] == list(range(600))
 
 
-def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joined) -> None:
+def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined):
     source = joined()
     for i in range(5):
         send(
@@ -134,7 +134,7 @@ def test_a_late_joiner_gets_the_newest_message_of_a_latest_channel(joined: Joine
     assert [sample.counter for sample in received(late, 1)] == [4]
 
 
-def test_a_late_joiner_gets_nothing_of_a_stream(joined: Joined) -> None:
+def test_a_late_joiner_gets_nothing_of_a_stream(joined):
     source, late = joined(), joined()
     send(source, (c.ODOMETRY, "alpha", odometry(0)))
     late.subscribe(c.ODOMETRY, "alpha")
@@ -143,7 +143,7 @@ def test_a_late_joiner_gets_nothing_of_a_stream(joined: Joined) -> None:
     assert [sample.counter for sample in received(late, 1)] == [1]
 
 
-def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
+def test_order_holds_across_keys_and_deliveries(joined):
     source, sink = joined(), joined()
     for channel in (c.SUBMAP, c.ROBOT_PROGRESS, c.ODOMETRY):
         sink.subscribe(channel, "alpha")
@@ -163,7 +163,7 @@ def test_order_holds_across_keys_and_deliveries(joined: Joined) -> None:
     ]
 
 
-def test_a_raw_sample_keeps_its_bytes_and_stamps(joined: Joined) -> None:
+def test_a_raw_sample_keeps_its_bytes_and_stamps(joined):
     source, sink = joined(), joined()
     sink.subscribe(c.SUBMAP)
     sample = Sample("robot/alpha/submap", b"not even msgpack", -7, 1_234, 99)
@@ -171,7 +171,7 @@ def test_a_raw_sample_keeps_its_bytes_and_stamps(joined: Joined) -> None:
     assert received(sink, 1) == [sample]
 
 
-def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
+def test_a_question_gets_all_its_answers_in_order(joined):
     centre, robot = joined(), joined()
 
     def answer(request: bytes) -> Iterable[bytes]:
@@ -183,18 +183,18 @@ def test_a_question_gets_all_its_answers_in_order(joined: Joined) -> None:
     assert got == [encoded(submap(i, "bravo")) for i in range(300)]
 
 
-def test_one_answer_can_serve_every_name(joined: Joined) -> None:
+def test_one_answer_can_serve_every_name(joined):
     world, robot = joined(), joined()
     world.answer(c.MEASUREMENTS, "*", lambda request: [request])
     wanted = build.measurements_request(robot="bravo", incarnation=0, first=1, last=2)
     assert asked(robot, world, c.MEASUREMENTS, "bravo", wanted) == [encoded(wanted)]
 
 
-def test_a_question_that_nobody_answers_has_no_answers(joined: Joined) -> None:
+def test_a_question_that_nobody_answers_has_no_answers(joined):
     assert joined().ask(c.SUBMAPS, "", build.submaps_request(robot="alpha"), 5.0) == []
 
 
-def test_an_answer_that_fails_is_told_to_the_asker(joined: Joined) -> None:
+def test_an_answer_that_fails_is_told_to_the_asker(joined):
     centre, robot = joined(), joined()
 
     def answer(request: bytes) -> Iterable[bytes]:
@@ -226,7 +226,7 @@ def asked(
     return replies
 
 
-def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined: Joined) -> None:
+def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined):
     early, watcher = joined(), joined()
     early.declare_alive("world")
     watcher.declare_alive("central")
@@ -243,7 +243,7 @@ def test_tokens_are_seen_as_they_appear_and_go_and_never_ones_own(joined: Joined
     ]
 
 
-def test_who_holds_a_token_can_be_asked_for(joined: Joined) -> None:
+def test_who_holds_a_token_can_be_asked_for(joined):
     asker, robot = joined(), joined()
     assert not asker.is_alive("robot/alpha")
     robot.declare_alive("robot/alpha")
@@ -253,7 +253,7 @@ def test_who_holds_a_token_can_be_asked_for(joined: Joined) -> None:
     wait_until(lambda: not asker.is_alive("robot/alpha"))
 
 
-def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
+def test_replies_to_a_request_come_with_what_arrives(joined):
     centre, robot = joined(), joined()
     answered = [encoded(submap(i)) for i in range(30)]
     robot.answer(c.SENT, "alpha", lambda request: answered)
@@ -273,6 +273,6 @@ def test_replies_to_a_request_come_with_what_arrives(joined: Joined) -> None:
 
 
 @pytest.mark.parametrize("reply", [encoded(submap(0, "bravo")), encoded(odometry(0)), b"\xc1"])
-def test_what_is_no_reply_to_the_question_is_dropped(reply: bytes) -> None:
+def test_what_is_no_reply_to_the_question_is_dropped(reply):
     with pytest.raises(WireError):
         replied(c.SENT, "alpha", reply, 0)

@@ -15,7 +15,7 @@ def sample(key: str, message: m.Message) -> Sample:
 
 
 @pytest.mark.parametrize("channel", c.CHANNELS, ids=lambda channel: channel.name)
-def test_every_key_leads_back_to_its_channel_and_name(channel: c.Channel) -> None:
+def test_every_key_leads_back_to_its_channel_and_name(channel):
     name = (
         "robot/alpha"
         if "{node}" in channel.template
@@ -29,31 +29,31 @@ def test_every_key_leads_back_to_its_channel_and_name(channel: c.Channel) -> Non
         assert c.channel_of(channel.key(name)) == (channel, name)
 
 
-def test_no_two_channels_share_a_name_or_a_key() -> None:
+def test_no_two_channels_share_a_name_or_a_key():
     assert len({channel.name for channel in c.CHANNELS}) == len(c.CHANNELS)
     assert len({channel.template for channel in c.CHANNELS}) == len(c.CHANNELS)
 
 
-def test_a_message_is_opened_with_its_channel_and_robot() -> None:
+def test_a_message_is_opened_with_its_channel_and_robot():
     assert opened(sample("robot/alpha/submap", submap(3))) == (c.SUBMAP, "alpha", submap(3))
 
 
-def test_a_key_that_no_channel_has_is_refused() -> None:
+def test_a_key_that_no_channel_has_is_refused():
     with pytest.raises(WireError, match="no channel has the key 'robot/alpha/gossip'"):
         opened(sample("robot/alpha/gossip", submap(0)))
 
 
-def test_a_robots_message_on_another_robots_key_is_refused() -> None:
+def test_a_robots_message_on_another_robots_key_is_refused():
     with pytest.raises(WireError, match="a message of 'alpha' on the key 'robot/bravo/submap'"):
         opened(sample("robot/bravo/submap", submap(0, "alpha")))
 
 
-def test_a_message_on_another_channels_key_is_refused() -> None:
+def test_a_message_on_another_channels_key_is_refused():
     with pytest.raises(WireError, match="wrong tag: 'odometry/1' where 'submap/1' belongs"):
         opened(sample("robot/alpha/submap", odometry(0)))
 
 
-def test_a_view_is_of_its_row_and_is_opened_by_nobody() -> None:
+def test_a_view_is_of_its_row_and_is_opened_by_nobody():
     assert c.VIEW.owner("view/particles/alpha") == "particles/alpha"
     assert view_of("view/particles/alpha") is PARTICLES
     assert view_of("view/nothing") is None

@@ -1,10 +1,11 @@
-"""The door: golden bytes, round trips, and what hostile bytes come to."""
+"""Payloads: golden bytes, structure, values, attachments."""
 
 import contextlib
 import json
 import struct
 import time
 import tracemalloc
+from typing import Any
 
 import msgpack
 import msgspec
@@ -14,11 +15,21 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from teamslam.team.config import UNNAMED
+from teamslam.team.core import check_packed_covariance, check_pose_covariance
 from teamslam.team.wire import messages as m
+from teamslam.team.wire import structure
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.channels import OBSERVATIONS
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
-from teamslam.team.wire.structure import MOST_VALUES, SMALL
+from teamslam.team.wire.structure import (
+    DEEPEST,
+    MOST_VALUES,
+    SMALL,
+    StructureError,
+    check_structure,
+    read_tag,
+)
+from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from tests import build
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 
@@ -37,22 +48,22 @@ def fields_of(message: m.Message) -> list[object]:
 
 
 @pytest.mark.parametrize("tag", sorted(m.BY_TAG))
-def test_each_message_has_its_golden_bytes(tag: str) -> None:
+def test_each_message_has_its_golden_bytes(tag):
     assert encoded(EXAMPLES[tag]).hex() == GOLDEN[tag]
 
 
 @pytest.mark.parametrize("tag", sorted(GOLDEN))
-def test_golden_bytes_are_still_understood(tag: str) -> None:
+def test_golden_bytes_are_still_understood(tag):
     assert decoded(bytes.fromhex(GOLDEN[tag])) == EXAMPLES[tag]
 
 
 @pytest.mark.parametrize("tag", sorted(m.BY_TAG))
-def test_plain_msgpack_reads_the_tag_and_the_stamp_first(tag: str) -> None:
+def test_plain_msgpack_reads_the_tag_and_the_stamp_first(tag):
     assert fields_of(EXAMPLES[tag])[:2] == [tag, EXAMPLES[tag].stamp_ns]
 
 
 @pytest.mark.parametrize("tag", sorted(m.BY_TAG))
-def test_appended_fields_are_ignored(tag: str) -> None:
+def test_appended_fields_are_ignored(tag):
     longer = msgpack.packb([*fields_of(EXAMPLES[tag]), "a later field", 7])
     assert decoded(longer) == EXAMPLES[tag]
 
@@ -65,20 +76,18 @@ def test_appended_fields_are_ignored(tag: str) -> None:
         *((submap(0), later) for later in (1, 4, 5, 7, 9)),
     ],
 )
-def test_a_message_from_before_its_later_fields_has_their_defaults(
-    message: m.Message, later: int
-) -> None:
+def test_a_message_from_before_its_later_fields_has_their_defaults(message, later):
     assert decoded(msgpack.packb(fields_of(message)[:-later])) == message
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([0.1, 0.0, 0.2]), np.ones((3, 3))])
-def test_a_motion_may_be_exact_in_some_direction(matrix: np.ndarray) -> None:
+def test_a_motion_may_be_exact_in_some_direction(matrix):
     fields = fields_of(EXAMPLES["increment/1"])
     fields[-1] = from_floats(matrix)
     assert decoded(msgpack.packb(fields), m.Increment).covariance == from_floats(matrix)
 
 
-def test_a_number_of_numpy_is_encoded_as_the_float_that_it_is() -> None:
+def test_a_number_of_numpy_is_encoded_as_the_float_that_it_is():
     """An estimate computed of arrays is one; a valid increment of huge numbers gave it."""
     plain = EXAMPLES["innovation/1"]
     computed = msgspec.structs.replace(plain, squared=np.float64(plain.squared))
@@ -87,7 +96,7 @@ def test_a_number_of_numpy_is_encoded_as_the_float_that_it_is() -> None:
         encoded(msgspec.structs.replace(plain, squared=np.zeros(2)))
 
 
-def test_a_key_of_several_kinds_takes_them_and_names_them_for_another() -> None:
+def test_a_key_of_several_kinds_takes_them_and_names_them_for_another():
     kinds = OBSERVATIONS.kinds
     for tag in ("observations/1", "points/1", "detections/1"):
         payload = encoded(EXAMPLES[tag])
@@ -99,7 +108,7 @@ def test_a_key_of_several_kinds_takes_them_and_names_them_for_another() -> None:
         decoded(msgpack.packb(["detections/9"]), *kinds)
 
 
-def test_no_tag_is_read_where_there_is_none() -> None:
+def test_no_tag_is_read_where_there_is_none():
     assert [tag_in(data) for data in (b"", b"\x98", b"\x98\x01\x02")] == ["", "", ""]
 
 
@@ -249,13 +258,11 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("wrong field", msgpack.packb(fields_of(SUBMAP)[:-11]), None),
     ],
 )
-def test_an_unsound_payload_is_refused_for_its_reason(
-    reason: str, payload: bytes, expected: type[m.Message] | None
-) -> None:
+def test_an_unsound_payload_is_refused_for_its_reason(reason, payload, expected):
     assert reason_of(payload, expected) == reason
 
 
-def test_a_payload_beyond_the_limit_is_refused_unread() -> None:
+def test_a_payload_beyond_the_limit_is_refused_unread():
     assert reason_of(b"\x91" * (LARGEST_PAYLOAD + 1)) == "too large"
 
 
@@ -276,9 +283,7 @@ BOMBS = {
 
 @pytest.mark.parametrize("name", BOMBS)
 @pytest.mark.parametrize("kind", [m.Status, m.SetSummary, m.Submap, None], ids=str)
-def test_a_payload_of_many_values_takes_no_more_than_its_size_and_is_refused_at_once(
-    name: str, kind: type[m.Message] | None
-) -> None:
+def test_a_payload_of_many_values_takes_no_more_than_its_size_and_is_refused_at_once(name, kind):
     payload = BOMBS[name]
     began = time.process_time()
     tracemalloc.start()
@@ -292,7 +297,7 @@ def test_a_payload_of_many_values_takes_no_more_than_its_size_and_is_refused_at_
     assert time.process_time() - began < 5.0
 
 
-def test_an_error_names_the_field() -> None:
+def test_an_error_names_the_field():
     with pytest.raises(WireError, match=r"not ascending: Submap\.ids"):
         decoded(with_fields(SUBMAP, ids=from_ids([7, 4])))
 
@@ -309,9 +314,7 @@ def test_an_error_names_the_field() -> None:
     ),
 )
 @example("pose/1", [(0.9, "f", b"\x7f")])
-def test_mutated_payloads_give_a_message_or_a_wire_error(
-    tag: str, mutations: list[tuple[float, str, bytes]]
-) -> None:
+def test_mutated_payloads_give_a_message_or_a_wire_error(tag, mutations):
     payload = bytearray(encoded(EXAMPLES[tag]))
     for where, how, data in mutations:
         i = int(where * len(payload))
@@ -330,10 +333,173 @@ def test_mutated_payloads_give_a_message_or_a_wire_error(
 
 @settings(deadline=None)
 @given(st.binary(max_size=200))
-def test_noise_is_never_a_message(payload: bytes) -> None:
+def test_noise_is_never_a_message(payload):
     with pytest.raises(WireError):
         decoded(payload)
 
 
-def test_the_examples_cover_every_message() -> None:
+def test_the_examples_cover_every_message():
     assert set(EXAMPLES) == set(m.BY_TAG) == set(GOLDEN)
+
+
+scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(-1e30, 1e30)
+leaves = scalars | st.text(max_size=300) | st.binary(max_size=300)
+values = st.recursive(
+    leaves,
+    lambda inner: (
+        st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20)
+    ),
+    max_leaves=40,
+)
+
+
+def count(value: Any) -> int:
+    if isinstance(value, dict):
+        return 1 + sum(1 + count(each) for each in value.values())
+    return 1 + sum(map(count, value)) if isinstance(value, list) else 1
+
+
+def depth(value: Any) -> int:
+    if isinstance(value, dict):
+        value = list(value.values())
+    inner = value if isinstance(value, list) else None
+    return 0 if inner is None else 1 + max(map(depth, inner), default=0)
+
+
+def reason_of_structure(payload: bytes) -> str:
+    with pytest.raises(StructureError) as refused:
+        check_structure(payload)
+    return refused.value.reason
+
+
+@given(values, st.booleans())
+def test_every_value_is_counted_and_its_end_found(value, single):
+    payload = msgpack.packb(value, use_single_float=single)
+    check_structure(payload)
+    check_structure(payload + b"\xc1")
+    for cut in {0, len(payload) // 2, len(payload) - 1}:
+        assert reason_of_structure(payload[:cut]) == "truncated"
+
+
+@given(values, st.integers(1, 40))
+def test_more_values_than_the_most_are_too_many(value, most):
+    payload = msgpack.packb(value)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(structure, "MOST_VALUES", most)
+        if count(value) > most:
+            assert reason_of_structure(payload) == "too large"
+        else:
+            check_structure(payload)
+
+
+@pytest.mark.parametrize("nested", range(DEEPEST - 2, DEEPEST + 3))
+def test_nesting_is_bounded(nested):
+    payload = b"\x91" * nested + b"\xc0"
+    if nested < DEEPEST:
+        check_structure(payload)
+    else:
+        assert reason_of_structure(payload) == "too deep"
+
+
+@given(st.binary(max_size=200))
+def test_noise_is_read_or_refused(payload):
+    for read in (check_structure, read_tag):
+        with contextlib.suppress(StructureError):
+            read(payload)
+
+
+def test_no_message_is_near_the_bounds_and_each_has_its_tag():
+    deepest = 0
+    for message in examples():
+        payload = encoded(message)
+        check_structure(payload)
+        assert read_tag(payload) == type(message).__struct_config__.tag
+        deepest = max(deepest, depth(msgpack.unpackb(payload)))
+    assert 2 * deepest <= DEEPEST
+
+
+@pytest.mark.parametrize(
+    "head", [b"\x91\xa3x/1", b"\xdc\x00\x01\xa3x/1", b"\xdd\x00\x00\x00\x01\xa3x/1",
+             b"\x91\xd9\x03x/1", b"\x91\xda\x00\x03x/1", b"\x91\xdb\x00\x00\x00\x03x/1"]
+)  # fmt: skip
+def test_a_tag_is_read_in_every_form_of_an_array_and_a_text(head):
+    assert read_tag(head) == msgpack.unpackb(head)[0] == "x/1"
+    for cut in range(len(head)):
+        with pytest.raises(StructureError):
+            read_tag(head[:cut])
+
+
+def verdict(check, *arguments):
+    try:
+        check(*arguments)
+    except ValueError as error:
+        return str(error).partition(":")[0]
+    return "sound"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_symmetric_pose_covariance_is_judged_as_a_packed_one_of_three_rows_is(seed):
+    rng = np.random.default_rng(seed)
+    scale = np.diag(10.0 ** rng.uniform(-100.0, 100.0, 3))
+    root = rng.normal(size=(3, 3))
+    P = root @ root.T
+    for matrix in (P, P - 0.5 * np.eye(3), root[:, :2] @ root[:, :2].T - 1e-6 * np.eye(3), -P):
+        scaled = scale @ (0.5 * (matrix + matrix.T)) @ scale
+        packed = from_floats(scaled[np.triu_indices(3)])
+        expected = verdict(check_packed_covariance, packed, 3, "it")
+        assert verdict(check_pose_covariance, from_floats(scaled), "it") == expected
+
+
+@pytest.mark.parametrize("place", [(0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1)])
+def test_symmetry_is_judged_by_the_standard_deviations(place):
+    sigmas = np.array([1e-3, 10.0, 0.1])
+    P = np.outer(sigmas, sigmas) * (0.3 + 0.7 * np.eye(3))
+    for by, expected in ((5e-10, "sound"), (2e-9, "not symmetric")):
+        other = P.copy()
+        other[place] += by * sigmas[place[0]] * sigmas[place[1]]
+        assert verdict(check_pose_covariance, from_floats(other), "it") == expected
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", range(9))
+def test_no_entry_of_a_pose_covariance_is_infinite_or_no_number(value, place):
+    P = np.eye(3).ravel()
+    P[place] = value
+    assert verdict(check_pose_covariance, from_floats(P), "it") == "not finite"
+
+
+KEY = "team/t/robot/r1/submap"
+GOLDEN_ATTACHMENT = bytes.fromhex(
+    "0100000000000000feffffffffffffff0300000000000000496a1b39ffcf6e5c"
+)
+"""Attachment of team time 1 ns, wall clock -2 ns and counter 3 on `KEY`."""
+stamps = st.integers(-(2**63), 2**63 - 1)
+
+
+def test_the_bytes_are_golden():
+    assert pack(KEY, Attachment(1, -2, 3)) == GOLDEN_ATTACHMENT
+
+
+@given(st.text(st.characters(codec="utf-8")), st.builds(Attachment, stamps, stamps, stamps))
+def test_an_attachment_comes_back_on_its_key(key, attachment):
+    assert unpack(key, pack(key, attachment)) == attachment
+
+
+@given(st.binary(max_size=64))
+def test_noise_is_no_attachment(data):
+    with pytest.raises(AttachmentError):
+        unpack(KEY, data)
+
+
+@pytest.mark.parametrize(
+    "other",
+    ["team/t/robot/r1/team/pose", "team/t/robot/r2/submap", "team/u/robot/r1/submap"],
+)
+def test_an_attachment_of_another_key_is_refused(other):
+    with pytest.raises(AttachmentError, match="another key"):
+        unpack(other, GOLDEN_ATTACHMENT)
+
+
+def test_an_attachment_of_an_earlier_version_is_named_as_one():
+    with pytest.raises(AttachmentError, match="an older version"):
+        unpack(KEY, struct.pack("<qqq", 1, 2, 3))

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -144,16 +143,16 @@ def code_of(page: str, language: str) -> str:
 
 
 @pytest.mark.parametrize("table", [channel_table, query_table, view_table, message_list])
-def test_the_page_has_the_tables_of_the_code(table: Callable[[], str]) -> None:
+def test_the_page_has_the_tables_of_the_code(table):
     assert table() in PAGE.read_text()
 
 
-def test_the_page_has_the_common_fields_of_each_type() -> None:
+def test_the_page_has_the_common_fields_of_each_type():
     rows = re.findall(r"^\| ([A-Za-z]+) \| [^|]+ \| (`.+) \|$", PAGE.read_text(), re.MULTILINE)
     assert dict(rows) == fields_by_type()
 
 
-def test_the_pages_program_reads_a_submap_from_a_live_team() -> None:
+def test_the_pages_program_reads_a_submap_from_a_live_team():
     program = code_of(PAGE.read_text(), "python")
     assert len(program.splitlines()) <= 20
     with router() as endpoint, ZenohBus("demo", endpoint) as bus:
@@ -169,7 +168,7 @@ def test_the_pages_program_reads_a_submap_from_a_live_team() -> None:
     ]
 
 
-def test_the_pages_example_bytes_are_those_of_the_code() -> None:
+def test_the_pages_example_bytes_are_those_of_the_code():
     assert encoded(
         build.odometry(
             stamp_ns=1_000,

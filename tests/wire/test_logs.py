@@ -2,8 +2,6 @@
 
 import logging
 
-import pytest
-
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import logs
@@ -17,22 +15,20 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"
 PRINTABLE = r"\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\x0d\x0a[  1.0 s] forged line"
 
 
-def test_a_hostile_text_is_one_printable_line() -> None:
+def test_a_hostile_text_is_one_printable_line():
     assert one_line(HOSTILE) == PRINTABLE
     assert one_line("σ = 0.1 m, 12 %, “a” – b…") == "σ = 0.1 m, 12 %, “a” – b…"
     assert lines("one\ntwo\x1b") == "one\ntwo\\x1b"
 
 
-def test_a_log_line_is_escaped_whoever_formats_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_log_line_is_escaped_whoever_formats_it(caplog):
     logging.getLogger("teamslam").warning("%s: dropped", HOSTILE + "x" * 100_000)
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith(PRINTABLE)
     assert len(caplog.messages[0]) <= logs.LONGEST
 
 
-def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(
-    request: pytest.FixtureRequest, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(request, caplog):
     now, made = [1000.0], logging.getLogRecordFactory()
 
     def record(*arguments: object, **named: object) -> logging.LogRecord:
@@ -62,7 +58,7 @@ def hostile_fault() -> m.Fault:
     return build.fault(count=1, **texts)
 
 
-def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without() -> None:
+def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without():
     sample = Sample(ch.STATUS.key("robot/r1"), encoded(hostile_status()), 0, 0, 0)
     _, _, message = shown(sample)
     assert isinstance(message, m.Status)
@@ -75,7 +71,7 @@ def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message
     assert shown(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "is data, not words"
 
 
-def test_a_launch_keeps_no_control_character_of_others_for_its_terminal() -> None:
+def test_a_launch_keeps_no_control_character_of_others_for_its_terminal():
     network = MemoryNetwork()
     robot, bus, watch = MemoryBus(network), MemoryBus(network), Watch()
     bus.subscribe(ch.STATUS)

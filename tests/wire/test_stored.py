@@ -39,7 +39,7 @@ def of(
     return [replied(ch.KEPT, "", reply, 0) for reply in stored.answer(request, now_s)]
 
 
-def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone() -> None:
+def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone():
     stored = StoredMessages()
     stored.token("robot/r1", alive=True)
     stored.token("world", alive=True)
@@ -54,7 +54,7 @@ def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone() -> None:
     assert of(stored, *ch.ORDERS) == []
 
 
-def test_a_robots_own_end_takes_nothing_from_the_team() -> None:
+def test_a_robots_own_end_takes_nothing_from_the_team():
     """Its author stays who it is: no order falls, and the centre's final map stays what it is."""
     stored = StoredMessages()
     stored.token("robot/r2", alive=True)
@@ -81,7 +81,7 @@ def test_a_robots_own_end_takes_nothing_from_the_team() -> None:
     ],
     ids=["garbage", "not final", "another type", "no counter", "of another robot"],
 )
-def test_what_is_no_valid_end_does_not_hide_the_true_one(wrong: Sample) -> None:
+def test_what_is_no_valid_end_does_not_hide_the_true_one(wrong):
     stored = StoredMessages()
     true = sample(ch.FINAL_MAP, "", FINAL), sample(ch.CONCLUDED, CONCLUDED.robot, CONCLUDED)
     for each in true:
@@ -91,7 +91,7 @@ def test_what_is_no_valid_end_does_not_hide_the_true_one(wrong: Sample) -> None:
     assert of(stored, *ch.ENDS, now_s=1.0, run_s=9.0) == [*true]
 
 
-def test_who_never_announced_its_end_has_missed_the_teams_until_it_does() -> None:
+def test_who_never_announced_its_end_has_missed_the_teams_until_it_does():
     """To ask in another node's name takes nothing from that node."""
     stored = StoredMessages()
     for node in ("killed", "well", "late"):
@@ -109,7 +109,7 @@ def test_who_never_announced_its_end_has_missed_the_teams_until_it_does() -> Non
     assert of(stored, *ch.ENDS, now_s=13.0, node="killed") == []
 
 
-def test_an_end_is_sent_to_whose_run_is_older() -> None:
+def test_an_end_is_sent_to_whose_run_is_older():
     stored = StoredMessages()
     final = sample(ch.FINAL_MAP, "", FINAL)
     stored.take(final, 10.0)
@@ -117,7 +117,7 @@ def test_an_end_is_sent_to_whose_run_is_older() -> None:
     assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=3.1) == [final]
 
 
-def test_of_more_than_a_team_has_the_first_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_more_than_a_team_has_the_first_are_kept(monkeypatch):
     monkeypatch.setattr(stored_module, "MOST_ORDERS", 3)
     monkeypatch.setattr(stored_module, "MOST_ENDS", 2)
     stored = StoredMessages()
@@ -128,7 +128,7 @@ def test_of_more_than_a_team_has_the_first_are_kept(monkeypatch: pytest.MonkeyPa
     assert [each.key[6:8] for each in of(stored, ch.TEAM_FINAL, run_s=1.0)] == ["r0", "r1"]
 
 
-def test_every_order_of_an_operator_is_stored_with_its_signature() -> None:
+def test_every_order_of_an_operator_is_stored_with_its_signature():
     assert {c for c in ch.CHANNELS if c.template.startswith("operator/")} == set(ch.ORDERS)
     stored = StoredMessages()
     for channel in ch.ORDERS:
@@ -141,7 +141,7 @@ def test_every_order_of_an_operator_is_stored_with_its_signature() -> None:
         assert of(stored, channel) == [given]
 
 
-def test_the_router_can_not_be_made_to_reply_with_another_channel() -> None:
+def test_the_router_can_not_be_made_to_reply_with_another_channel():
     kept = m.Kept(
         stamp_ns=0, key="central/end", wall_ns=0, counter=0,
         payload=encoded(build.team_end(reason="so")),

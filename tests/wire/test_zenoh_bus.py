@@ -4,7 +4,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -41,7 +40,7 @@ FINAL = example(m.FusedMap)
 
 
 @pytest.fixture
-def endpoint() -> Iterator[str]:
+def endpoint():
     with router() as bound:
         yield bound
 
@@ -76,7 +75,7 @@ def counters(samples: list[Sample], key: str) -> list[int]:
     return [sample.counter for sample in samples if sample.key == key]
 
 
-def test_what_was_published_before_close_reaches_a_reader_that_is_slow(endpoint: str) -> None:
+def test_what_was_published_before_close_reaches_a_reader_that_is_slow(endpoint):
     """A session drops what its link has not sent about a second after its close."""
     arrived: list[int] = []
 
@@ -103,7 +102,7 @@ def test_what_was_published_before_close_reaches_a_reader_that_is_slow(endpoint:
 
 
 @pytest.mark.parametrize("behind", ["source", "sink"])
-def test_a_cut_link_loses_nothing_but_streams(endpoint: str, behind: str) -> None:
+def test_a_cut_link_loses_nothing_but_streams(endpoint, behind):
     with (
         Link(endpoint) as link,
         ZenohBus("t", link.endpoint if behind == "source" else endpoint) as source,
@@ -124,7 +123,7 @@ def test_a_cut_link_loses_nothing_but_streams(endpoint: str, behind: str) -> Non
     assert counters(arrived, "robot/bravo/submap") == [0]
 
 
-def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint: str) -> None:
+def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint):
     with (
         Link(endpoint) as link,
         ZenohBus("t", endpoint) as source,
@@ -146,7 +145,7 @@ def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint: s
     assert counters(arrived, "central/map") == [*range(10), *range(10 + MORE, i + 2)]
 
 
-def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None:
+def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint):
     with (
         Link(endpoint) as link,
         ZenohBus("t", link.endpoint) as source,
@@ -165,7 +164,7 @@ def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint: str) -> None
         assert [sample.key for sample in received(sink, 1)] == ["robot/alpha/done"]
 
 
-def test_a_killed_process_loses_its_token(endpoint: str) -> None:
+def test_a_killed_process_loses_its_token(endpoint):
     program = (
         "import sys; from teamslam.team.wire.zenoh.bus import ZenohBus\n"
         f"bus = ZenohBus('t', {endpoint!r}); bus.declare_alive('robot/alpha')\n"
@@ -191,7 +190,7 @@ def python(program: str) -> subprocess.Popen[str]:
     )
 
 
-def test_a_process_that_dies_of_an_exception_ends(endpoint: str) -> None:
+def test_a_process_that_dies_of_an_exception_ends(endpoint):
     program = (
         "from teamslam.team.wire import channels as c\n"
         "from teamslam.team.wire.zenoh.bus import ZenohBus\n"
@@ -203,20 +202,18 @@ def test_a_process_that_dies_of_an_exception_ends(endpoint: str) -> None:
         "raise RuntimeError('of an exception')"
     )
     with ZenohBus("t", endpoint) as source, python(program) as child:
-        assert child.stdout is not None
         assert child.stdout.readline() == "ready\n"
         end = time.monotonic() + 30.0
         while child.poll() is None and time.monotonic() < end:  # traffic while it goes down
             source.publish(Outgoing(c.ODOMETRY, "alpha", odometry(0)))
         gone = child.poll()
         child.kill()
-        assert child.stderr is not None
         told = child.stderr.read()
     assert gone == 1
     assert told.endswith("RuntimeError: of an exception\n")
 
 
-def test_nobody_at_the_endpoint_is_an_error_that_says_what_to_do() -> None:
+def test_nobody_at_the_endpoint_is_an_error_that_says_what_to_do():
     with (
         nobody_listens() as free,
         pytest.raises(BusError, match=f"no router answers at {free}.*start `teamslam router`"),
@@ -224,7 +221,7 @@ def test_nobody_at_the_endpoint_is_an_error_that_says_what_to_do() -> None:
         ZenohBus("t", free, patience_s=0.3)
 
 
-def test_a_client_waits_for_a_router_that_starts_later() -> None:
+def test_a_client_waits_for_a_router_that_starts_later():
     with router() as free:
         pass
     joined: list[ZenohBus] = []
@@ -235,12 +232,12 @@ def test_a_client_waits_for_a_router_that_starts_later() -> None:
         joined[0].close()
 
 
-def test_a_taken_port_is_an_error_that_names_it(endpoint: str) -> None:
+def test_a_taken_port_is_an_error_that_names_it(endpoint):
     with pytest.raises(BusError, match=f"can not listen at {endpoint}"), router(endpoint):
         pass
 
 
-def test_teams_do_not_hear_each_other(endpoint: str) -> None:
+def test_teams_do_not_hear_each_other(endpoint):
     with ZenohBus("a", endpoint) as a, ZenohBus("b", endpoint) as b, ZenohBus("a", endpoint) as own:
         own.subscribe(c.SUBMAP)
         b.publish(Outgoing(c.SUBMAP, "bravo", submap(0, "bravo")))
@@ -248,7 +245,7 @@ def test_teams_do_not_hear_each_other(endpoint: str) -> None:
         assert [sample.key for sample in received(own, 1)] == ["robot/alpha/submap"]
 
 
-def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
+def test_an_answer_that_never_comes_is_an_error(endpoint):
     with ZenohBus("t", endpoint) as silent, ZenohBus("t", endpoint) as asker:
         silent.answer(c.SUBMAPS, "", lambda request: [])
 
@@ -262,21 +259,19 @@ def test_an_answer_that_never_comes_is_an_error(endpoint: str) -> None:
         wait_until(timed_out)
 
 
-def test_a_payload_beyond_the_limit_is_not_sent(endpoint: str) -> None:
+def test_a_payload_beyond_the_limit_is_not_sent(endpoint):
     with ZenohBus("t", endpoint) as bus, pytest.raises(BusError, match="split the map"):
         bus.publish_raw(Sample("robot/alpha/submap", bytes(LARGEST_PAYLOAD + 1), 0, 0, 0))
 
 
-def test_the_largest_payload_arrives(endpoint: str) -> None:
+def test_the_largest_payload_arrives(endpoint):
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         flowing(source, sink, c.FUSED_MAP)
         source.publish_raw(Sample("central/map", bytes(LARGEST_PAYLOAD), 0, 0, 0))
         assert [len(sample.payload) for sample in received(sink, 1)] == [LARGEST_PAYLOAD]
 
 
-def test_a_publication_without_its_attachment_is_dropped_and_logged(
-    endpoint: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_publication_without_its_attachment_is_dropped_and_logged(endpoint, caplog):
     config = zenoh.Config.from_json5(
         f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
         "scouting: {multicast: {enabled: false}}}"
@@ -308,9 +303,7 @@ OTHER = "robot/alpha/sighting_factor"
     ],
     ids=["another key", "another team", "no hash"],
 )
-def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(
-    endpoint: str, caplog: pytest.LogCaptureFixture, beside: bytes, why: str
-) -> None:
+def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(endpoint, caplog, beside, why):
     caplog.set_level("INFO")
     key = "robot/alpha/submap"
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
@@ -333,9 +326,7 @@ def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(
     assert why in caplog.text
 
 
-def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(endpoint, monkeypatch):
     """The first arrival of the second submap is as Zenoh delivered some after a cut."""
     misled: list[str] = []
 
@@ -355,9 +346,7 @@ def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(
         assert sink.lacking() == {}
 
 
-def test_a_heartbeat_on_half_a_key_is_nobodys(
-    endpoint: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
     """As Zenoh passed one on when links of fifty robots had been cut: two robots died of it."""
     caplog.set_level("INFO")
     with ZenohBus("t", endpoint) as bus, client(endpoint, 5.0, None) as stranger:
@@ -377,7 +366,7 @@ def test_a_heartbeat_on_half_a_key_is_nobodys(
     assert "asked for" not in caplog.text
 
 
-def test_on_a_key_of_no_channel_nothing_is_missing(endpoint: str) -> None:
+def test_on_a_key_of_no_channel_nothing_is_missing(endpoint):
     """As Zenoh composed it of two when links had been cut: it is handed on, and that is all."""
     with client(endpoint, 5.0, None) as session:
         publisher = zenoh.SourceInfo(session.declare_publisher("any").id, 390)
@@ -391,8 +380,8 @@ def test_on_a_key_of_no_channel_nothing_is_missing(endpoint: str) -> None:
 
 
 def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    endpoint, monkeypatch, caplog
+):
     """Keys and publishers are names from the wire; what is beyond the bound is not requested."""
     asked: list[tuple[str, str]] = []
     monkeypatch.setattr(
@@ -417,7 +406,7 @@ def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
         assert len(set(asked)) == 15, "each is asked in its turn"
 
 
-def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endpoint: str) -> None:
+def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endpoint):
     with client(endpoint, 5.0, None) as session:
         source = zenoh.SourceInfo(session.declare_publisher("any").id, 0)
         recovery = Recovery(session, "team/t/", lambda item: None)
@@ -430,9 +419,7 @@ def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endp
         assert recovery.lacking() == {"robot/r1/submap": [(1, 2)]}
 
 
-def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(endpoint, monkeypatch):
     """Samples that arrive during a read wait for the next one, so that a slow reader returns."""
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         flowing(source, sink)
@@ -440,7 +427,7 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
 
         def slowly(item: object, samples: list[Sample]) -> None:
             time.sleep(0.005)
-            read(item, samples)  # type: ignore[arg-type]
+            read(item, samples)
 
         monkeypatch.setattr(sink, "_take", slowly)
 
@@ -459,9 +446,7 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(
     assert heard, "it was back while the other still spoke"
 
 
-def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(endpoint, monkeypatch):
     """Poses alone are dropped."""
     monkeypatch.setattr(zenoh_bus, "MOST_WAITING", 10)
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint, sheds=[c.OWN_POSE]) as sink:
@@ -486,7 +471,7 @@ def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(
     assert keys.count("robot/alpha/submap") == 100
 
 
-def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:
+def test_close_wakes_a_receiver_and_ends_the_bus(endpoint):
     bus = ZenohBus("t", endpoint)
     got: list[list[Sample]] = []
     thread = threading.Thread(target=lambda: got.append(bus.receive(60.0)))
@@ -500,19 +485,19 @@ def test_close_wakes_a_receiver_and_ends_the_bus(endpoint: str) -> None:
             act()
 
 
-def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint: str) -> None:
+def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint):
     with ZenohBus("t", endpoint) as bus:
         bus.subscribe(c.SUBMAP, "alpha")
         with pytest.raises(BusError, match="deliver twice"):
             bus.subscribe(c.SUBMAP)
 
 
-def test_who_joins_while_others_publish_gets_everything_once_and_in_order() -> None:
+def test_who_joins_while_others_publish_gets_everything_once_and_in_order():
     partial, _, _ = storm(joins=12, publishers=4, seed=5)
     assert partial == 0
 
 
-def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint: str) -> None:
+def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint):
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         for i in range(50):
             source.publish(progress(i))
@@ -521,9 +506,7 @@ def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint
         assert sink.lacking() == {}
 
 
-def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, monkeypatch):
     first, final = (f for f in [FINAL, msgspec.structs.replace(FINAL, dof=99)])
     with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
         assert TheEnd(centre).missed() == []
@@ -541,9 +524,7 @@ def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(
         assert TheEnd(straggler).missed(), "whoever started it says that it belongs to that run"
 
 
-def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(
-    endpoint: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):
     """A flood of them is neither queued nor passed on, and logs a few lines."""
     status = build.status(state="x")
     with (
@@ -564,9 +545,7 @@ def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(
     assert len(caplog.records) < 100
 
 
-def test_a_bus_receives_samples_of_a_bounded_number_of_keys(
-    endpoint: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bus_receives_samples_of_a_bounded_number_of_keys(endpoint, monkeypatch):
     """Without keys anyone can publish in the names of any number of robots."""
     monkeypatch.setattr(zenoh_bus, "MOST_KEYS", 3)
     with ZenohBus("t", endpoint) as sink, ZenohBus("t", endpoint) as source:

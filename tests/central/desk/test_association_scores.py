@@ -1,13 +1,15 @@
-"""Scores of association against labels, and a path against a GPS: by runs made up by hand."""
+"""Scores of the data association, and of a map as a set of points."""
 
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 
 from teamslam.central.desk.evaluation.association import association_json, association_result
 from teamslam.central.desk.evaluation.gps import distances
 from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.central.desk.evaluation.matching import assign, gospa, half_spacing
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -74,7 +76,7 @@ def scores(samples: list[Sample]) -> dict[str, Any]:
     return association_json(result)
 
 
-def test_a_run_without_an_error_is_scored_as_one() -> None:
+def test_a_run_without_an_error_is_scored_as_one():
     found = scores(
         [
             truth("r1", [7, 7, 8, 7, 8, NONE]),
@@ -88,7 +90,7 @@ def test_a_run_without_an_error_is_scored_as_one() -> None:
     assert found["unlabelled_detections_in_the_map"] == 1
 
 
-def test_duplicates_wrong_members_and_what_is_left_out_are_counted() -> None:
+def test_duplicates_wrong_members_and_what_is_left_out_are_counted():
     found = scores(
         [
             truth("r1", [7, 7, 8, 7, 7, 7]),
@@ -107,9 +109,7 @@ def test_duplicates_wrong_members_and_what_is_left_out_are_counted() -> None:
 
 
 @pytest.mark.parametrize(("label", "right", "wrong"), [(7, 1, 0), (9, 0, 1)])
-def test_a_merge_of_robots_is_judged_by_the_landmarks_that_they_share(
-    label: int, right: int, wrong: int
-) -> None:
+def test_a_merge_of_robots_is_judged_by_the_landmarks_that_they_share(label, right, wrong):
     found = scores(
         [
             truth("r1", [7, 7]),
@@ -122,11 +122,11 @@ def test_a_merge_of_robots_is_judged_by_the_landmarks_that_they_share(
     assert (found["merges_right"], found["merges_wrong"]) == (right, wrong)
 
 
-def test_a_run_without_labels_has_no_scores() -> None:
+def test_a_run_without_labels_has_no_scores():
     assert association_result(collect_log([window("r1", 0, 0, [0])])) is None
 
 
-def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are_wrong() -> None:
+def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are_wrong():
     rng = np.random.default_rng(0)
     headings = np.cumsum(rng.normal(size=200) * 0.2)
     steps = np.column_stack((np.cos(headings), np.sin(headings)))
@@ -137,3 +137,39 @@ def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are
     turned[::10] += rng.normal(size=(20, 2)) * 20.0
     assert np.median(distances(poses, turned)) < 1e-2
     assert np.median(distances(1.1 * poses, turned)) > 0.1, "no scale is fitted"
+
+
+TRUE = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
+
+
+def test_of_equal_sets_in_another_order_it_is_zero():
+    found = gospa(TRUE[::-1], TRUE, 2.0)
+    assert (found.distance_m, found.missed, found.false) == (0.0, 0, 0)
+
+
+def test_each_missed_and_each_false_one_costs_half_the_square_of_the_cut_off():
+    found = gospa(np.array([[0.3, 0.0], [9.0, 9.0]]), TRUE, 2.0)
+    assert found.distance_m == pytest.approx(np.sqrt(0.09 + 0.5 * 4.0 * 3))
+    assert (found.missed, found.false) == (2, 1)
+    assert found.localisation_m == pytest.approx(0.3)
+
+
+def test_a_duplicate_is_a_false_one():
+    found = gospa(np.concatenate((TRUE, TRUE[:1] + 0.1)), TRUE, 2.0)
+    assert (found.missed, found.false) == (0, 1)
+
+
+def test_the_cut_off_is_half_of_the_spacing():
+    assert half_spacing(TRUE) == 2.0
+    assert half_spacing(TRUE[:1]) is None
+
+
+def test_points_are_assigned_with_the_least_sum_of_squared_distances():
+    rng = np.random.default_rng(0)
+    for n, k in ((0, 3), (1, 1), (4, 7), (7, 4), (12, 12)):
+        found, true = rng.uniform(0.0, 3.0, (n, 2)), rng.uniform(0.0, 3.0, (k, 2))
+        rows, columns, squared = assign(found, true, 1.0)
+        costs = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), 1.0)
+        best = costs[linear_sum_assignment(costs)].sum()
+        assert len({*rows.tolist()}) == len({*columns.tolist()}) == len(squared)
+        assert squared.sum() + min(n, k) - len(squared) == pytest.approx(best)

@@ -1,4 +1,4 @@
-"""A result names the robot whose detections are late against its odometry, and no other robot."""
+"""Robots' clocks in results and while a team runs."""
 
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from teamslam.central.desk.evaluation.clocks import (
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
 from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.central.desk.presence import Presence
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.sim.cli.launch import _time_warnings
 from teamslam.sim.cli.main import app
@@ -21,8 +22,10 @@ from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.digest import configured
+from tests import build
 from tests.sim.logs import final_map, samples
 from tests.trials.stress_world import StressWorld, write
 
@@ -46,15 +49,13 @@ def timed_of(log: list[Sample], robot: str) -> Timed:
 
 
 @pytest.fixture(scope="module")
-def late(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
+def late(tmp_path_factory):
     """A log with detections of r2 that are 0.1 s late."""
     world = StressWorld(robots=2, late={"r2": LATE_S})
     return published(world, tmp_path_factory.mktemp("late"))
 
 
-def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(
-    late: list[Sample],
-) -> None:
+def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(late):
     evaluation = evaluate(late)
     (warning,) = evaluation.clocks
     assert warning.startswith("r2: its detections are stamped 0.1")
@@ -65,28 +66,23 @@ def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(
     assert ("note", warning) in team_rows(evaluation)
 
 
-def test_the_offset_is_right_within_its_uncertainty_and_a_configured_one_is_deducted(
-    late: list[Sample],
-) -> None:
+def test_the_offset_is_right_within_its_uncertainty_and_a_configured_one_is_deducted(late):
     timed = timed_of(late, "r2")
     found = lateness(timed, RobotConfig("r2"))
-    assert found is not None
     assert abs(found.offset_s - LATE_S) < 3.0 * found.sigma_s
     assert found.offset_s > BEYOND_DOUBT * found.sigma_s > 0.0
     rest = lateness(timed, RobotConfig("r2", clock_offset_s=LATE_S))
-    assert rest is not None
     assert rest.offset_s == pytest.approx(found.offset_s - LATE_S, abs=0.002)
     assert not rest.is_beyond_doubt
 
 
-def test_a_wrong_mount_is_not_taken_for_a_late_clock(late: list[Sample]) -> None:
+def test_a_wrong_mount_is_not_taken_for_a_late_clock(late):
     robot = RobotConfig("r1", sensor=Sensor(mount=(0.3, 0.1, 0.1), range_offset=0.1))
     found = lateness(timed_of(late, "r1"), robot)
-    assert found is not None
     assert abs(found.offset_s) < 3.0 * found.sigma_s
 
 
-def test_clocks_that_are_right_are_not_mentioned(tmp_path: Path) -> None:
+def test_clocks_that_are_right_are_not_mentioned(tmp_path):
     log = published(StressWorld(seed=3, robots=2), tmp_path)
     assert evaluate(log).clocks == ()
     for robot in ("r1", "r2"):
@@ -106,9 +102,7 @@ def test_clocks_that_are_right_are_not_mentioned(tmp_path: Path) -> None:
          "r1, r2 from 0 s to 700 s; r3 from 2,000 s to 2,600 s"),
     ],
 )  # fmt: skip
-def test_robots_whose_times_do_not_overlap_are_named_with_their_times(
-    spans_s: dict[str, tuple[float, float]], said: str
-) -> None:
+def test_robots_whose_times_do_not_overlap_are_named_with_their_times(spans_s, said):
     spans = {robot: (int(a * 1e9), int(b * 1e9)) for robot, (a, b) in spans_s.items()}
     warning = separate_times_warning(spans)
     assert (warning is not None) == bool(said)
@@ -117,7 +111,7 @@ def test_robots_whose_times_do_not_overlap_are_named_with_their_times(
         assert "map of columns" in warning
 
 
-def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path: Path) -> None:
+def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path):
     rows = "t_s,forward_m_s,yaw_rate_rad_s\n{0},1,0\n{1},1,0\n{2},0,0\n"
     for robot, begin in (("r1", 0), ("r2", 1_700_000_000)):
         (tmp_path / "set" / robot).mkdir(parents=True)
@@ -135,3 +129,51 @@ def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path:
         out += node.publish(0.0)
     (warning,) = evaluate(samples(out)).warnings
     assert expected in warning
+
+
+S = 10**9
+NOW_S = 1_763_800_000
+
+
+def presence(*behind: tuple[float, float]) -> Presence:
+    """A team's drivers, so many seconds behind the wall clock at two moments that are 2 s apart."""
+    found = Presence()
+    for node in ("central", "robot/r1", "robot/r2", "robot/r3"):
+        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+    for k, each in enumerate(behind, 1):
+        node = f"source/r{k}"
+        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+        for wall_s, late_s in zip((NOW_S, NOW_S + 2), each, strict=True):
+            stamp_ns = round((wall_s - late_s) * S)
+            status = build.status(stamp_ns=stamp_ns, node=node, state="measuring", warnings=())
+            found._take_message(status, wall_s * S)
+    return found
+
+
+IN_TIME, YEARS = (0.0, 0.0), (5e8, 5e8)
+
+
+@pytest.mark.parametrize(
+    ("clocks", "words"),
+    [
+        ((IN_TIME, IN_TIME, (7.0, 7.0)), "stamps 7.0 s behind the others: set its machine's clock"),
+        (
+            (IN_TIME, IN_TIME, (-7.0, -7.0)),
+            "stamps 7.0 s ahead of the others: set its machine's clock",
+        ),
+        ((IN_TIME, IN_TIME, (9.0, 7.0)), "it lags and catches up: its program delivers old"),
+        ((IN_TIME, IN_TIME, (6.0, 7.0)), "it lags and falls further behind"),
+        ((YEARS, YEARS, (5e8 + 20, 5e8 + 20)), "began later or go slower: the map waits for them"),
+        ((IN_TIME, IN_TIME, YEARS), "recorded data, which began later or go slower: the map"),
+        ((YEARS, YEARS, (5e8 - 20, 5e8 - 20)), "of which the others began later or go slower"),
+    ],
+)
+def test_who_lags_or_replays_is_not_told_to_set_its_clock(clocks, words):
+    (advice,) = presence(*clocks).advice()
+    assert advice.startswith("source/r3 stamps ")
+    assert words in advice
+    assert ("set its machine's clock" in advice) == ("set its machine's clock" in words)
+
+
+def test_robots_of_one_clock_are_advised_nothing():
+    assert presence(IN_TIME, IN_TIME, (0.4, 0.4)).advice() == []

@@ -1,7 +1,6 @@
 """The figures of a run equal their definitions."""
 
 import json
-from pathlib import Path as Folder
 
 import msgspec
 import numpy as np
@@ -77,7 +76,7 @@ def submap(sequence: int, first: int, last: int) -> Outgoing:
     return Outgoing(ch.SUBMAP, "r1", message)
 
 
-def test_truth_is_interpolated_along_the_shorter_arc() -> None:
+def test_truth_is_interpolated_along_the_shorter_arc():
     truth = path([0.0, 1.0], [[0.0, 2.0, 3.0], [4.0, 0.0, -3.0]])
     poses, known = interpolate_truth(truth, stamps(0.25))
     turn = 2.0 * np.pi - 6.0
@@ -85,20 +84,20 @@ def test_truth_is_interpolated_along_the_shorter_arc() -> None:
     np.testing.assert_allclose(poses, [[1.0, 1.5, 3.0 + 0.25 * turn]], atol=1e-12)
 
 
-def test_truth_is_not_extrapolated() -> None:
+def test_truth_is_not_extrapolated():
     truth = path([1.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     _, known = interpolate_truth(truth, stamps(0.999, 1.0, 2.0, 2.001))
     assert known.tolist() == [False, True, True, False]
 
 
-def test_truth_is_not_interpolated_across_a_gap_but_known_at_its_ends() -> None:
+def test_truth_is_not_interpolated_across_a_gap_but_known_at_its_ends():
     truth = path([0.0, 1.5, 2.5], [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
     poses, known = interpolate_truth(truth, stamps(0.0, 0.7, 1.5, 2.0))
     assert known.tolist() == [True, False, True, True]
     np.testing.assert_allclose(poses[known, 0], [0.0, 3.0, 3.5])
 
 
-def test_without_truth_nothing_is_known() -> None:
+def test_without_truth_nothing_is_known():
     nowhere = Path(np.empty(0, np.int64), np.empty((0, 3)))
     assert not interpolate_truth(nowhere, stamps(0.0, 1.0))[1].any()
     assert pose_errors(path([0.0], [[0.0, 0.0, 0.0]]), np.eye(3)[np.newaxis], nowhere) is None
@@ -106,9 +105,7 @@ def test_without_truth_nothing_is_known() -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(x=numbers, y=numbers, theta=st.floats(-3.1, 3.1), seed=st.integers(0, 2**31))
-def test_a_map_that_is_only_moved_has_no_error_after_alignment(
-    x: float, y: float, theta: float, seed: int
-) -> None:
+def test_a_map_that_is_only_moved_has_no_error_after_alignment(x, y, theta, seed):
     truth = np.random.default_rng(seed).uniform(-20.0, 20.0, (5, 2))
     motion = np.array([x, y, theta])
     errors = map_errors(transform_points(motion, truth), np.eye(10), truth)
@@ -118,20 +115,20 @@ def test_a_map_that_is_only_moved_has_no_error_after_alignment(
     assert errors.rmse_m == pytest.approx(np.sqrt(np.mean(np.sum(shift**2, axis=1))), abs=1e-9)
 
 
-def test_alignment_does_not_scale() -> None:
+def test_alignment_does_not_scale():
     truth = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
     errors = map_errors(1.5 * truth, np.eye(8), truth)
     assert errors.aligned_rmse_m == pytest.approx(0.5 * np.sqrt(2.0))
 
 
-def test_one_landmark_has_an_error_but_no_alignment() -> None:
+def test_one_landmark_has_an_error_but_no_alignment():
     errors = map_errors(np.array([[3.0, 4.0]]), np.diag([9.0, 16.0]), np.zeros((1, 2)))
     assert errors.rmse_m == 5.0
     assert errors.aligned_rmse_m is None
     assert errors.nees_per_dof == pytest.approx(1.0)
 
 
-def test_map_nees_takes_the_joint_covariance_not_its_blocks() -> None:
+def test_map_nees_takes_the_joint_covariance_not_its_blocks():
     P = spd(4)
     error = np.array([0.5, -0.25, 0.75, 1.0])
     errors = map_errors(error.reshape(2, 2), P, np.zeros((2, 2)))
@@ -147,7 +144,7 @@ def drawn_maps(runs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return truth, truth + noise.reshape(runs, 15, 2), P
 
 
-def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent() -> None:
+def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent():
     runs = 200
     truth, maps, P = drawn_maps(runs)
     motion = np.array([3.0, -2.0, 0.5])
@@ -156,7 +153,6 @@ def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent()
     values, covered, raw = [], [], []
     for means in maps:
         shape = map_errors(transform_points(motion, means), turned, truth).shape
-        assert shape is not None
         values.append(shape.nees_per_landmark)
         covered.append(shape.coverage)
         raw.append(map_errors(means, P, truth).coverage)
@@ -173,11 +169,10 @@ def test_the_shape_of_drawn_maps_has_nees_2_per_landmark_and_covers_95_percent()
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_the_shape_of_few_landmarks_is_what_their_distances_say(count: int) -> None:
+def test_the_shape_of_few_landmarks_is_what_their_distances_say(count):
     truth = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])[:count]
     means = truth + np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]])[:count]
     shape = map_errors(means, 0.01 * np.eye(2 * count), truth).shape
-    assert shape is not None
     if count == 2:  # one number: a length of variance 0.02 that is 0.3 too large
         assert shape.nees_per_landmark == pytest.approx(2.0 * 0.09 / 0.02)
         assert shape.coverage == 0.0
@@ -185,37 +180,32 @@ def test_the_shape_of_few_landmarks_is_what_their_distances_say(count: int) -> N
         assert 0.0 < shape.nees_per_landmark < 2.0 * 0.09 / 0.01
 
 
-def test_pose_errors_are_those_of_the_consistency_module() -> None:
+def test_pose_errors_are_those_of_the_consistency_module():
     P = np.stack([spd(3), 0.25 * spd(3)])
     truth = path([0.0, 1.0], [[0.0, 0.0, 3.1], [1.0, 1.0, -1.0]])
     estimate = path([0.0, 1.0], [[0.1, -0.2, -3.1], [1.5, 1.0, -1.25]])
     errors = pose_errors(estimate, P, truth)
-    assert errors is not None
     expected = [state_error(a, b) for a, b in zip(estimate.poses, truth.poses, strict=True)]
     np.testing.assert_allclose(errors.errors, expected, atol=1e-12)
     np.testing.assert_allclose(errors.nees, [nees(e, p) for e, p in zip(expected, P, strict=True)])
     assert errors.position_rmse_m == pytest.approx(np.sqrt((0.05 + 0.25) / 2.0))
 
 
-def test_coverage_is_the_share_of_poses_within_their_own_95_percent() -> None:
+def test_coverage_is_the_share_of_poses_within_their_own_95_percent():
     truth = path([0.0, 3.0], [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     offsets = [[2.79, 0.0, 0.0], [2.80, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.81]]
     errors = pose_errors(path([0.0, 1.0, 2.0, 3.0], offsets), np.tile(np.eye(3), (4, 1, 1)), truth)
-    assert errors is not None
     assert errors.coverage == 0.5  # the 95 % quantile of three numbers is 2.795²
 
 
-def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
+def test_a_log_whose_map_is_off_by_a_known_shift_says_so():
     run = evaluate(joined_log(scenario(robots=2), 0.3))
-    assert run.map is not None
-    assert run.map.errors is not None
     assert run.map.errors.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
     assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
     assert run.map.errors.nees_per_dof == pytest.approx(0.09 / 0.01)
     assert not run.map.errors.in_band
     assert run.map.cost_per_dof == 1.5
     for robot in run.robots.values():
-        assert robot.smoothed is not None
         assert robot.smoothed.position_rmse_m == pytest.approx(0.15 * np.sqrt(2.0))
         assert robot.smoothed.heading_rmse_rad == pytest.approx(0.03)
         assert robot.final_pose_nees_per_dof == pytest.approx(0.09 * 0.51 / 0.01 / 3.0)
@@ -226,9 +216,7 @@ def test_a_log_whose_map_is_off_by_a_known_shift_says_so() -> None:
 
 
 @pytest.mark.parametrize(("shift", "is_shown"), [(0.3, False), (0.05, True)])
-def test_covariances_are_not_called_too_large_where_the_errors_are_larger(
-    shift: float, is_shown: bool
-) -> None:
+def test_covariances_are_not_called_too_large_where_the_errors_are_larger(shift, is_shown):
     """All submaps share the error, as of a late clock: their differences do not show it."""
     too_large = m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,))
     log = []
@@ -239,7 +227,6 @@ def test_covariances_are_not_called_too_large_where_the_errors_are_larger(
             payload = encoded(msgspec.structs.replace(final, diagnosis=(too_large,)))
         log.append(msgspec.structs.replace(sample, payload=payload))
     run = evaluate(log)
-    assert run.map is not None
     assert run.map.diagnosis == ((too_large,) if is_shown else ())
 
 
@@ -256,13 +243,12 @@ def own_map(shift: float, of: Scenario) -> Outgoing:
     return Outgoing(ch.OWN_MAP, "r1", estimate)
 
 
-def test_a_robots_last_own_map_is_held_against_the_truth() -> None:
+def test_a_robots_last_own_map_is_held_against_the_truth():
     of = scenario(robots=2)
     nothing = final_map([], np.empty((0, 2)), np.empty((0, 0)))
     said = [own_map(5.0, of), own_map(0.3, of), nothing]
     run = evaluate([*world_log(of), *samples(said)])
     own = run.robots["r1"].own_map
-    assert own is not None
     assert own.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
     assert own.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
     assert own.nees_per_dof == pytest.approx(0.09 / 0.01)
@@ -272,7 +258,7 @@ def test_a_robots_last_own_map_is_held_against_the_truth() -> None:
     assert figures["r2"]["own_map_nees_per_dof"] is None
 
 
-def test_a_measurement_that_is_in_the_log_twice_is_counted_once() -> None:
+def test_a_measurement_that_is_in_the_log_twice_is_counted_once():
     log = world_log(scenario())
     again = [s for s in log if s.key == ch.ODOMETRY.key("r1")]
     once, twice = evaluate(log).robots["r1"], evaluate(log + again).robots["r1"]
@@ -280,7 +266,7 @@ def test_a_measurement_that_is_in_the_log_twice_is_counted_once() -> None:
     assert once.consumption.published == twice.consumption.published == 41
 
 
-def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes() -> None:
+def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes():
     sent = samples([submap(0, 0, 20), submap(1, 21, 40)])
     robot = evaluate(world_log(scenario()) + sent).robots["r1"]
     assert robot.uplink_bytes == sum(len(s.payload) for s in sent)
@@ -293,14 +279,14 @@ def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes()
     [(21, 41, True), (20, 41, False), (21, 42, False)],
     ids=["disjoint", "a measurement in two submaps", "a ledger that counts one twice"],
 )
-def test_a_measurement_that_is_used_twice_is_found(first: int, counted: int, once: bool) -> None:
+def test_a_measurement_that_is_used_twice_is_found(first, counted, once):
     said = [submap(0, 0, 20), submap(1, first, 40), done(41, (("in a submap", counted),))]
     robot = evaluate(world_log(scenario()) + samples(said)).robots["r1"]
     assert robot.consumption.consumed == 41
     assert robot.consumption.each_once == once
 
 
-def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:
+def test_a_log_without_truth_has_no_errors_but_the_rest():
     hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
     log = [s for s in joined_log(scenario(), 0.1) if s.key not in hidden]
     figures = to_json(evaluate(log))
@@ -313,7 +299,7 @@ def test_a_log_without_truth_has_no_errors_but_the_rest() -> None:
         assert robot[name] is None
 
 
-def test_where_no_true_landmark_is_known_all_paths_are_moved_together(tmp_path: Folder) -> None:
+def test_where_no_true_landmark_is_known_all_paths_are_moved_together(tmp_path):
     log = joined_log(scenario(robots=2), 0.3)
     run = evaluate([each for each in log if not each.key.endswith(ch.TRUTH_LANDMARKS.template)])
     for robot in run.robots.values():
@@ -322,18 +308,17 @@ def test_where_no_true_landmark_is_known_all_paths_are_moved_together(tmp_path: 
     assert compare_picture({"run": run}, tmp_path / "paths.png"), "it has its paths' errors"
 
 
-def test_a_log_that_was_cut_before_the_final_map_is_evaluated() -> None:
+def test_a_log_that_was_cut_before_the_final_map_is_evaluated():
     figures = to_json(evaluate(world_log(scenario())[:30]))
     assert figures["final_map_digest"] is None
     assert figures["landmark_rmse_m"] is None
     assert figures["robots"]["r1"]["measurements_consumed"] is None
 
 
-def test_the_trajectory_aligns_itself_where_the_map_can_not() -> None:
+def test_the_trajectory_aligns_itself_where_the_map_can_not():
     of = scenario()
     stream = streams(of).streams[0]
     assert stream.truth is not None
-    assert stream.truth_ns is not None
     turned = np.array(
         [
             [*transform_points(np.array([1.0, 2.0, 0.3]), p[np.newaxis, :2])[0], p[2]]
@@ -346,17 +331,14 @@ def test_the_trajectory_aligns_itself_where_the_map_can_not() -> None:
     assert robot.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
+def test_the_own_pose_counts_only_where_there_is_no_team_pose():
     of = scenario()
     stream = streams(of).streams[0]
-    assert stream.truth is not None
     assert stream.truth_ns is not None
     own = online(ch.OWN_POSE, stream.truth[1:] + np.array([3.0, 4.0, 0.0]), of)
     team = online(ch.TEAM_POSE, stream.truth[1:] + np.array([0.0, 1.0, 0.0]), of)
     alone = evaluate(world_log(of) + samples(own)).robots["r1"]
     both = evaluate(world_log(of) + samples([*own, *team])).robots["r1"]
-    assert alone.online is not None
-    assert both.online is not None
     assert (alone.online_channel, both.online_channel) == ("own/pose", "team/pose")
     assert alone.online.position_rmse_m == pytest.approx(5.0)
     assert both.online.position_rmse_m == pytest.approx(1.0)
@@ -366,7 +348,7 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose() -> None:
     assert joined.online_aligned_rmse_m == pytest.approx(np.hypot(0.3, 1.3))
 
 
-def test_damaged_messages_are_counted_and_left_out() -> None:
+def test_damaged_messages_are_counted_and_left_out():
     log = joined_log(scenario(), 0.1)
     damaged = [
         msgspec.structs.replace(s, payload=s.payload[:-3])
@@ -380,30 +362,26 @@ def test_damaged_messages_are_counted_and_left_out() -> None:
     assert run.channels["nobody/knows"].bytes == 1
 
 
-def test_landmarks_without_truth_are_left_out_of_the_errors() -> None:
+def test_landmarks_without_truth_are_left_out_of_the_errors():
     ids, positions = [1, 2, 77], np.array([[5.0, 6.0], [15.0, 5.0], [0.0, 0.0]])
     said = final_map(ids, positions, 0.5 * spd(6))
     run = evaluate(world_log(scenario()) + samples([said]))
-    assert run.map is not None
-    assert run.map.errors is not None
     assert run.map.known.tolist() == [True, True, False]
     assert run.map.errors.count == 2
     assert run.map.errors.rmse_m == 0.0
 
 
-def test_blocks_without_correlations_are_judged_as_such() -> None:
+def test_blocks_without_correlations_are_judged_as_such():
     P = spd(4)
     blocks = P.copy()
     blocks[:2, 2:] = blocks[2:, :2] = 0.0
     error = np.array([[0.5, 0.25], [-0.5, 1.0]])
     means = np.array([[5.0, 6.0], [15.0, 5.0]]) + error
     run = evaluate(world_log(scenario()) + samples([final_map([1, 2], means, P, joint=False)]))
-    assert run.map is not None
-    assert run.map.errors is not None
     assert run.map.errors.nees_per_dof == pytest.approx(nees(error.ravel(), blocks) / 4.0)
 
 
-def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> None:
+def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds():
     extra = {"processes": {"world": {"pid": 7, "exit": 0}}, "log": "run.mcap", "wall_s": 1.5}
     figures = json.loads(json.dumps(to_json(evaluate(joined_log(scenario(), 0.1)), extra)))
     names = (
@@ -423,7 +401,7 @@ def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds() -> 
     assert set(figures["channels"][ch.ODOMETRY.key("r1")]) == {"messages", "bytes"}
 
 
-def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone() -> None:
+def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone():
     """A pose 100 m away errs by 5 m along the circle and by 0.13 m across it; sigma there: 1 mm."""
     turn, sigma = 0.05, 0.05
     truth = np.array([[100.0, 0.0, 0.3]])
@@ -433,12 +411,11 @@ def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone() -> 
     covariance = back @ np.diag([1e-6, 1e-6, sigma**2]) @ back.T
     stamps = np.array([0])
     found = pose_errors(Path(stamps, pose), covariance[None], Path(stamps, truth))
-    assert found is not None
     assert found.motion_nees[0] == pytest.approx((turn / sigma) ** 2)
     assert found.nees[0] > 1000.0
 
 
-def test_what_a_driver_never_got_is_a_note() -> None:
+def test_what_a_driver_never_got_is_a_note():
     figures = {"messages": 90.0, "messages_lost": 9.0, "messages_dropped": 1.0}
     said = m.Status(stamp_ns=1, node="source/r1", state="ended", figures=figures, warnings=())
     (note,) = evaluate(
@@ -476,7 +453,6 @@ def unnamed_log(
         log = [each for each in log if each.key != ch.START.key("r1")]
         poses = world.streams[0].truth
         stamps_ns = world.streams[0].intervals.end_ns
-        assert poses is not None
         turned = np.column_stack(
             (transform_points(ROTATED, poses[1:, :2]), poses[1:, 2] + ROTATED[2])
         )
@@ -490,19 +466,14 @@ ROTATED = np.array([30.0, -20.0, 2.0])
 
 
 @pytest.mark.parametrize(("named", "labels"), [(0, False), (3, False), (0, True)])
-def test_landmarks_without_identities_have_their_errors_by_the_nearest_true_ones(
-    named: int, labels: bool
-) -> None:
+def test_landmarks_without_identities_have_their_errors_by_the_nearest_true_ones(named, labels):
     true = streams(scenario()).landmarks
     means = true + 0.1
     means[-1] += 40.0
     run = evaluate(unnamed_log(means, named=named, labels=labels))
-    assert run.map is not None
-    assert run.map.errors is not None
     assert run.map.errors.rmse_m == pytest.approx(0.1 * np.sqrt(2.0))
     assert run.map.known.tolist() == [True] * 7 + [False]
     matching = run.map.matching
-    assert matching is not None
     assert (matching.matched, matching.of) == (7 - named, 8 - named)
     words = f"nearest neighbour within {matching.gate_m:.3g} m, {7 - named} of {8 - named} matched"
     rows = dict(team_rows(run))
@@ -516,46 +487,38 @@ def test_landmarks_without_identities_have_their_errors_by_the_nearest_true_ones
     assert ("landmark errors by", (words,)) in compare_rows({"a": run})
 
 
-def test_a_map_far_from_all_true_landmarks_has_no_errors_and_says_within_which_gate() -> None:
+def test_a_map_far_from_all_true_landmarks_has_no_errors_and_says_within_which_gate():
     run = evaluate(unnamed_log(streams(scenario()).landmarks + 100.0))
-    assert run.map is not None
     assert run.map.errors is None
-    assert run.map.matching is not None
     assert dict(team_rows(run))["landmark errors"] == (
         f"can not be computed: nearest neighbour within {run.map.matching.gate_m:.3g} m, "
         "0 of 8 matched"
     )
 
 
-def test_no_true_landmark_has_two_of_the_map() -> None:
+def test_no_true_landmark_has_two_of_the_map():
     true = streams(scenario()).landmarks
     run = evaluate(unnamed_log(np.vstack((true + 0.1, true[:1] + 0.02))))
-    assert run.map is not None
-    assert run.map.matching is not None
     assert (run.map.matching.matched, run.map.matching.of) == (8, 9)
     assert run.map.known.tolist() == [False] + [True] * 8
 
 
-def test_in_an_arbitrary_frame_the_paths_move_the_map_before_it_is_matched() -> None:
+def test_in_an_arbitrary_frame_the_paths_move_the_map_before_it_is_matched():
     true = streams(scenario()).landmarks
     run = evaluate(unnamed_log(transform_points(ROTATED, true), initial_poses=False))
     assert run.arbitrary_frame
-    assert run.map is not None
-    assert run.map.matching is not None
     assert run.map.matching.matched == 8
-    assert run.map.errors is not None
     assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_landmarks_with_identities_are_matched_by_nothing_else() -> None:
+def test_landmarks_with_identities_are_matched_by_nothing_else():
     run = evaluate(joined_log(scenario(), 0.1))
-    assert run.map is not None
     assert run.map.matching is None
     assert to_json(run)["landmark_matching"] is None
     assert "landmark errors" not in dict(team_rows(run))
 
 
-def test_the_table_tells_used_from_rejected_and_open_measurements() -> None:
+def test_the_table_tells_used_from_rejected_and_open_measurements():
     published = evaluate(world_log(scenario())).robots["r1"].consumption.published
     ledger = (("in a submap", published - 6), ("rejected: no pose node near it", 3))
     run = evaluate(world_log(scenario()) + samples([done(published - 3, ledger)]))
@@ -577,7 +540,7 @@ def test_the_table_tells_used_from_rejected_and_open_measurements() -> None:
     assert robot_sheet(without).rows[0][2] == f"– of {published}"
 
 
-def test_a_run_on_a_data_set_is_titled_with_its_name() -> None:
+def test_a_run_on_a_data_set_is_titled_with_its_name():
     of = scenario()
     world = FolderWorld(path="/somewhere/my_set")
     told = configured("world", 0, 0, msgspec.structs.replace(of, world=world))

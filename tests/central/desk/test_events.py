@@ -21,7 +21,7 @@ def alive(there: bool, node: str = "robot/r1") -> m.Liveliness:
     return m.Liveliness(stamp_ns=0, node=node, alive=there)
 
 
-def test_a_robot_joins_is_lost_and_comes_back() -> None:
+def test_a_robot_joins_is_lost_and_comes_back():
     assert told(alive(True), alive(False), alive(False), alive(True)) == [
         ("joined", "r1 joined"),
         ("lost", "r1 was lost"),
@@ -29,7 +29,7 @@ def test_a_robot_joins_is_lost_and_comes_back() -> None:
     ]
 
 
-def test_a_robot_that_is_done_leaves() -> None:
+def test_a_robot_that_is_done_leaves():
     done = build.done(measurements=1200, steps=5, submaps=4)
     assert told(alive(True), done, done, alive(False))[1:] == [
         ("done", "r1 has taken all its 1,200 measurements, 4 submaps"),
@@ -51,7 +51,7 @@ def fused(
     )
 
 
-def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> None:
+def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once():
     why = "r2: 1 shared landmark, cost 2.5"
     alone = fused(["r1"], (why,))
     moved = fused(["r1"], (why.replace("2.5", "2.6"),))
@@ -64,7 +64,7 @@ def test_who_is_in_the_map_and_why_not_and_who_was_withdrawn_is_told_once() -> N
     ]
 
 
-def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map() -> None:
+def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map():
     why = "r2 not joined: no landmark is shared"
     assert told(fused(["r1", "r2"], (why,)), fused(["r1", "r2"])) == [
         ("map", "r1 is in the team's map"),
@@ -73,9 +73,7 @@ def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map() -> None
     ]
 
 
-def test_robots_that_wait_for_a_place_are_told_once_whatever_test_fails_and_who_joined_whom() -> (
-    None
-):
+def test_robots_that_wait_for_a_place_are_told_once_whatever_test_fails_and_who_joined_whom():
     def waiting(who: str, why: str, joined: tuple[str, ...] = ()) -> m.FusedMap:
         reasons = (f"{who} not joined: with r1 (incarnation 1) {why}",) if who else ()
         said = msgspec.structs.replace(fused(["r1", "r2", "r3"], reasons), joined=joined)
@@ -102,7 +100,7 @@ def test_robots_that_wait_for_a_place_are_told_once_whatever_test_fails_and_who_
     ]
 
 
-def test_a_withdrawal_is_told_once_with_its_reason() -> None:
+def test_a_withdrawal_is_told_once_with_its_reason():
     said = m.Withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
     assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [
         ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
@@ -115,7 +113,7 @@ def status(refused: int, *warnings: str) -> m.Status:
     )
 
 
-def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_is_one() -> None:
+def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_is_one():
     said = (
         status(0, "waiting for r1", "submap 20: cost 1.2"),
         status(0, "submap 20: cost 1.3", "submap 21: cost 1.3"),
@@ -130,7 +128,7 @@ def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_
     assert without_decimals("submap 20, cost 9.1") == "submap 20, cost #"
 
 
-def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
+def test_another_incarnation_and_another_life_of_a_process_are_events():
     first, again = (
         m.InitialPose(stamp_ns=9, robot="r1", incarnation=n, number=0, pose=b"", covariance=b"")
         for n in (1, 2)
@@ -144,7 +142,7 @@ def test_another_incarnation_and_another_life_of_a_process_are_events() -> None:
     ]
 
 
-def test_the_end_of_the_world_and_its_notes_are_told_once() -> None:
+def test_the_end_of_the_world_and_its_notes_are_told_once():
     end = m.End(stamp_ns=9, streams=(), notes=("a row was repaired",))
     assert told(end, end, fused([], final=True), alive(True, "recorder")) == [
         ("warning", "a row was repaired"),
@@ -154,6 +152,6 @@ def test_the_end_of_the_world_and_its_notes_are_told_once() -> None:
     ]
 
 
-def test_the_number_of_events_of_a_run_is_bounded() -> None:
+def test_the_number_of_events_of_a_run_is_bounded():
     many = [Outgoing(ch.ALIVE, "robot/r1", alive(t % 2 == 0)) for t in range(MOST + 50)]
     assert len(history(samples(many)).events) == MOST

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.history import History, history
+from teamslam.central.desk.evaluation.history import history
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
@@ -19,22 +19,22 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def log() -> list[Sample]:
+def log():
     of = scenario(robots=2)
     return list(run_team(of, streams(of)))
 
 
 @pytest.fixture(scope="module")
-def run(log: list[Sample]) -> History:
+def run(log):
     return history(log)
 
 
-def test_every_byte_is_counted_under_its_key(run: History, log: list[Sample]) -> None:
+def test_every_byte_is_counted_under_its_key(run, log):
     assert sum(int(t.sizes.sum()) for t in run.traffic.values()) == sum(len(s.payload) for s in log)
     assert set(run.traffic) == {s.key for s in log}
 
 
-def test_nis_is_what_the_robots_said_of_their_windows(run: History, log: list[Sample]) -> None:
+def test_nis_is_what_the_robots_said_of_their_windows(run, log):
     said = [opened(s)[2] for s in log if s.key == ch.INNOVATION.key("r1")]
     submaps = [opened(s)[2] for s in log if s.key == ch.SUBMAP.key("r1")]
     found = run.innovations["r1"]
@@ -45,7 +45,7 @@ def test_nis_is_what_the_robots_said_of_their_windows(run: History, log: list[Sa
     assert resumed.innovations["r1"].per_dof == found.per_dof
 
 
-def test_the_cost_and_the_nees_are_those_of_each_map(run: History, log: list[Sample]) -> None:
+def test_the_cost_and_the_nees_are_those_of_each_map(run, log):
     keys = (ch.FUSED_MAP.key(), ch.FINAL_MAP.key())
     maps = [opened(s)[2] for s in log if s.key in keys]
     assert len(run.map_cost.values) == len([x for x in maps if x.dof])
@@ -100,7 +100,7 @@ def fused(stamp_ns: int, last: int, **fields: object) -> Outgoing:
     return Outgoing(ch.FUSED_MAP, "", message)
 
 
-def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used_it() -> None:
+def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used_it():
     windows = [submap(k, "r1") for k in range(2)]  # of measurements 0-9 and 10-19
     log = [measurement(k, 100 + 10 * k) for k in range(20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", w), 400) for w in windows]
@@ -110,7 +110,7 @@ def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used
     np.testing.assert_allclose(found.first_s, [0.350, 0.700])
 
 
-def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
+def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it():
     log = [measurement(k, 10 * k) for k in range(12, 20)]
     log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
     assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
@@ -128,7 +128,7 @@ def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it() -> None:
     assert history([*log, *absurd]).end_ns == 19 * MS
 
 
-def test_without_truth_there_is_the_cost_and_no_nees() -> None:
+def test_without_truth_there_is_the_cost_and_no_nees():
     of = scenario()
     hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
     blind = history([s for s in joined_log(of, 0.1) if s.key not in hidden])
@@ -137,6 +137,6 @@ def test_without_truth_there_is_the_cost_and_no_nees() -> None:
     assert final_map([1], np.zeros((1, 2)), np.eye(2)).message.dof == 20
 
 
-def test_an_empty_log_has_an_empty_history() -> None:
+def test_an_empty_log_has_an_empty_history():
     empty = history([])
     assert (empty.start_ns, empty.end_ns, empty.events, empty.traffic) == (0, 0, (), {})

@@ -13,7 +13,7 @@ from tests.support import examples
 FUSED = next(each for each in examples() if isinstance(each, m.FusedMap))
 
 
-def test_the_page_says_of_a_landmark_who_its_members_are_and_by_which_step() -> None:
+def test_the_page_says_of_a_landmark_who_its_members_are_and_by_which_step():
     count, words = sets_of(FUSED)[2**31 + 7]
     assert count == 2
     assert words == [
@@ -22,7 +22,7 @@ def test_the_page_says_of_a_landmark_who_its_members_are_and_by_which_step() -> 
     ]
 
 
-def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
+def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone():
     detector = EventDetector()
     first = [each for each in detector.take(FUSED, 0) if each.kind == "closure"]
     assert [each.text for each in first] == [
@@ -47,7 +47,7 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone() -> None:
     assert not [each for each in detector.take(again, 0) if each.kind in ("closure", "undone")]
 
 
-def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -> None:
+def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why():
     (made,) = FUSED.decisions
     waits = msgspec.structs.replace(made, kind="waits", why="evidence 3 < 12", absent=9)
     undone = msgspec.structs.replace(made, kind="undone", why="share 0.41 < 0.5")
@@ -57,7 +57,7 @@ def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why() -
     assert rows[2][1:6] == ("0.0", "12", "40", "9", "5")
 
 
-def test_the_report_scores_pairs_inside_windows_and_over_all() -> None:
+def test_the_report_scores_pairs_inside_windows_and_over_all():
     def pairs(missed: int) -> Pairs:
         return Pairs(right=30, wrong=10, missed=missed, wrong_detections=1, detections=50)
 
@@ -82,7 +82,7 @@ def test_the_report_scores_pairs_inside_windows_and_over_all() -> None:
     assert "4 rightly, 0 wrongly; 3 attempts wait" in score_sheet(found).note
 
 
-def test_a_nees_outside_of_its_band_says_what_that_means() -> None:
+def test_a_nees_outside_of_its_band_says_what_that_means():
     errors = map_errors(np.full((18, 2), 1.26), np.eye(36), np.zeros((18, 2)))
     assert 1.5 < errors.nees_per_dof < 1.6
     words = in_words(errors, joint=True)

@@ -19,7 +19,7 @@ STEPS = 60
 
 
 @pytest.fixture(scope="module")
-def samples() -> list[Sample]:
+def samples():
     return team_samples(thesis(STEPS))
 
 
@@ -35,9 +35,7 @@ def submap_changed(samples: list[Sample], sequence: int, **fields: int) -> list[
     return changed(samples, ch.SUBMAP, change)
 
 
-def test_a_good_log_disposes_of_each_measurement_once(
-    samples: list[Sample], tmp_path: Path
-) -> None:
+def test_a_good_log_disposes_of_each_measurement_once(samples, tmp_path):
     found = ledger_of(samples, tmp_path)
     assert found.offenders == ()
     (end,) = messages(samples, ch.END)
@@ -52,7 +50,7 @@ def test_a_good_log_disposes_of_each_measurement_once(
     )
 
 
-def test_every_submap_names_the_maps_that_used_it(samples: list[Sample], tmp_path: Path) -> None:
+def test_every_submap_names_the_maps_that_used_it(samples, tmp_path):
     found = ledger_of(samples, tmp_path)
     (final,) = messages(samples, ch.FINAL_MAP)
     assert len(found.maps) == 2 * STEPS // 10
@@ -60,7 +58,7 @@ def test_every_submap_names_the_maps_that_used_it(samples: list[Sample], tmp_pat
     assert len(found.maps["r1", 1, 0]) > len(found.maps["r1", 1, 5])
 
 
-def test_a_measurement_in_two_submaps_is_named(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_in_two_submaps_is_named(samples, tmp_path):
     second = messages(samples, ch.SUBMAP, "r1")[1]
     twice = submap_changed(samples, 1, first_measurement=second.first_measurement - 1)
     (offender,) = ledger_of(twice, tmp_path).offenders
@@ -68,7 +66,7 @@ def test_a_measurement_in_two_submaps_is_named(samples: list[Sample], tmp_path: 
     assert offender == f"measurement {counter} of r1, incarnation 1 is in two submaps: 0 and 1"
 
 
-def test_a_measurement_that_no_submap_took_is_named(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_that_no_submap_took_is_named(samples, tmp_path):
     second = messages(samples, ch.SUBMAP, "r1")[1]
     skipped = submap_changed(samples, 1, first_measurement=second.first_measurement + 1)
     offenders = ledger_of(skipped, tmp_path).offenders
@@ -77,18 +75,14 @@ def test_a_measurement_that_no_submap_took_is_named(samples: list[Sample], tmp_p
     assert "r1, incarnation 1 reports" in offenders[1]
 
 
-def test_a_submap_of_measurements_that_are_not_there_is_named(
-    samples: list[Sample], tmp_path: Path
-) -> None:
+def test_a_submap_of_measurements_that_are_not_there_is_named(samples, tmp_path):
     last = messages(samples, ch.SUBMAP, "r1")[-1]
     beyond = submap_changed(samples, last.sequence, last_measurement=last.last_measurement + 2**40)
     (offender,) = ledger_of(beyond, tmp_path).offenders
     assert offender.startswith(f"submap {last.sequence} of r1, incarnation 1 uses measurement")
 
 
-def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
-    samples: list[Sample], tmp_path: Path
-) -> None:
+def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(samples, tmp_path):
     gone = changed(samples, ch.SUBMAP, lambda x: None if (x.robot, x.sequence) == ("r2", 5) else x)
     (final,) = messages(samples, ch.FINAL_MAP)
     found = ledger_of(gone, tmp_path)
@@ -98,9 +92,7 @@ def test_a_map_of_a_submap_that_is_not_in_the_log_is_named(
     )
 
 
-def test_a_measurement_that_was_changed_and_sent_again_is_named(
-    samples: list[Sample], tmp_path: Path
-) -> None:
+def test_a_measurement_that_was_changed_and_sent_again_is_named(samples, tmp_path):
     copy = next(s for s in samples if s.key == ch.ODOMETRY.key("r1"))
     counter = messages([copy], ch.ODOMETRY, "r1")[0].number
     (again,) = changed([copy], ch.ODOMETRY, lambda x: msgspec.structs.replace(x, forward=9.0))
@@ -111,7 +103,7 @@ def test_a_measurement_that_was_changed_and_sent_again_is_named(
     )
 
 
-def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> None:
+def test_a_robots_false_word_is_named(samples, tmp_path):
     def lie(done: m.Message) -> m.Message:
         ledger = tuple(
             m.Disposition(disposition=d.disposition, measurements=d.measurements + 1)
@@ -124,7 +116,7 @@ def test_a_robots_false_word_is_named(samples: list[Sample], tmp_path: Path) -> 
     assert all(offender.startswith("r2, incarnation 1") for offender in offenders)
 
 
-def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path: Path) -> None:
+def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path):
     found = ledger_of(said(restless(2, dies=True)), tmp_path)
     assert found.offenders == ()
     lost = found.totals("r1")
@@ -133,15 +125,11 @@ def test_a_dead_robots_last_measurements_are_open_or_lost(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("cache", [None, 0])
-def test_restarts_and_new_incarnations_use_no_measurement_twice(
-    cache: int | None, tmp_path: Path
-) -> None:
+def test_restarts_and_new_incarnations_use_no_measurement_twice(cache, tmp_path):
     assert ledger_of(said(restless(1, cache=cache)), tmp_path).offenders == ()
 
 
-def test_the_command_ends_with_1_and_names_the_offender(
-    samples: list[Sample], tmp_path: Path
-) -> None:
+def test_the_command_ends_with_1_and_names_the_offender(samples, tmp_path):
     good = written(tmp_path / "good.mcap", samples)
     runner = CliRunner()
     proof = runner.invoke(app, ["verify-ledger", str(good.path)])

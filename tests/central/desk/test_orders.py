@@ -65,7 +65,7 @@ def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object
     return centre
 
 
-def test_an_order_is_given_once_and_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_order_is_given_once_and_followed(monkeypatch):
     centre = ordered(monkeypatch, final=False, withdrawn=("r3",))
     (order,) = centre.orders
     assert (order.robot, order.by, order.reason) == ("r3", "operator", "a flat wheel")
@@ -79,34 +79,30 @@ def test_an_order_is_given_once_and_followed(monkeypatch: pytest.MonkeyPatch) ->
         ({}, "no map without r3 within 1 s"),
     ],
 )
-def test_an_order_that_is_not_followed_says_why(
-    monkeypatch: pytest.MonkeyPatch, answer: dict[str, object], why: str
-) -> None:
+def test_an_order_that_is_not_followed_says_why(monkeypatch, answer, why):
     with pytest.raises(WithdrawError, match=why):
         ordered(monkeypatch, **answer)
 
 
-def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch):
     with pytest.raises(WithdrawError, match=r"no robot r9; its robots: r3"):
         ordered(monkeypatch, robot="r9")
 
 
-def test_without_a_centre_there_is_nobody_to_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_centre_there_is_nobody_to_order(monkeypatch):
     monkeypatch.setattr(orders, "CENTRE_S", 0.2)
     with pytest.raises(WithdrawError, match="no centre and no peer answers"):
         withdraw(MemoryBus(MemoryNetwork()), "r3", "a flat wheel", 1.0)
 
 
 @pytest.mark.parametrize(("robot", "team"), [("R 3", "thesis"), ("r3", "a/b")])
-def test_names_that_are_none_are_wrong_use(robot: str, team: str) -> None:
+def test_names_that_are_none_are_wrong_use(robot, team):
     refused = CliRunner().invoke(app, ["withdraw", robot, "--team", team])
     assert refused.exit_code == 2
     assert "is no" in refused.stderr
 
 
-def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(monkeypatch):
     network = MemoryNetwork()
     bus = MemoryBus(network)
     bus.declare_alive("central")
@@ -133,9 +129,7 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(
     assert "r3 is given up" in node.status().warnings[0]
 
 
-def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkeypatch):
     """Invalid payloads on every key that the commands read."""
     monkeypatch.setattr(orders, "CENTRE_S", 0.3)
     network = MemoryNetwork()
@@ -185,17 +179,13 @@ def pair(same: bool) -> m.Judgement:
     return m.Judgement(first=first, second=second, same=same)
 
 
-def test_a_verdict_on_a_robot_that_the_team_does_not_have_is_wrong_use(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_verdict_on_a_robot_that_the_team_does_not_have_is_wrong_use(monkeypatch):
     refused = said(monkeypatch, "same", "r3/1/2/3", "r9/1/77/1", rests_on=())
     assert refused.exit_code == 2
     assert "the team has no robot r9; its robots: r3" in refused.stderr
 
 
-def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(monkeypatch):
     names, both = ("r3/1/4/5", "r3/1/2/3"), (pair(True), pair(False))
     alone = said(monkeypatch, "different", *names, rests_on=both[1:])
     assert (alone.exit_code, alone.stderr) == (0, "")
@@ -207,9 +197,7 @@ def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(
     assert "have an earlier verdict, different, which is what holds" in in_vain.stderr
 
 
-def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(monkeypatch):
     a, b, c, d = (local_landmark(f"r3/1/{k}/0") for k in range(4))
     one = m.Judgement(first=a, second=b, same=True), m.Judgement(first=c, second=b, same=True)
     two = m.Judgement(first=a, second=c, same=False)
@@ -226,7 +214,7 @@ def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(
     assert said(monkeypatch, "same", "r3/1/2/0", "r3/1/3/0", rests_on=every).exit_code == 0
 
 
-def test_a_report_names_the_verdicts_and_which_of_them_the_map_rests_on() -> None:
+def test_a_report_names_the_verdicts_and_which_of_them_the_map_rests_on():
     other = m.Judgement(
         first=local_landmark("r3/1/77/1"), second=local_landmark("r3/1/4/5"), same=True
     )

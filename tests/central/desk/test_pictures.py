@@ -1,7 +1,6 @@
-"""Pictures and the report: drawn where there is something to draw, self-contained, readable."""
+"""Pictures of a run, on the page and for a paper."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -9,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.text import Text
 from PIL import Image
 from rich.console import Console
 
@@ -18,14 +19,25 @@ from teamslam.central.desk.drawing import (
     curve_through,
     ellipses,
 )
-from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
 from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.pictures import film
 from teamslam.central.desk.pictures.run import (
     error_picture,
     map_picture,
+    new_figure,
 )
-from teamslam.central.desk.pictures.style import Form, Look, Picture, Style
+from teamslam.central.desk.pictures.style import (
+    PAPER_DPI,
+    PAPER_PT,
+    Form,
+    Look,
+    Picture,
+    Style,
+    drawn_in,
+    parsed_width,
+    save,
+)
 from teamslam.central.desk.report.page import write_pictures
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
@@ -38,15 +50,13 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture(scope="module")
-def run() -> Evaluation:
+def run():
     return evaluate(joined_log(scenario(robots=2), 0.1))
 
 
 @settings(deadline=None, max_examples=50)
 @given(a=st.floats(0.1, 5.0), b=st.floats(0.1, 5.0), share=st.floats(-0.95, 0.95))
-def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
-    a: float, b: float, share: float
-) -> None:
+def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(a, b, share):
     P = np.array([[a, share * np.sqrt(a * b)], [share * np.sqrt(a * b), b]])
     (major,), (minor,), (turn,) = ellipses(np.array([[P[0, 0], P[0, 1], P[1, 1]]]))
     ends = (
@@ -59,7 +69,7 @@ def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(
 
 
 @pytest.mark.parametrize("speed", [0.4, -0.4])
-def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed: float) -> None:
+def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed):
     theta = np.array([0.3, 0.35, 2.0, 3.3])  # an eye for landmarks only at these; up to 95° between
     radius = speed / 0.2
     arc = np.column_stack([radius * np.sin(theta), -radius * np.cos(theta), theta])
@@ -70,14 +80,14 @@ def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed: float) 
     assert curve_through(on_the_spot).tolist() == on_the_spot[:, :2].tolist()
 
 
-def test_both_pictures_are_drawn(run: Evaluation, tmp_path: Path) -> None:
+def test_both_pictures_are_drawn(run, tmp_path):
     assert map_picture(run, tmp_path / "map.png")
     assert error_picture(run, tmp_path / "errors.png")
     assert (tmp_path / "map.png").read_bytes().startswith(PNG)
     assert (tmp_path / "errors.png").read_bytes().startswith(PNG)
 
 
-def test_the_same_run_draws_the_same_bytes(run: Evaluation, tmp_path: Path) -> None:
+def test_the_same_run_draws_the_same_bytes(run, tmp_path):
     pictures = []
     for name in ("a.png", "b.png"):
         map_picture(run, tmp_path / name)
@@ -85,7 +95,7 @@ def test_the_same_run_draws_the_same_bytes(run: Evaluation, tmp_path: Path) -> N
     assert pictures[0] == pictures[1]
 
 
-def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> None:
+def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path):
     hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
     blind = evaluate([s for s in joined_log(scenario(), 0.1) if s.key not in hidden])
     assert map_picture(blind, tmp_path / "map.png")
@@ -93,13 +103,11 @@ def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path: Path) -> N
     assert not (tmp_path / "errors.png").exists()
 
 
-def test_an_empty_run_draws_nothing(tmp_path: Path) -> None:
+def test_an_empty_run_draws_nothing(tmp_path):
     assert not map_picture(evaluate([]), tmp_path / "map.png")
 
 
-def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
-    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_path, monkeypatch):
     """The path of a robot that had never joined began at the origin of the others' map."""
     drawn: list[Figure] = []
     monkeypatch.setattr(
@@ -116,9 +124,7 @@ def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(
     assert not any("online" in label for label in labels)
 
 
-def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(
-    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(run, tmp_path, monkeypatch):
     monkeypatch.setattr(film, "FRAMES", 3)
     monkeypatch.setattr(film, "LAST_FRAMES", 1)
     log = joined_log(scenario(robots=2), 0.1)
@@ -134,13 +140,12 @@ def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(
 
 
 def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_factor(
-    run: Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    run, tmp_path, monkeypatch
+):
     drawn: list[Figure] = []
     monkeypatch.setattr(
         "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
     )
-    assert run.map is not None
     small = replace(run, map=replace(run.map, covariance=1e-8 * np.eye(len(run.map.covariance))))
     assert map_picture(small, tmp_path / "map.png")
     (legend,) = drawn[0].legends
@@ -154,10 +159,9 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     np.testing.assert_allclose(found[: len(expected)], expected)
 
 
-def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
+def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed():
     of = scenario()
     truth = streams(of).streams[0].truth
-    assert truth is not None
     said = online(ch.OWN_POSE, truth[1:] + np.array([3.0, 4.0, 0.0]), of)
     console = Console(width=80, record=True, force_terminal=False)
     console.print(summary_tables(evaluate(world_log(of) + samples(said)))[1])
@@ -173,10 +177,7 @@ def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed() -> None:
         ("kalman", "> 1000: over-confident (measurements counted again)"),
     ],
 )
-def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
-    run: Evaluation, fusion: str, said: str
-) -> None:
-    assert run.map is not None
+def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(run, fusion, said):
     assert run.map.errors is not None
     assert run.scenario is not None
     absurd = replace(
@@ -191,7 +192,7 @@ def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(
     assert to_json(absurd)["map_nees_per_dof"] == 6e18
 
 
-def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path: Path) -> None:
+def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path):
     of = scenario(robots=2)
     log = joined_log(of, 0.1)
     run = Run(evaluate(log), history(log), {})
@@ -205,7 +206,7 @@ def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path: Path) -> None:
     assert svg != titled.read_text()
 
 
-def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path: Path) -> None:
+def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):
     of = scenario(robots=2)
     world = msgspec.structs.replace(of.world, unknown_starts=("*",))
     log = joined_log(msgspec.structs.replace(of, world=world), 0.1)
@@ -219,3 +220,38 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path: Pa
     assert not error_picture(run, tmp_path / "errors.png")
     assert map_picture(run, tmp_path / "map.png")
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
+
+
+@pytest.mark.parametrize(
+    ("text", "inches"), [("3.5in", 3.5), ("89mm", 89 / 25.4), ("8.9 cm", 8.9 / 2.54)]
+)
+def test_a_width_is_read_in_several_units(text, inches):
+    assert parsed_width(text) == pytest.approx(inches)
+
+
+@pytest.mark.parametrize("text", ["3.5", "wide", "0.1in", "9000mm", "-3in"])
+def test_a_width_that_is_none_is_refused(text):
+    with pytest.raises(ValueError, match=r"give a width from 1in to 40in, as 3\.5in or 89mm"):
+        parsed_width(text)
+
+
+def test_png_for_a_paper_does_not_take_the_names_of_the_page():
+    names = [Style(look, Form.PNG).file_name(Picture.MAP) for look in Look]
+    assert names == ["map.png", "map-paper.png"]
+
+
+@pytest.mark.parametrize(("width_in", "inches"), [(None, 3.5), (2.5, 2.5)])
+def test_a_picture_has_the_width_of_the_column_and_its_text_true_to_size(
+    tmp_path, width_in, inches
+):
+    figure, axes = new_figure(9.0, 9.0, 1, 1)
+    axes[0][0].plot([0, 1], [0, 1], "o-", label="r1")
+    axes[0][0].set_xlabel("x [m]")
+    axes[0][0].set_title("a title", fontsize=12)
+    axes[0][0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.07))
+    with drawn_in(Style(Look.PAPER, Form.PNG, None, width_in)):
+        save(figure, tmp_path / "a.png")
+    assert np.asarray(imread(tmp_path / "a.png")).shape[1] == round(inches * PAPER_DPI)
+    texts = [each for each in figure.findobj(Text) if each.get_text()]
+    assert {each.get_fontsize() for each in texts} == {PAPER_PT}
+    assert "a title" not in [each.get_text() for each in texts]

@@ -35,7 +35,7 @@ def page_of(run: Run, folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def log() -> list[Sample]:
+def log():
     """A run in memory, which has no wall clock: each message a millisecond after the one before."""
     of = scenario(robots=2)
     return [
@@ -45,12 +45,12 @@ def log() -> list[Sample]:
 
 
 @pytest.fixture
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_pictures(monkeypatch):
     """To draw them takes longer than all else, and the test is about the page's words."""
     monkeypatch.setattr(report_page, "write_pictures", lambda *_: {})
 
 
-def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Path) -> None:
+def test_it_is_one_page_that_needs_nothing_else(log, tmp_path):
     run = run_of(log, seed="1")
     paths = write_report(run, tmp_path / "new", to_json(run.evaluation, run_figures(run)))
     names = [path.name for path in paths]
@@ -76,7 +76,7 @@ def test_it_is_one_page_that_needs_nothing_else(log: list[Sample], tmp_path: Pat
     assert figures["bytes_per_s"][ch.SUBMAP.key("r1")] > 0.0
 
 
-def test_clocks_that_disagree_still_give_a_page(log: list[Sample], tmp_path: Path) -> None:
+def test_clocks_that_disagree_still_give_a_page(log, tmp_path):
     behind = [
         msgspec.structs.replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log
     ]
@@ -85,7 +85,7 @@ def test_clocks_that_disagree_still_give_a_page(log: list[Sample], tmp_path: Pat
     assert 'id="latency"' in page_of(run_of(behind), tmp_path)  # a warning would be an error here
 
 
-def test_what_a_log_says_can_not_become_markup(log: list[Sample], tmp_path: Path) -> None:
+def test_what_a_log_says_can_not_become_markup(log, tmp_path):
     run = run_of(log, commit="<b>", long="<i>" * 100)
     bad = "<script>alert(1)</script> [red]x[/nothing]"
     evaluation = replace(run.evaluation, notes=(bad,))
@@ -98,7 +98,7 @@ def test_what_a_log_says_can_not_become_markup(log: list[Sample], tmp_path: Path
     assert "<td>&lt;b&gt;</td>" in page
 
 
-def test_without_truth_there_are_the_monitor_and_nis(log: list[Sample], tmp_path: Path) -> None:
+def test_without_truth_there_are_the_monitor_and_nis(log, tmp_path):
     blind = [s for s in log if not s.key.startswith("truth")]
     run = run_of(blind)
     page = page_of(run, tmp_path)
@@ -112,7 +112,7 @@ def test_without_truth_there_are_the_monitor_and_nis(log: list[Sample], tmp_path
 
 
 @pytest.mark.parametrize("count", [0, 1, 30])
-def test_a_log_that_stops_anywhere_is_reported(count: int, tmp_path: Path) -> None:
+def test_a_log_that_stops_anywhere_is_reported(count, tmp_path):
     page = page_of(run_of(world_log(scenario())[:count]), tmp_path)
     assert "did not finish" in page
 
@@ -124,7 +124,7 @@ def written(log: list[Sample], path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("_without_pictures")
-def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: Path) -> None:
+def test_the_command_proves_the_ledger_and_says_so(log, tmp_path):
     file = written(log, tmp_path / "log.mcap")
     done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
@@ -138,7 +138,7 @@ def test_the_command_proves_the_ledger_and_says_so(log: list[Sample], tmp_path: 
 
 
 @pytest.mark.usefixtures("_without_pictures")
-def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_path: Path) -> None:
+def test_a_measurement_used_twice_is_named_on_the_page(log, tmp_path):
     run = run_of(log)
     name = "measurement 7 of r1, incarnation 1 is in two submaps: 0 and 1"
     offending = Ledger({("r1", 1): 3 * (Entry("in a submap", 0),)}, {}, (name,))
@@ -147,9 +147,7 @@ def test_a_measurement_used_twice_is_named_on_the_page(log: list[Sample], tmp_pa
 
 
 @pytest.mark.usefixtures("_without_pictures")
-def test_a_log_that_lacks_what_the_ledger_needs_names_it_beside_the_run_or_in_a_folder(
-    tmp_path: Path,
-) -> None:
+def test_a_log_that_lacks_what_the_ledger_needs_names_it_beside_the_run_or_in_a_folder(tmp_path):
     file = written(joined_log(scenario(), 0.1), tmp_path / "log.mcap")
     done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output

@@ -1,19 +1,19 @@
-"""Every robot of the team has a state in the result, with the reason."""
+"""Robots that are withdrawn, not joined or lost, in results and reruns."""
 
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
 from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
+from teamslam.central.desk.verification.differences import first_difference
 from teamslam.sim.cli.rerun import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.world.simulator import simulated
@@ -22,26 +22,29 @@ from teamslam.team.containment import Boundary
 from teamslam.team.shell import FaultyRunError, judge
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 from tests.central.test_withdrawal import run, scenario
 from tests.sim.reruns import written
+from tests.support import packed, spd
 
 
 @pytest.fixture(scope="module")
-def samples() -> list[Sample]:
+def samples():
     """A run in memory of which the centre withdraws r3."""
     return run(scenario(), "odometry")
 
 
 @pytest.fixture(scope="module")
-def result(samples: list[Sample]) -> Evaluation:
+def result(samples):
     return evaluate(samples)
 
 
 def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_why(
-    samples: list[Sample], result: Evaluation, tmp_path: Path
-) -> None:
+    samples, result, tmp_path
+):
     state = result.states["r3"]
     assert state.state == "withdrawn"
     assert state.why.startswith("by central: its submaps contradict")
@@ -58,9 +61,7 @@ def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_
     assert "r3: by central: its submaps contradict" in (tmp_path / "report.html").read_text()
 
 
-def test_a_rerun_gives_the_same_warnings_and_ends_with_1(
-    samples: list[Sample], result: Evaluation, tmp_path: Path
-) -> None:
+def test_a_rerun_gives_the_same_warnings_and_ends_with_1(samples, result, tmp_path):
     log = written(tmp_path / "log.mcap", samples)
     figures = tmp_path / "rerun.json"
     path = str(log.path)
@@ -75,8 +76,8 @@ def test_a_rerun_gives_the_same_warnings_and_ends_with_1(
 
 
 def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothing_is_named(
-    samples: list[Sample],
-) -> None:
+    samples,
+):
     def changed(final: m.FusedMap) -> m.FusedMap:
         why = ("r2 (incarnation 1) not joined: 0 shared landmarks, 2 needed",)
         members = tuple(each for each in final.members if each.robot != "r1")
@@ -102,7 +103,7 @@ def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]
     ]
 
 
-def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed() -> None:
+def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
     """r1 alone has a known start; it is withdrawn, and the map is in the frame of r2."""
     of = scenario()
     streams = simulated(of.world, of.robots, of.seed)
@@ -136,9 +137,28 @@ def without_starts(streams: WorldStreams, *robots: str) -> WorldStreams:
     )
 
 
-def test_a_process_whose_final_map_is_without_a_withdrawn_robot_ends_with_1(
-    samples: list[Sample],
-) -> None:
+def test_a_process_whose_final_map_is_without_a_withdrawn_robot_ends_with_1(samples):
     final = next(s for s in reversed(samples) if s.key == ch.FINAL_MAP.key())
     with pytest.raises(FaultyRunError, match="the final map is without r3: withdrawn"):
         judge(Boundary("robot/r1"), decoded(final.payload, m.FusedMap))
+
+
+def prior(value: float) -> m.Prior:
+    bias = m.BiasEstimate(robot="r1", incarnation=0, bias="bearing", value=value, sigma=0.1)
+    return build.prior(
+        incarnation=0,
+        ids=b"",
+        mean=from_floats([0.0] * 3),
+        covariance=packed(spd(3)),
+        biases=(bias,),
+    )
+
+
+def test_a_bias_that_rounding_has_moved_differs_only_where_bits_are_promised():
+    there, here = prior(0.25), prior(0.25 * (1.0 + 1e-15))
+    assert first_difference(there, here, exact=False) is None
+    exact = first_difference(there, here, exact=True)
+    assert exact.field == "biases"
+    assert first_difference(there, prior(0.26), exact=False) is not None
+    fewer = msgspec.structs.replace(there, biases=())
+    assert first_difference(there, fewer, exact=False) is not None

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -32,7 +31,7 @@ from tests.support import fused_map, submap
 
 
 @pytest.fixture(scope="module")
-def log() -> list[Sample]:
+def log():
     of = scenario(robots=2)
     return list(run_team(of, streams(of)))
 
@@ -44,7 +43,7 @@ def recorded_of(samples: list[Sample]) -> Recorded:
     return found
 
 
-def test_a_path_has_every_keyframe_and_the_final_maps_ends(log: list[Sample]) -> None:
+def test_a_path_has_every_keyframe_and_the_final_maps_ends(log):
     run = evaluate(log)
     for robot, path in smoothed_paths(recorded_of(log)).items():
         ends = run.robots[robot].smoothed_path
@@ -55,7 +54,7 @@ def test_a_path_has_every_keyframe_and_the_final_maps_ends(log: list[Sample]) ->
         np.testing.assert_array_equal(path.poses[at_ends], ends.poses)
 
 
-def test_between_the_ends_the_covariance_is_that_of_the_errors(log: list[Sample]) -> None:
+def test_between_the_ends_the_covariance_is_that_of_the_errors(log):
     """NEES/3 per pose of two robots, between the ends of the submaps."""
     run = evaluate(log)
     within = []
@@ -64,12 +63,11 @@ def test_between_the_ends_the_covariance_is_that_of_the_errors(log: list[Sample]
         kept[0] = False  # the initial pose is exactly known
         poses = Poses(path.stamps_ns[kept], path.poses[kept])
         errors = pose_errors(poses, path.covariances[kept], run.robots[robot].truth)
-        assert errors is not None
         within.append(errors.nees / 3.0)
     assert 0.3 < float(np.concatenate(within).mean()) < 2.0
 
 
-def test_without_the_measurements_the_ends_are_what_there_is(log: list[Sample]) -> None:
+def test_without_the_measurements_the_ends_are_what_there_is(log):
     said = [sample for sample in log if "/odometry" not in sample.key]
     ends = {name: robot.smoothed_path for name, robot in evaluate(log).robots.items()}
     for robot, path in smoothed_paths(recorded_of(said)).items():
@@ -77,10 +75,9 @@ def test_without_the_measurements_the_ends_are_what_there_is(log: list[Sample]) 
         np.testing.assert_array_equal(path.poses, ends[robot].poses)
 
 
-def test_the_tables_come_back_to_the_last_bit(log: list[Sample], tmp_path: Path) -> None:
+def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
     home = take_home(recorded_of(log))
     fused = evaluate(log).map
-    assert fused is not None
     write_map(fused, home.measurements, tmp_path)
     with (tmp_path / "map.csv").open() as lines:
         rows = list(csv.DictReader(lines))
@@ -102,7 +99,7 @@ def test_the_tables_come_back_to_the_last_bit(log: list[Sample], tmp_path: Path)
     np.testing.assert_array_equal(read[:, 5], home.paths["r1"].covariances[:, 0, 1])
 
 
-def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_counted() -> None:
+def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_counted():
     def table(*numbers: int) -> bytes:
         return from_ids(np.array(numbers, np.uint32))
 

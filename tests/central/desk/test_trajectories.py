@@ -62,13 +62,13 @@ def asked(program: str, relation: str, options: tuple[str, ...], folder: FilePat
 
 
 @pytest.mark.parametrize("name", sorted(FIGURES))
-def test_our_figure_is_evos(name: str) -> None:
+def test_our_figure_is_evos(name):
     ours = trajectory_errors(*paths())
     assert ours is not None
     assert getattr(ours, name) == pytest.approx(json.loads(GOLDEN.read_text())[name], rel=1e-6)
 
 
-def test_evo_still_says_what_the_golden_file_holds(tmp_path: FilePath) -> None:
+def test_evo_still_says_what_the_golden_file_holds(tmp_path):
     if shutil.which("evo_ape") is None:
         pytest.skip("evo_ape is not on the path: pip install evo, in an environment of its own")
     golden = json.loads(GOLDEN.read_text())
@@ -76,29 +76,26 @@ def test_evo_still_says_what_the_golden_file_holds(tmp_path: FilePath) -> None:
         assert asked(program, relation, options, tmp_path) == pytest.approx(golden[name], rel=1e-6)
 
 
-def test_a_path_that_is_its_truth_has_no_error_and_another_frame_only_an_absolute_one() -> None:
+def test_a_path_that_is_its_truth_has_no_error_and_another_frame_only_an_absolute_one():
     _, true = paths()
     exact = trajectory_errors(true, true)
-    assert exact is not None
     assert max(exact.ape_m, exact.ape_rad, exact.rpe_m, exact.rpe_rad) < 1e-12
     moved = Path(true.stamps_ns, true.poses + np.array([3.0, 4.0, 0.0]))
     found = trajectory_errors(moved, true)
-    assert found is not None
     assert found.ape_m == pytest.approx(5.0)
     assert max(found.ape_aligned_m, found.rpe_m) < 1e-12
 
 
-def test_what_has_no_truth_has_no_error_and_one_pose_no_relative_one() -> None:
+def test_what_has_no_truth_has_no_error_and_one_pose_no_relative_one():
     estimate, true = paths()
     assert trajectory_errors(estimate, Path(np.empty(0, np.int64), np.empty((0, 3)))) is None
     one = trajectory_errors(Path(estimate.stamps_ns[:1], estimate.poses[:1]), true)
-    assert one is not None
     assert one.poses == 1
     assert one.rpe_m is None
     assert one.ape_aligned_m is None
 
 
-def test_a_file_has_each_pose_with_its_nanoseconds_and_its_turn(tmp_path: FilePath) -> None:
+def test_a_file_has_each_pose_with_its_nanoseconds_and_its_turn(tmp_path):
     stamps = np.array([-1_500_000_000, 0, START_NS])
     poses = np.array([[1.0, 2.0, 0.0], [0.1, -0.2, np.pi], [3.0, 4.0, -np.pi / 2]])
     write_tum(Path(stamps, poses), tmp_path / "a.tum")
@@ -112,7 +109,7 @@ def test_a_file_has_each_pose_with_its_nanoseconds_and_its_turn(tmp_path: FilePa
     np.testing.assert_allclose(np.cos(turns - poses[:, 2]), 1.0)
 
 
-def test_every_robots_paths_are_written_and_agree_with_the_figures(tmp_path: FilePath) -> None:
+def test_every_robots_paths_are_written_and_agree_with_the_figures(tmp_path):
     of = scenario(robots=2)
     run = evaluate(run_team(of, streams(of)))
     written = write_trajectories(run, tmp_path)
@@ -122,5 +119,4 @@ def test_every_robots_paths_are_written_and_agree_with_the_figures(tmp_path: Fil
     tables = [np.loadtxt(tmp_path / f"r1.online{k}.tum") for k in ("", ".truth")]
     np.testing.assert_array_equal(tables[0][:, 0], tables[1][:, 0])
     distances = np.hypot(*(tables[0][:, 1:3] - tables[1][:, 1:3]).T)
-    assert ours is not None
     assert np.sqrt(np.mean(distances**2)) == pytest.approx(ours.ape_m)

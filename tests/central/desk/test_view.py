@@ -2,7 +2,6 @@
 
 import json
 from collections import defaultdict
-from pathlib import Path
 
 import jsonschema
 import msgspec
@@ -34,7 +33,6 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire import views
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
-from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded
 from tests import build
 from tests.support import fused_map, spd
@@ -43,7 +41,7 @@ S = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def samples() -> list[Sample]:
+def samples():
     """Run two robots for 40 steps of the thesis' world."""
     scenario = with_options(load("thesis"), seed=1)
     scenario = msgspec.structs.replace(
@@ -53,7 +51,7 @@ def samples() -> list[Sample]:
 
 
 @pytest.fixture(scope="module")
-def exported(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(samples, tmp_path_factory):
     folder = tmp_path_factory.mktemp("view")
     with Recorder(folder / "log.mcap", "thesis", {}) as recorder:
         recorder.write(samples)
@@ -62,7 +60,7 @@ def exported(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="module")
-def read(exported: Path) -> dict[str, list[tuple[int, object]]]:
+def read(exported):
     """(log time, message) by topic, decoded by the schemas in the file alone."""
     found = defaultdict(list)
     with exported.open("rb") as file:
@@ -241,7 +239,6 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
         assert errors.known() is None
         step()
     found = errors.known()
-    assert found is not None
     np.testing.assert_allclose(found.errors, [[0.5, 0.0, 0.0]])
     np.testing.assert_allclose(found.nees, [1.0])
 
@@ -269,11 +266,9 @@ def test_the_nees_of_a_joint_map_is_that_of_the_report():
     )
     true = np.array([[0.0, 0.0], [5.0, 5.0]])
     fit = TrueLandmarks(np.array([4, 7], np.uint32), true).fit(fused)
-    assert fit is not None
     assert fit.nees_per_dof == pytest.approx(map_errors(means, P, true).nees_per_dof)
     assert fit.nees_per_dof != pytest.approx(0.25 * (1.0 / 0.45 + 0.25 / 0.45))
     of_one = TrueLandmarks(np.array([7], np.uint32), true[1:]).fit(fused)
-    assert of_one is not None
     e = means[1] - true[1]
     assert of_one.nees_per_dof == pytest.approx(e @ np.linalg.solve(P[2:, 2:], e) / 2.0)
 
@@ -285,7 +280,6 @@ def test_the_nees_of_a_map_of_blocks_is_the_mean_over_its_landmarks():
         covariance=from_floats([0.25, 0.0, 1.0] * 2),
     )
     fit = TrueLandmarks(np.array([4], np.uint32), np.zeros((1, 2))).fit(fused)
-    assert fit is not None
     assert (fit.landmarks, fit.rmse_m, fit.nees_per_dof) == (1, 1.0, 2.0)
     assert TrueLandmarks().fit(fused) is None
 

@@ -5,7 +5,6 @@ import json
 import re
 import socket
 from collections import defaultdict
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from http.client import HTTPConnection
 from pathlib import Path
@@ -39,12 +38,12 @@ PAGE = ROOT / "central" / "desk" / "view" / "page"
 
 
 @pytest.fixture(scope="module")
-def samples() -> list[Sample]:
+def samples():
     return list(crowd(ROBOTS, LANDMARKS, SECONDS))
 
 
 @pytest.fixture(scope="module")
-def log(samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(samples, tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "log.mcap"
     with Recorder(path, "crowd", {"seed": "7", "scenario": '{"name": "small crowd"}'}) as recorder:
         recorder.write(samples)
@@ -60,7 +59,7 @@ def told(path: Path) -> list[dict[str, object]]:
 
 
 @pytest.fixture(scope="module")
-def frames(log: Path) -> dict[str, list[dict[str, object]]]:
+def frames(log):
     """Return the page's frames of the log by kind."""
     found = defaultdict(list)
     for frame in told(log):
@@ -92,7 +91,7 @@ def test_the_page_gets_every_pose_and_its_error(frames):
         assert 0.7 < errors[:, 6].mean() < 1.3
 
 
-def test_the_page_is_told_when_a_robots_poses_are_in_another_frame() -> None:
+def test_the_page_is_told_when_a_robots_poses_are_in_another_frame():
     """Its earlier path is in its own frame, which is no place in the team's map."""
     page = PageFrames()
 
@@ -127,7 +126,7 @@ def told_of(*messages: tuple[ch.Channel, m.Message]) -> list[dict[str, object]]:
     return [json.loads(frame) for frame in page.flush()]
 
 
-def test_the_page_gets_measurements_in_the_robots_frame() -> None:
+def test_the_page_gets_measurements_in_the_robots_frame():
     """A sensor that looks to the left, half a metre ahead; a landmark at most twice a second."""
     sensor = {"mount": [0.5, 0.0, np.pi / 2], "max_range": 30.0, "field_of_view": 2.0}
     config = build.configuration(configuration=json.dumps({"sensor": sensor}))
@@ -152,7 +151,7 @@ def test_the_page_gets_measurements_in_the_robots_frame() -> None:
     assert seen["v"] == [7, 0.5, 2.0, 8, 0.5, 2.0, 7, 0.5, 2.0, "r2", -0.5, 0.0]
 
 
-def test_the_page_is_told_what_a_node_waits_for_and_when_no_more() -> None:
+def test_the_page_is_told_what_a_node_waits_for_and_when_no_more():
     def status(*warnings: str) -> tuple[ch.Channel, m.Message]:
         return ch.STATUS, build.status(node="world", warnings=warnings)
 
@@ -161,7 +160,7 @@ def test_the_page_is_told_what_a_node_waits_for_and_when_no_more() -> None:
     assert [each["x"] for each in told if each["k"] == "wait"] == [[waits], []]
 
 
-def test_a_running_map_without_cross_covariances_has_no_nees(frames) -> None:
+def test_a_running_map_without_cross_covariances_has_no_nees(frames):
     """The report's NEES is that of the final map: one name has one definition."""
     *running, final = frames["map"]
     assert {each["nees"] for each in running} == {None}
@@ -255,7 +254,7 @@ def test_the_tail_of_what_is_no_log_says_so(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def shown(log: Path) -> Iterator[Shown]:
+def shown(log):
     with session(log, "127.0.0.1", 0, 0, growing=False) as found:
         wait_until(lambda: found.feed.ended, what="the log is read")
         yield found
@@ -396,7 +395,7 @@ def test_foxgloves_proxy_checks_host_and_origin(at, host, origins, let_in):
 
 
 @pytest.fixture(scope="module")
-def kept(samples: list[Sample]) -> list[Sample]:
+def kept(samples):
     return [s for s in with_views(samples) if ch.VIEW.owner(s.key) is not None]
 
 

@@ -19,9 +19,7 @@ FINAL = next(message for message in examples() if isinstance(message, m.FusedMap
 
 
 @pytest.mark.parametrize("lost", [(), ("r2",)])
-def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
-    lost: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(lost, monkeypatch):
     monkeypatch.setattr(the_end, "FINAL_S", 0.1)
     final = msgspec.structs.replace(FINAL, final=True, lost=lost, withdrawn=())
     network = MemoryNetwork()
@@ -45,9 +43,7 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(
         timer.cancel()
 
 
-def test_a_viewer_of_a_team_with_a_centre_does_not_end_by_a_robots_own_map(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_viewer_of_a_team_with_a_centre_does_not_end_by_a_robots_own_map(monkeypatch):
     """The robot's map, which names r2 as lost, is there before the centre's."""
     monkeypatch.setattr(the_end, "FINAL_S", 0.1)
     true = msgspec.structs.replace(FINAL, final=True, lost=(), withdrawn=())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from teamslam.team.config import AssociationSettings
-from teamslam.team.estimation.association.clustering import WindowAssociation, associate_window
+from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
@@ -152,14 +152,6 @@ def test_names_of_detections_are_kept_beside_detections_without_a_name():
     named = result.names[result.names != UNASSIGNED]
     assert (np.diff(named) > 0).all()
     assert (result.names[len(named) :] == UNASSIGNED).all()
-
-
-def test_the_same_window_gives_the_same_bits_and_truth_is_no_input():
-    scans, _ = window(5, clutter=0.2)
-    first, second = (associate_window(scans, SETTINGS) for _ in range(2))
-    for name in ("landmark_of", "counts", "seen", "clutter"):
-        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-    assert isinstance(first, WindowAssociation)
 
 
 def test_points_carry_the_covariance_of_range_and_bearing():

@@ -13,7 +13,6 @@ from teamslam.team.estimation.association.landmark_sets import (
     Opened,
     Verdict,
 )
-from teamslam.team.estimation.association.member_log import LocalLandmark
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick, share_now
 from teamslam.team.estimation.map_joining.joining import (
@@ -59,14 +58,12 @@ def _not_joined(fold: Fold) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def loop() -> tuple[list[Contribution], dict[LocalLandmark, int], Fold]:
+def loop():
     submaps, truth = drive("r1", LOOP, _world(5), np.random.default_rng(5))
     return submaps, truth, _folded(submaps)
 
 
-def test_a_loop_without_names_is_the_map_with_names(
-    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
-) -> None:
+def test_a_loop_without_names_is_the_map_with_names(loop):
     _, truth, fold = loop
     assert wrong(fold.landmarks, truth) == duplicates(fold.landmarks, truth) == 0
     order = np.random.default_rng(5)
@@ -83,9 +80,7 @@ def test_a_loop_without_names_is_the_map_with_names(
     assert 0.7 < agreement.chi2 / agreement.dof < 1.3
 
 
-def test_the_fold_repeats_its_bits_and_submaps_with_names_add_no_set(
-    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
-) -> None:
+def test_the_fold_repeats_its_bits_and_submaps_with_names_add_no_set(loop):
     submaps, _, fold = loop
     again = _folded(submaps)
     assert again.main.state.tobytes() == fold.main.state.tobytes()
@@ -94,7 +89,7 @@ def test_the_fold_repeats_its_bits_and_submaps_with_names_add_no_set(
     assert _folded(named[:5]).landmarks == Landmarks() or not _folded(named[:5]).landmarks.sets
 
 
-def test_a_loop_of_small_uncertainty_closes_by_a_few_landmarks_that_agree() -> None:
+def test_a_loop_of_small_uncertainty_closes_by_a_few_landmarks_that_agree():
     rng, world = np.random.default_rng(3), np.zeros((0, 2))
     while len(world) < 34:
         angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(6.0, 10.0)
@@ -109,7 +104,7 @@ def test_a_loop_of_small_uncertainty_closes_by_a_few_landmarks_that_agree() -> N
     assert wrong(landmarks, truth) == duplicates(landmarks, truth) == 0
 
 
-def test_robots_with_unknown_initial_poses_are_merged_by_their_landmarks() -> None:
+def test_robots_with_unknown_initial_poses_are_merged_by_their_landmarks():
     world, rng = _world(5), np.random.default_rng(8)
     one, first = drive("r1", circle((0.0, 0.0), 20.0, 12, 0.6), world, rng)
     two, second = drive("r2", circle((0.0, 0.0), 20.0, 12, 0.6, phase=2.0), world, rng)
@@ -128,7 +123,7 @@ def test_robots_with_unknown_initial_poses_are_merged_by_their_landmarks() -> No
     assert not _not_joined(replace(fold, landmarks=stale))
 
 
-def test_robots_with_unknown_initial_poses_are_not_merged_in_a_grid_of_equal_rooms() -> None:
+def test_robots_with_unknown_initial_poses_are_not_merged_in_a_grid_of_equal_rooms():
     # Of 200 seeds the last one was merged while rivals were charged with what they left over.
     for seed, heading in ((0, 0.0), (1, 0.0), (80, np.pi)):
         rng = np.random.default_rng(seed)
@@ -147,7 +142,7 @@ def test_robots_with_unknown_initial_poses_are_not_merged_in_a_grid_of_equal_roo
         assert any(why.endswith(each.why) for each in fold.landmarks.waits.values())
 
 
-def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it() -> None:
+def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it():
     rng = np.random.default_rng(4)
     room = rng.uniform(-6.0, 6.0, (14, 2))
     elsewhere = rng.uniform(-6.0, 6.0, (40, 2)) * np.array([3.0, 1.0]) + np.array([24.0, 0.0])
@@ -165,9 +160,7 @@ def test_a_wrong_closure_is_undone_and_leaves_the_map_as_it_would_be_without_it(
     assert fold.landmarks.sets == careful.landmarks.sets
 
 
-def test_an_audit_looks_around_a_closure_as_far_as_landmarks_stand_apart(
-    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
-) -> None:
+def test_an_audit_looks_around_a_closure_as_far_as_landmarks_stand_apart(loop):
     _, _, fold = loop
     stream = fold.main_key
     assert stream is not None
@@ -187,9 +180,7 @@ def test_an_audit_looks_around_a_closure_as_far_as_landmarks_stand_apart(
     assert shares == [1.0, 1.0]
 
 
-def test_a_verdict_merges_two_landmarks_or_keeps_them_apart(
-    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
-) -> None:
+def test_a_verdict_merges_two_landmarks_or_keeps_them_apart(loop):
     submaps, _, fold = loop
     members = next(m for m in fold.landmarks.sets.values() if len(m) > 1)
     apart = Verdict(members[0], members[1], same=False)
@@ -204,9 +195,7 @@ def test_a_verdict_merges_two_landmarks_or_keeps_them_apart(
     assert joined.landmarks.identity(single[0]) == joined.landmarks.identity(other)
 
 
-def test_verdicts_that_contradict_each_other_over_a_third_landmark_keep_the_two_apart(
-    loop: tuple[list[Contribution], dict[LocalLandmark, int], Fold],
-) -> None:
+def test_verdicts_that_contradict_each_other_over_a_third_landmark_keep_the_two_apart(loop):
     submaps, _, _ = loop
     before = _folded(submaps[:3])
     a, b, c = sorted(

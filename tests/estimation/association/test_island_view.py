@@ -1,4 +1,6 @@
-"""The steps of a tick: which submaps are compared, and the sweep."""
+"""What islands see of each other: views, votes for a motion, numbers of landmarks."""
+
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association import voting
 from teamslam.team.estimation.association.gating import Joint, list_pairs
 from teamslam.team.estimation.association.island_view import (
     REEXAMINED,
@@ -15,6 +18,20 @@ from teamslam.team.estimation.association.island_view import (
     select_comparisons,
 )
 from teamslam.team.estimation.association.joint_compatibility import assign_jointly
+from teamslam.team.estimation.association.landmark_sets import (
+    NO_LANDMARKS,
+    add_landmarks,
+    merge_sets,
+    number_of,
+)
+from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
+from teamslam.team.estimation.association.visibility import (
+    mark_missed,
+    mark_visible,
+    pad_views,
+    renumber_views,
+)
+from teamslam.team.estimation.association.voting import PointSet, apply_motion, propose_alignments
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import (
@@ -24,6 +41,7 @@ from teamslam.team.estimation.map_joining.joining import (
     Tick,
 )
 from teamslam.team.estimation.submap import LocalMap, Unnamed
+from tests.estimation.association.unnamed_worlds import circle, drive
 
 OWN = 0.01
 PROFILE = AssociationProfile(slack=0.0, density=1.0)
@@ -130,7 +148,126 @@ def view_of_a_group_shifted_by(shift: float) -> IslandView:
 
 
 @pytest.mark.parametrize(("shift", "merged"), [(0.0, 2), (0.22, 0)])
-def test_a_group_that_fits_at_two_places_is_not_swept(shift: float, merged: int) -> None:
+def test_a_group_that_fits_at_two_places_is_not_swept(shift, merged):
     view = view_of_a_group_shifted_by(shift)
     view.sweep()
     assert len(view.ties) == merged
+
+
+def test_a_point_in_the_polygon_that_one_keyframe_saw_is_covered_and_one_outside_is_not():
+    rng = np.random.default_rng(3)
+    own = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [2.0, 1.0], [9.0, 9.0]])
+    views = pad_views([np.array([0, 1, 2, 3, 4]), np.array([2, 5, 4])])
+    points = rng.uniform(-1.0, 6.0, (400, 2))
+    inside = ((points > 0.0) & (points < [4.0, 3.0])).all(axis=1)
+    triangle = own[[2, 5, 4]]
+    sides = [_left(triangle[k], triangle[(k + 1) % 3], points) for k in range(3)]
+    inside |= np.all(sides, axis=0) | ~np.any(sides, axis=0)
+    assert mark_visible(points, own, views).tolist() == inside.tolist()
+    assert 50 < inside.sum() < 350
+
+
+def _left(one: np.ndarray, two: np.ndarray, points: np.ndarray) -> np.ndarray:
+    along, to = two - one, points - one
+    return along[0] * to[:, 1] - along[1] * to[:, 0] > 0.0
+
+
+def test_the_views_of_a_window_are_the_largest_sets_of_three_or_more():
+    seen = np.array([[1, 1, 0, 1], [1, 1, 0, 1], [1, 0, 1, 1], [1, 0, 1, 0]], np.bool_)
+    found = Unnamed(np.full(4, 3, np.uint32), seen).views
+    assert [each.tolist() for each in found] == [[0, 1, 2, 3]]
+
+
+def test_views_lose_landmarks_that_are_left_out_and_views_of_fewer_than_three_go():
+    views = pad_views([np.array([0, 1, 2, 3]), np.array([1, 2, 4])])
+    to = np.array([10, 11, 12, -1, -1])
+    assert renumber_views(views, to).tolist() == [[10, 11, 12, -1]]
+
+
+def test_a_landmark_that_later_submaps_miss_is_missed_and_a_new_one_is_not():
+    """All but the last submap look at landmarks 0 and 1; 2 is false, 3 elsewhere, 4 new."""
+    sees = np.zeros((7, 5), np.bool_)
+    sees[:6, :2] = True
+    sees[1, 2] = sees[6, 3] = sees[5, 4] = True
+    assert mark_missed(sees).tolist() == [False, False, True, False, False]
+    assert not mark_missed(sees[:3]).any(), "three submaps are no evidence"
+    assert mark_missed(np.zeros((0, 3), np.bool_)).tolist() == [False] * 3
+
+
+def _points(mean: np.ndarray) -> PointSet:
+    return PointSet(mean, np.full(len(mean), 0.1))
+
+
+def test_the_motion_between_two_sets_is_found_among_points_that_only_one_of_them_has():
+    rng = np.random.default_rng(1)
+    shared = rng.uniform(0.0, 20.0, (15, 2))
+    motion = np.array([4.0, -7.0, 2.2])
+    a = np.concatenate([shared, rng.uniform(0.0, 20.0, (10, 2))])
+    centre = a.mean(axis=0)
+    b = np.concatenate([rng.uniform(-30.0, 30.0, (60, 2)), apply_motion(motion, shared - centre)])
+    best = propose_alignments(_points(a), _points(b), 0.3, 15.0)[0]
+    pairs = set(zip(best.first.tolist(), best.second.tolist(), strict=True))
+    assert {(k, 60 + k) for k in range(15)} <= pairs
+    assert np.abs(best.motion - motion).max() < 0.05
+
+
+def test_a_pattern_that_stands_twice_gives_two_alignments_of_equal_size():
+    rng = np.random.default_rng(2)
+    room = rng.uniform(0.0, 8.0, (10, 2))
+    twice = np.concatenate([room, room + np.array([30.0, 0.0])])
+    first, second = propose_alignments(_points(room), _points(twice), 0.3, 15.0)[:2]
+    assert len(first.first) == len(second.first) == 10
+    assert abs(first.motion[0] - second.motion[0]) > 29.0
+
+
+def test_two_maps_of_one_point_have_no_alignment():
+    assert propose_alignments(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
+
+
+def test_votes_that_are_counted_cell_by_cell_and_sorted_votes_give_the_same_alignments(monkeypatch):
+    points = np.random.default_rng(4).uniform(0.0, 9.0, (30, 2))
+    counted = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
+    monkeypatch.setattr(voting, "MOST_COUNTED", 0)
+    ordered = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
+    assert len(counted) == len(ordered) > 0
+    for one, two in zip(counted, ordered, strict=True):
+        np.testing.assert_array_equal(one.motion, two.motion)
+        np.testing.assert_array_equal(one.second, two.second)
+
+
+WORLD = np.array([[8.0, 1.0], [9.0, -2.0], [7.0, 3.0]])
+
+
+def _tie(into: int) -> MergeRecord:
+    return MergeRecord("track", into, 5.0, 0.0, 0.1, 0)
+
+
+def test_each_unnamed_landmark_is_a_set_of_its_own_with_a_number_derived_from_its_name():
+    (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
+    landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
+    assert numbers[submap.key] == [number_of(LocalLandmark("r1", 1, 0, k)) for k in range(3)]
+    assert all(number >= UNNAMED for number in numbers[submap.key])
+    assert [landmarks.sets[number] for number in numbers[submap.key]] == [
+        (LocalLandmark("r1", 1, 0, k),) for k in range(3)
+    ]
+
+
+def test_a_set_has_the_number_of_its_smallest_member_in_any_order_of_merges():
+    path = circle((0.0, 0.0), 5.0, 1, 0.05)
+    submaps = [drive(robot, path, WORLD, np.random.default_rng(1))[0][0] for robot in ("r1", "r2")]
+    landmarks, numbers = add_landmarks(NO_LANDMARKS, submaps)
+    one, two, three = numbers[submaps[0].key][0], *numbers[submaps[1].key][:2]
+    for a, b, c in permutations((one, two, three)):
+        found, becomes = merge_sets(landmarks, [(a, _tie(b)), (b, _tie(c))])
+        assert {found.identity(member) for member in found.sets[one]} == {one}
+        assert becomes == {two: one, three: one}
+
+
+def test_a_set_with_a_name_keeps_the_name():
+    (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
+    landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
+    number = numbers[submap.key][0]
+    for ties in ([(7, _tie(number))], [(number, _tie(7))]):
+        found, becomes = merge_sets(landmarks, ties)
+        assert becomes == {number: 7}
+        assert found.sets[7] == (LocalLandmark("r1", 1, 0, 0),)

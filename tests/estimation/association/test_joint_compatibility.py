@@ -1,17 +1,221 @@
-"""Joint compatibility: pairs merged one after the other, and pairs with rivals weighed together."""
+"""Pairs of landmarks: gates, likelihoods, classes, densities, and compatibility of them all."""
+
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
 from teamslam.team.association import AssociationProfile
-from teamslam.team.estimation.association.gating import SPLIT, Joint, evaluate_pairs
+from teamslam.team.config import UNNAMED, AssociationSettings
+from teamslam.team.estimation.association.certainty import marginals
+from teamslam.team.estimation.association.classes import compare_classes, stack_classes
+from teamslam.team.estimation.association.clustering import associate_window
+from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.gating import (
+    SPLIT,
+    Joint,
+    evaluate_pairs,
+    gate_pairs,
+    match_best_first,
+    match_scan,
+)
 from teamslam.team.estimation.association.joint_compatibility import (
     assign_jointly,
     condition_on_pair,
     grow_pairs,
 )
+from teamslam.team.estimation.association.scans import UNASSIGNED
+from teamslam.team.estimation.association.voting import PointSet, propose_alignments
+from teamslam.team.estimation.submap import LocalMap, Unnamed
+from tests.estimation.association.test_clustering import pairs, window
 
-PROFILE = AssociationProfile(slack=0.0)
+
+def test_the_best_pair_comes_first_and_each_is_matched_once():
+    squared = np.array([[1.0, 0.5], [2.0, 0.1], [30.0, 40.0]])
+    assert match_best_first(squared < 13.8, squared).tolist() == [0, 1, UNASSIGNED]
+
+
+def test_a_name_matches_at_any_distance_and_only_its_own_landmark():
+    points = np.array([(9.0, 0.0), (0.0, 0.0), (5.0, 0.0)])
+    names, mapped = np.array([7, 8, UNASSIGNED]), np.array([UNASSIGNED, 7, UNASSIGNED])
+    seen = np.array([(0.0, 0.0), (1.0, 0.0), (5.0, 0.1)])
+    small = np.tile(0.01 * np.eye(2), (3, 1, 1))
+    found = match_scan(points, small, names, (seen, small), mapped, AssociationSettings())
+    assert found.tolist() == [1, UNASSIGNED, 2]
+
+
+def test_a_pairs_likelihood_is_that_of_its_difference_against_a_stray_landmark():
+    profile = AssociationProfile(slack=0.0)
+    points = np.array([(0.0, 0.0), (0.1, -0.05)])
+    joint = Joint(points, 0.01 * np.eye(4), np.zeros((2, 2), np.bool_))
+    at = evaluate_pairs(joint, np.array([0]), np.array([1]), profile)
+    S = 0.02 * np.eye(2)
+    d = np.array([-0.1, 0.05])
+    chi2 = d @ np.linalg.solve(S, d)
+    density = np.exp(-0.5 * chi2) / (2.0 * np.pi * np.sqrt(np.linalg.det(S)))
+    assert at.chi2[0] == pytest.approx(chi2)
+    assert at.llr[0] == pytest.approx(np.log(density / profile.density))
+    assert at.sd[0] == pytest.approx(np.sqrt(0.02))
+
+
+PROFILE = AssociationProfile(slack=0.0, density=1.0)
+
+
+def _submap(points: np.ndarray, together: bool) -> LocalMap:
+    n = len(points)
+    seen = np.ones((n, 1), np.bool_) if together else np.eye(n, dtype=np.bool_)
+    ids = (UNNAMED + np.arange(n)).astype(np.uint32)
+    mean = np.concatenate([np.zeros(3), points.ravel()])
+    return LocalMap(ids, mean, np.eye(len(mean)), unnamed=Unnamed(np.ones(n, np.uint32), seen))
+
+
+def test_a_profiles_lengths_are_bounded_by_the_spacing_of_landmarks_seen_together():
+    rng = np.random.default_rng(2)
+    groups = np.repeat(rng.uniform(0.0, 12.0, (8, 2)), 2, axis=0)
+    groups[1::2] += [0.2, 0.0]
+    crowd = LandmarkDensity([_submap(groups, together=True).spacings])
+    bounded = crowd.limit_lengths(AssociationProfile(same=1.7, tight=0.5, slack=0.1))
+    assert bounded.same == pytest.approx(0.3)
+    assert (bounded.tight, bounded.slack) == pytest.approx((0.1, 0.036))
+    assert bounded.near == PROFILE.near
+    within = crowd.around_landmarks(np.array([0.3]))[0]
+    assert within == pytest.approx(1.0 / (np.pi * 0.3**2), rel=0.1)
+    few = LandmarkDensity([_submap(groups[:3], together=True).spacings]).limit_lengths(
+        AssociationProfile(same=1.7)
+    )
+    assert few.same == pytest.approx(0.3)
+    nobody = LandmarkDensity([_submap(groups, together=False).spacings])
+    assert nobody.limit_lengths(PROFILE) == PROFILE
+    assert nobody.around_landmarks(np.array([0.3]))[0] < 0.1 * within
+
+
+def test_a_pair_needs_less_evidence_where_the_maps_landmarks_stand_far_apart():
+    apart = np.zeros((2, 2), np.bool_)
+    places = np.array([(0.0, 0.0), (0.25, 0.0)])  # 2.5 standard deviations of their difference
+    strangers = Joint(places, 0.005 * np.eye(4), apart)
+    pair = np.array([0]), np.array([1])
+    llr = {"the profile's density": float(evaluate_pairs(strangers, *pair, PROFILE).llr[0])}
+    for name, spacing in (("far apart", 2.0), ("close", 0.3)):
+        at = spacing * np.array([(i, j) for i in range(10) for j in range(10)], float)
+        crowd = LandmarkDensity([_submap(at, together=True).spacings], at)
+        of_one_map = strangers._replace(density=crowd, unseen=np.ones(2))
+        llr[name] = float(evaluate_pairs(of_one_map, *pair, PROFILE).llr[0])
+        between = evaluate_pairs(strangers._replace(density=crowd), *pair, PROFILE).llr[0]
+        assert between <= llr["the profile's density"]  # of two maps nothing is known
+    assert llr["close"] < llr["the profile's density"] < PROFILE.llr_tight < llr["far apart"]
+    assert llr["far apart"] - llr["the profile's density"] == pytest.approx(3.8, abs=0.1)
+
+
+P = 0.99
+
+
+def reported(classes: list[int], count: int = 3) -> np.ndarray:
+    rows = np.full((len(classes), count), np.log((1.0 - P) / (count - 1)))
+    rows[np.arange(len(classes)), classes] = np.log(P)
+    return rows
+
+
+def test_the_evidence_is_that_of_the_posterior_over_equally_frequent_classes():
+    one, two = reported([0, 0, 2]), reported([0, 1, 2])
+    q = (1.0 - P) / 2.0
+    same, different = 3.0 * (P * P + 2.0 * q * q), 3.0 * (2.0 * P * q + q * q)
+    assert np.allclose(compare_classes(one, two), np.log([same, different, same]))
+    unknown = np.zeros((3, 3))
+    assert np.allclose(compare_classes(one, unknown), 0.0)
+    assert np.allclose(compare_classes(one, two), compare_classes(one + 7.0, two - 90.0))
+
+
+def test_rows_without_classes_and_with_fewer_are_stacked():
+    assert stack_classes([(2, None), (3, np.empty((3, 0)))]) is None
+    found = stack_classes([(1, None), (1, reported([1], 2)), (1, reported([2]))])
+    assert found[0].tolist() == [0.0, 0.0, 0.0]
+    assert np.allclose(found[1], np.log([1.0 - P, P, 1.0 - P]))
+
+
+def joint(classes: np.ndarray | None) -> Joint:
+    mean = np.array([[0.0, 0.0], [0.02, 0.0], [5.0, 0.0]])
+    return Joint(mean, 1e-4 * np.eye(6), np.zeros((3, 3), np.bool_), classes=classes)
+
+
+def test_landmarks_of_contradicting_classes_are_not_in_the_gate():
+    profile = AssociationProfile()
+    pair = np.array([0]), np.array([1])
+    plain = evaluate_pairs(joint(None), *pair, profile)
+    alike = evaluate_pairs(joint(reported([1, 1, 0])), *pair, profile)
+    assert plain.chi2 == alike.chi2
+    assert alike.llr - plain.llr == pytest.approx(compare_classes(reported([1]), reported([1])))
+    assert len(gate_pairs(joint(reported([1, 1, 0])), *pair, profile)[0]) == 1
+    assert len(gate_pairs(joint(reported([1, 2, 0])), *pair, profile)[0]) == 0
+    assert len(gate_pairs(joint(None), *pair, profile)[0]) == 1
+
+
+def test_a_merged_landmark_has_the_evidence_of_both():
+    before = joint(reported([1, 1, 0]))
+    after = condition_on_pair(before, 0, 1, AssociationProfile())
+    assert np.array_equal(after.classes[1], before.classes[0] + before.classes[1])
+    assert np.array_equal(before.classes[1], reported([1])[0])
+
+
+def test_of_two_places_of_equal_shape_the_one_of_equal_classes_gets_the_votes():
+    shape = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [-1.0, 6.0], [7.0, 5.0]])
+    kinds = [0, 1, 2, 1, 0]
+    target = np.concatenate((shape, shape + np.array([40.0, 0.0])))
+    sd = np.full(10, 0.02)
+    other = PointSet(target, sd, reported([1, 2, 0, 0, 1, *kinds]))
+    votes = propose_alignments(PointSet(shape, sd[:5], reported(kinds)), other, 0.1, 20.0)
+    assert (len(votes[0].first), votes[0].second.tolist()) == (5, [5, 6, 7, 8, 9])
+    assert all(len(vote.first) < 5 for vote in votes[1:])
+    plain = propose_alignments(PointSet(shape, sd[:5]), other._replace(classes=None), 0.1, 20.0)
+    assert [len(vote.first) for vote in plain[:2]] == [5, 5]
+
+
+def exact(weights: np.ndarray) -> np.ndarray:
+    """The marginals over every joint association, each with the product of its odds."""
+    n, count = weights.shape
+    found, total = np.zeros_like(weights), 0.0
+    for joint in product(range(-1, count), repeat=n):
+        taken = [(i, j) for i, j in enumerate(joint) if j >= 0]
+        if len({j for _, j in taken}) < len(taken):
+            continue
+        odds = float(np.prod([weights[pair] for pair in taken]))
+        total += odds
+        for pair in taken:
+            found[pair] += odds
+    return found / total
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_marginals_are_those_of_all_joint_associations(seed):
+    weights = np.exp(np.random.default_rng(seed).normal(1.0, 2.0, (3, 3)))
+    assert np.allclose(marginals(weights), exact(weights), atol=0.1)
+
+
+def test_the_marginals_of_one_detection_or_one_landmark_are_exact():
+    for shape in ((1, 4), (4, 1)):
+        weights = np.exp(np.random.default_rng(5).normal(0.0, 2.0, shape))
+        assert np.allclose(marginals(weights), exact(weights))
+
+
+def test_a_poor_sensor_gives_fewer_landmarks_and_not_wrong_ones():
+    wrong, left = [], []
+    for certain in (0.0, 0.95):
+        precision, kept = [], []
+        for seed in range(3):
+            scans, labels = window(seed, spacing=2.0, missed=0.1)
+            noise = np.random.default_rng(seed).normal(size=scans.points.shape) * 0.45
+            poor = np.tile((0.45**2 + 0.05**2) * np.eye(2), (len(labels), 1, 1))
+            scans = replace(scans, points=scans.points + noise, covariances=poor)
+            result = associate_window(scans, AssociationSettings(certain=certain))
+            precision.append(pairs(result.landmark_of, labels)[0])
+            kept.append((result.landmark_of != UNASSIGNED).mean())
+        wrong.append(1.0 - np.mean(precision))
+        left.append(np.mean(kept))
+    assert wrong[1] < 0.3 * wrong[0]
+    assert 0.1 < left[1] < left[0]
+
+
+PROFILE_JOINT_COMPATIBILITY = AssociationProfile(slack=0.0)
 
 
 def _joint(points: list[tuple[float, float]], sd: float, common: float = 0.0) -> Joint:
@@ -31,7 +235,7 @@ def test_conditioning_on_a_pair_is_the_kalman_filters_measurement_of_no_differen
     H[:, 2:4], H[:, 6:8] = np.eye(2), -np.eye(2)
     S = H @ joint.covariance @ H.T
     K = joint.covariance @ H.T @ np.linalg.inv(S)
-    found = condition_on_pair(joint, 1, 3, PROFILE)
+    found = condition_on_pair(joint, 1, 3, PROFILE_JOINT_COMPATIBILITY)
     assert found.mean.ravel() == pytest.approx(joint.mean.ravel() - K @ H @ joint.mean.ravel())
     assert found.covariance == pytest.approx(joint.covariance - K @ S @ K.T)
 
@@ -42,8 +246,7 @@ def test_a_common_error_is_estimated_by_the_first_pair_and_the_others_follow():
     new = [(x + shift, y) for x, y in old]
     joint = _joint([*old, *new], sd=0.02, common=3.0)
     one, two = (each.ravel() for each in np.meshgrid([3, 4, 5], [0, 1, 2], indexing="ij"))
-    found = grow_pairs(joint, (one, two), PROFILE, seeds=[(3, 0)])
-    assert found is not None
+    found = grow_pairs(joint, (one, two), PROFILE_JOINT_COMPATIBILITY, seeds=[(3, 0)])
     assert {(pair.first, pair.second) for pair in found.pairs} == {(3, 0), (4, 1), (5, 2)}
     assert found.pairs[0].sd > 1.0 > found.pairs[1].sd
 
@@ -53,21 +256,20 @@ def test_two_equal_partners_block_each_other_and_fragments_of_one_landmark_do_no
     one, two = np.array([0, 0]), np.array([1, 2])
     rivals = joint._replace(apart=joint.apart.copy())
     rivals.apart[1, 2] = rivals.apart[2, 1] = True
-    waits = grow_pairs(rivals, (one, two), PROFILE)
-    assert waits is not None
+    waits = grow_pairs(rivals, (one, two), PROFILE_JOINT_COMPATIBILITY)
     assert not waits.pairs
-    fragments = grow_pairs(joint, (one, two), PROFILE)
-    assert fragments is not None
+    fragments = grow_pairs(joint, (one, two), PROFILE_JOINT_COMPATIBILITY)
     assert len(fragments.pairs) == 1
 
 
 def test_landmarks_of_one_scan_are_never_merged_and_merged_ones_inherit_this():
     joint = _joint([(0.0, 0.0), (0.02, 0.0), (0.01, 0.0)], sd=0.05)
     joint.apart[0, 1] = joint.apart[1, 0] = True
-    found = grow_pairs(joint, (np.array([0, 1, 0]), np.array([2, 2, 1])), PROFILE)
-    assert found is not None
+    found = grow_pairs(
+        joint, (np.array([0, 1, 0]), np.array([2, 2, 1])), PROFILE_JOINT_COMPATIBILITY
+    )
     assert len(found.pairs) <= 1
-    after = condition_on_pair(joint, 0, 2, PROFILE)
+    after = condition_on_pair(joint, 0, 2, PROFILE_JOINT_COMPATIBILITY)
     assert after.apart[2, 1]
     assert after.apart[1, 2]
 
@@ -75,16 +277,20 @@ def test_landmarks_of_one_scan_are_never_merged_and_merged_ones_inherit_this():
 def test_landmarks_of_one_window_need_more_evidence_and_merged_ones_inherit_this():
     joint = _joint([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0)], sd=0.08)
     one, two = np.array([0]), np.array([1])
-    llr = evaluate_pairs(joint, one, two, PROFILE).llr[0]
-    assert PROFILE.llr_tight < llr < PROFILE.llr_tight + SPLIT
+    llr = evaluate_pairs(joint, one, two, PROFILE_JOINT_COMPATIBILITY).llr[0]
+    assert (
+        PROFILE_JOINT_COMPATIBILITY.llr_tight < llr < PROFILE_JOINT_COMPATIBILITY.llr_tight + SPLIT
+    )
     split = np.zeros((3, 3), np.bool_)
     split[0, 1] = split[1, 0] = True
-    for beside, pairs in ((None, 1), (split, 0)):
-        found = grow_pairs(joint._replace(apart_in_window=beside), (one, two), PROFILE)
-        assert found is not None
-        assert len(found.pairs) == pairs
-    after = condition_on_pair(joint._replace(apart_in_window=split), 1, 2, PROFILE).apart_in_window
-    assert after is not None
+    for beside, merged in ((None, 1), (split, 0)):
+        found = grow_pairs(
+            joint._replace(apart_in_window=beside), (one, two), PROFILE_JOINT_COMPATIBILITY
+        )
+        assert len(found.pairs) == merged
+    after = condition_on_pair(
+        joint._replace(apart_in_window=split), 1, 2, PROFILE_JOINT_COMPATIBILITY
+    ).apart_in_window
     assert after[0, 2]
     assert after[2, 0]
 
@@ -110,7 +316,6 @@ def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarra
 def test_neighbours_are_distinguished_jointly_where_each_by_itself_is_not():
     joint, one, two = _twins([0, 1, 2, 3], common=0.15)
     alone = grow_pairs(joint, (one, two), DENSE)
-    assert alone is not None
     assert not alone.pairs
     found = assign_jointly(joint, one, two, DENSE, 0.5)
     assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
@@ -121,10 +326,10 @@ def test_one_of_two_neighbours_alone_is_not_merged():
     assert not assign_jointly(joint, one, two, DENSE, 0.5).pairs
 
 
-def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged() -> None:
+def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
     known = np.array([(0.0, 0.0), (4.0, 1.0), (1.0, 5.0)])
     profile = AssociationProfile(slack=0.0, density=0.006, same=1.0)
-    for count, sd, pairs in ((2, 0.3, 0), (2, 0.05, 2), (3, 0.3, 3)):
+    for count, sd, merged in ((2, 0.3, 0), (2, 0.05, 2), (3, 0.3, 3)):
         points = np.concatenate([known, known[:count] + np.array([1.0, -0.5])])
         n = len(points)
         shift = np.zeros((2 * n, 2))  # an error of 1 m that all that is seen again has in common
@@ -134,10 +339,10 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged() ->
         joint = Joint(points, sd**2 * np.eye(2 * n) + shift @ shift.T, apart)
         one, two = (each.ravel() for each in np.meshgrid(np.arange(3, n), np.arange(3)))
         found = assign_jointly(joint, one, two, profile, 2.0)
-        assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(pairs)]
+        assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(merged)]
 
 
-def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it() -> None:
+def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it():
     twins_and_another = [(0.0, 0.0), (0.25, 0.0), (3.0, 1.0)]
     points = np.array([*twins_and_another, (0.12, 0.0), (3.0, 1.0)])  # the first is either twin
     shift = np.zeros((10, 2))  # an error of 1 m that what is seen again has in common
@@ -146,8 +351,8 @@ def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it(
     apart = (seen[:, None] == seen) & ~np.eye(5, dtype=np.bool_)
     joint = Joint(points, 0.05**2 * np.eye(10) + shift @ shift.T, apart)
     one, two = (each.ravel() for each in np.meshgrid([3, 4], [0, 1, 2], indexing="ij"))
-    for density, pairs in ((0.05, []), (0.006, [(4, 2)])):
+    for density, merged in ((0.05, []), (0.006, [(4, 2)])):
         profile = AssociationProfile(slack=0.0, density=density, same=0.1)
         found = assign_jointly(joint, one, two, profile, 2.0)
-        assert [(p.first, p.second) for p in found.pairs] == pairs
+        assert [(p.first, p.second) for p in found.pairs] == merged
         assert all(p.sd > 1.0 for p in found.pairs), "it is known to a metre, whatever the first is"

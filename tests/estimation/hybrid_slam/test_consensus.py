@@ -92,7 +92,7 @@ def test_a_lone_measurement_of_another_landmark_is_not_taken_nor_are_two_that_di
 
 
 @pytest.mark.parametrize("points", [False, True])
-def test_measurements_are_judged_by_the_covariances_that_they_claim(points: bool) -> None:
+def test_measurements_are_judged_by_the_covariances_that_they_claim(points):
     window = drive(3)
     few = np.arange(1, 40, 5)
     r, b = window.measurements.T
@@ -212,14 +212,14 @@ def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:
     ],
 )
 def test_of_three_tenths_outliers_few_pass_and_good_measurements_are_kept(
-    name: str, kind: str, least_kept: float, most_passed: float
-) -> None:
+    name, kind, least_kept, most_passed
+):
     kept, passed = rates(name, kind)
     assert kept > least_kept
     assert passed < most_passed
 
 
-def test_the_smoother_finds_what_the_odometry_alone_lets_pass() -> None:
+def test_the_smoother_finds_what_the_odometry_alone_lets_pass():
     assert (
         rates("thesis-b", "measurement", "agreeing")[1] > 2.0 * rates("thesis-b", "measurement")[1]
     )

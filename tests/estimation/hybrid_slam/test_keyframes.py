@@ -1,7 +1,5 @@
 """The segmenter: motion is neither lost nor counted twice, wherever observations fall into it."""
 
-from itertools import pairwise
-
 import msgspec
 import numpy as np
 import pytest
@@ -109,25 +107,6 @@ def test_the_finer_the_split_the_nearer_to_noise_that_is_white_within_the_interv
         errors.append(np.abs(found.covariance - covariance).max())
     assert errors[0] < 0.2 * np.abs(covariance).max()
     assert errors[2] < 0.05 * errors[0] + 1e-7
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.lists(st.integers(1, SECOND - 1), min_size=1, max_size=5, unique=True))
-def test_the_motion_does_not_depend_on_how_the_odometry_is_cut(cuts):
-    """Of noise along the way only: the sum of the pieces is the whole to 1e-9, to second order."""
-    motion = MotionModel(
-        forward=MotionNoise(per_s=0.05), final_turn=MotionNoise(per_s=0.0), lateral=MotionNoise()
-    )
-    one, many = (Segmenter(motion, Sensor(), 0.0) for _ in range(2))
-    for segmenter in (one, many):
-        segmenter.begin(0)
-    one.drive(OdometryInterval(SECOND, SECOND, 1.2, 0.0))
-    ends = [0, *sorted(cuts), SECOND]
-    for begin, end in pairwise(ends):
-        many.drive(OdometryInterval(end, end - begin, 1.2, 0.0))
-    expected, found = one.cut(SECOND)[1], many.cut(SECOND)[1]
-    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-9)
-    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-9)
 
 
 def test_an_observation_waits_for_the_odometry_that_covers_it():

@@ -48,7 +48,7 @@ def updated(z: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray, flo
 
 
 @pytest.mark.parametrize("kind", ["none", "refused", "range and bearing"])
-def test_the_range_and_then_the_bearing_are_the_joint_update(kind: str) -> None:
+def test_the_range_and_then_the_bearing_are_the_joint_update(kind):
     """Range first, then the bearing less its regression on the range: the same Gaussian."""
     h = np.array(predicted(np.array(POSE), MEAN))
     z = h + np.array([0.2, -0.05])
@@ -58,7 +58,7 @@ def test_the_range_and_then_the_bearing_are_the_joint_update(kind: str) -> None:
         np.testing.assert_allclose(got, textbook, rtol=1e-10)
 
 
-def test_a_measured_point_is_a_linear_measurement_in_the_plane() -> None:
+def test_a_measured_point_is_a_linear_measurement_in_the_plane():
     """Its density is that of (range, bearing of the predicted range), so `distance` times it."""
     h = np.array(predicted(np.array(POSE), MEAN))
     z = h + np.array([0.3, 0.4])
@@ -95,7 +95,7 @@ def least_prior(
 
 
 @pytest.mark.parametrize("kind", ["none", "range and bearing"])
-def test_one_measurement_predicts_another_with_all_of_their_noise(kind: str) -> None:
+def test_one_measurement_predicts_another_with_all_of_their_noise(kind):
     """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, its Jacobians by differences.
 
     Both agree where log p + prior + log(reach · field of view), the support of the one that is

@@ -43,7 +43,7 @@ def submaps(of: RobotConfig, measurements: list[m.Measurement]) -> list[m.Submap
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 
 
-def test_a_submap_is_as_if_the_outliers_had_never_been_measured() -> None:
+def test_a_submap_is_as_if_the_outliers_had_never_been_measured():
     clean = stream("r1", 20)
     seen = clean.landmark_detections
     rows = np.arange(len(seen.ids)) % 5 == 2
@@ -63,9 +63,7 @@ def test_a_submap_is_as_if_the_outliers_had_never_been_measured() -> None:
     assert sum(s.gated for s in found) >= np.count_nonzero(rows)
 
 
-def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(monkeypatch):
     taken = OpenWindow._take_all
 
     def again(window: OpenWindow, keyframes: Sequence[Keyframe], times: int = 1) -> None:
@@ -76,7 +74,7 @@ def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(
     assert sum(s.gated for s in submaps(config(), published(stream("r1", 20)))) == 0
 
 
-def test_a_robot_that_was_started_again_gates_the_same_measurements() -> None:
+def test_a_robot_that_was_started_again_gates_the_same_measurements():
     measurements = published(spoilt(stream("r1", 20)))
     of = robot()
     whole = submaps(of, measurements)
@@ -87,7 +85,7 @@ def test_a_robot_that_was_started_again_gates_the_same_measurements() -> None:
     assert again == whole[2:]
 
 
-def test_the_status_tells_how_many_measurements_were_gated() -> None:
+def test_the_status_tells_how_many_measurements_were_gated():
     node = RobotNode(robot())
     driven(node, published(spoilt(stream("r1", 20))))
     assert node.status().figures["gated"] >= 5.0
@@ -115,20 +113,16 @@ def world_with(kind: str, steps: int = 200) -> Scenario:
 
 def aligned_rmse(scenario: Scenario) -> float:
     found = evaluate(list(run_team(scenario, streams_of(scenario)))).map
-    assert found is not None
-    assert found.errors is not None
     assert found.errors.aligned_rmse_m is not None
     return found.errors.aligned_rmse_m
 
 
 @pytest.fixture(scope="module")
-def clean_rmse() -> float:
+def clean_rmse():
     """Of the run in which the same measurements are left out."""
     return aligned_rmse(world_with("drop"))
 
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])
-def test_with_outliers_the_map_is_nearly_that_of_the_good_measurements(
-    kind: str, clean_rmse: float
-) -> None:
+def test_with_outliers_the_map_is_nearly_that_of_the_good_measurements(kind, clean_rmse):
     assert aligned_rmse(world_with(kind)) < 1.3 * clean_rmse

@@ -1,11 +1,13 @@
-"""Scans of a moment reduced to one range and bearing of each landmark, with names and without."""
+"""Windows whose detections have no names."""
 
 import numpy as np
 import pytest
 
 from teamslam.team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
+from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import unclaimed
 
@@ -47,8 +49,8 @@ def keyframes(keyframe_s: float, *, hidden: bool, tagged: int = 0) -> list[Keyfr
 @pytest.mark.parametrize("keyframe_s", [0.0, 0.5])
 @pytest.mark.parametrize("tagged", [0, 1])
 def test_detections_that_are_associated_rightly_give_the_numbers_that_names_give(
-    keyframe_s: float, tagged: int
-) -> None:
+    keyframe_s, tagged
+):
     named = keyframes(keyframe_s, hidden=False)
     raw = keyframes(keyframe_s, hidden=True, tagged=tagged)
     found = associate_keyframes(raw, AssociationSettings(certain=0.0), SENSOR, 100)
@@ -63,7 +65,7 @@ def test_detections_that_are_associated_rightly_give_the_numbers_that_names_give
     assert np.allclose(*motions)
 
 
-def test_the_events_of_a_window_are_its_whole_motion_and_every_detection_once() -> None:
+def test_the_events_of_a_window_are_its_whole_motion_and_every_detection_once():
     raw = keyframes(0.5, hidden=True, tagged=1)
     events = events_of(raw)
     assert [e.at_ns for e in events] == sorted(e.at_ns for e in events)
@@ -74,3 +76,29 @@ def test_the_events_of_a_window_are_its_whole_motion_and_every_detection_once() 
     assert sum(len(e.look.ids) for e in events if e.look is not None) == sum(
         len(look.ids) for each in raw for look in each.looks
     )
+
+
+SECOND = 10**9
+FORWARD = Increment(np.array([1.0, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-5]))
+
+
+def keyframe(k: int, ranges: list[float]) -> Keyframe:
+    bearings = np.linspace(-1.0, 1.0, len(ranges)) if ranges else np.empty(0)
+    ids = (UNNAMED + np.arange(len(ranges))).astype(np.uint32)
+    own, still = unclaimed(len(ranges)), Increment.identity()
+    at = k * SECOND
+    look = KeyframeScan(at, ids, np.array(ranges), bearings, own, at_ns=at, motion=FORWARD)
+    looks, rest = ((look,), still) if ranges else ((), None)
+    none = np.empty(0)
+    return Keyframe(
+        at, FORWARD, np.empty(0, np.uint32), none, none, unclaimed(0), looks=looks, rest=rest
+    )
+
+
+def test_a_window_that_confirms_no_detection_has_none():
+    window = [keyframe(0, [3.0]), keyframe(1, []), keyframe(2, [30.0])]
+    found = associate_keyframes(window, AssociationSettings(least_seen=2), Sensor(), 100)
+    assert [len(each.ids) for each in found.keyframes] == [0, 0, 0]
+    assert (found.gated, len(found.became.silent)) == (2, 2)
+    assert len(found.unnamed.counts) == 0
+    assert found.became.landmarks.tolist() == [0, 0]

@@ -14,7 +14,7 @@ from teamslam.team import core, translate
 from teamslam.team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation import se2
 from teamslam.team.estimation.consistency import nees
-from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
 from teamslam.team.estimation.map_joining import joining, marginals
@@ -446,12 +446,6 @@ def test_a_team_with_biased_cameras_is_consistent_with_bias_states_only():
             truth = (BEARING if bias == "bearing" else RANGE) * (1.0 if robot == "r1" else -1.0)
             assert abs(value - truth) < 4.0 * sigma
             assert sigma < 0.5 * SIGMA[bias]
-
-
-def test_a_contribution_keeps_its_columns_over_the_wire():
-    _, submaps, _ = camera_team(1, ("bearing",))
-    assert all(isinstance(each, Contribution) for each in submaps)
-    assert all(each.local.sensitivity.shape == (1, len(each.local.mean)) for each in submaps)
 
 
 def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_its_costs():

@@ -170,19 +170,6 @@ def test_a_running_pose_is_near_the_windows_and_knows_of_the_sensors_constant_er
     assert running.covariance.tobytes() == solved.covariance.tobytes()
 
 
-def test_a_submap_reports_its_landmarks_by_id_in_the_frame_of_its_start():
-    sensor = Sensor(range_sigma=1e-3, bearing_sigma=1e-4)
-    run = drive(3, sensor, noise=0.0)
-    precise = MotionModel(
-        kind="turn-then-drive", forward=MotionNoise(1e-3), turn=MotionNoise(per_s=1e-4)
-    )
-    local = windows.gaussian(driven(run, sensor, motion=precise))
-    assert (np.diff(local.ids.astype(int)) > 0).all()
-    assert set(local.ids) == set(np.concatenate([ids for ids, _, _ in run.keyframes]))
-    np.testing.assert_allclose(local.landmarks, run.landmarks[local.ids], atol=0.02)
-    np.testing.assert_allclose(local.end_pose, run.truth, atol=0.01)
-
-
 def test_the_same_window_gives_the_same_bytes_and_nothing_changes_it():
     run = drive(5, ACCURATE)
     window = driven(run, ACCURATE, seed=9)
@@ -381,7 +368,7 @@ def test_a_measurement_that_is_not_a_number_gives_an_error_that_names_it(ranges)
         taken()
 
 
-def test_a_window_without_landmarks_is_its_odometry_in_the_windows_frame() -> None:
+def test_a_window_without_landmarks_is_its_odometry_in_the_windows_frame():
     """Its covariance is that of samples of the motion, and it has no landmarks."""
     motion = increment_of(ROBOT, 1.0, 2.0, 0.7)
     local = windows.motion_alone(motion)

@@ -207,6 +207,6 @@ def test_merges_and_their_words_are_the_same_for_every_order_of_arrival(random):
     assert one.joined
 
 
-def test_a_moment_is_seconds_or_the_time_of_day_where_team_time_is_unix_time() -> None:
+def test_a_moment_is_seconds_or_the_time_of_day_where_team_time_is_unix_time():
     assert moment(123_456_789_000) == "123.5 s"
     assert moment(1_700_000_000 * 10**9) == "2023-11-14 22:13:20 UTC"

@@ -60,7 +60,7 @@ def member(sequence: int, local: int) -> LocalLandmark:
     return LocalLandmark("r1", 1, sequence, local)
 
 
-def test_what_may_be_either_of_two_neighbours_is_no_third_landmark() -> None:
+def test_what_may_be_either_of_two_neighbours_is_no_third_landmark():
     fold = folded((2.0, 0.1))
     one, two, third = (fold.landmarks.identity(member(*at)) for at in ((0, 0), (0, 1), (2, 0)))
     assert len({one, two, third}) == 3, "nothing tells which of the two it is"
@@ -76,7 +76,7 @@ def test_what_may_be_either_of_two_neighbours_is_no_third_landmark() -> None:
 
 
 @pytest.mark.parametrize("how", ["far away", "by an operator"])
-def test_a_landmark_that_is_another_one_is_shown(how: str) -> None:
+def test_a_landmark_that_is_another_one_is_shown(how):
     different = [Verdict(member(0, k), member(2, 0), same=False) for k in (0, 1)]
     fold = folded((4.0, 1.0)) if how == "far away" else folded((2.0, 0.1), tuple(different))
     shown = shown_landmarks(fold, CentralConfig(), "final")
@@ -84,16 +84,14 @@ def test_a_landmark_that_is_another_one_is_shown(how: str) -> None:
     assert not shown.undecided
 
 
-def test_of_what_may_be_one_landmark_the_place_that_is_known_best_is_shown() -> None:
+def test_of_what_may_be_one_landmark_the_place_that_is_known_best_is_shown():
     fold = folded((2.0, 0.1), times=4)  # more submaps have seen it than either of the two
     one, two = (fold.landmarks.identity(member(0, k)) for k in (0, 1))
     assert {*shown_landmarks(fold, CentralConfig(), "final").ids} == {one, two}
 
 
 @pytest.mark.parametrize(("heading_sd", "is_lost"), [(0.2, False), (0.5, True)])
-def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(
-    heading_sd: float, is_lost: bool
-) -> None:
+def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(heading_sd, is_lost):
     fold = folded((8.0, 0.0), heading_sd=heading_sd)
     third = fold.landmarks.identity(member(2, 0))
     shown = shown_landmarks(fold, CentralConfig(), "final")
@@ -118,9 +116,7 @@ def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fol
 
 
 @pytest.mark.parametrize(("times", "found"), [(15, 2), (16, 2), (16, 3)])
-def test_what_fewer_than_one_submap_in_eight_finds_that_look_there_is_left_out(
-    times: int, found: int
-) -> None:
+def test_what_fewer_than_one_submap_in_eight_finds_that_look_there_is_left_out(times, found):
     fold = looked_at(times, found)
     third = fold.landmarks.identity(member(0, 2))
     shown, is_missed = shown_landmarks(fold, CentralConfig(), "final"), times >= MOST * found
@@ -132,7 +128,7 @@ def test_what_fewer_than_one_submap_in_eight_finds_that_look_there_is_left_out(
     assert third in shown_landmarks(fold, CentralConfig(), "closed").ids
 
 
-def test_a_landmark_that_an_operator_has_judged_is_shown_however_many_missed_it() -> None:
+def test_a_landmark_that_an_operator_has_judged_is_shown_however_many_missed_it():
     fold = looked_at(16, 2, (Verdict(member(0, 2), member(0, 0), same=False),))
     assert (
         fold.landmarks.identity(member(0, 2)) in shown_landmarks(fold, CentralConfig(), "final").ids

@@ -1,4 +1,4 @@
-"""Nonlinearity of the start pose of a robot that drove long before its first landmark."""
+"""Errors of linearisation: bent ellipses, and maps that become too long."""
 
 import numpy as np
 import pytest

@@ -40,19 +40,19 @@ def seen(assumed: tuple[float, float, float] = MOUNT, **changes: object) -> list
 
 
 @pytest.mark.parametrize("told", ["ranges", "points"])
-def test_the_factors_of_what_is_claimed_are_learnt(told: str) -> None:
+def test_the_factors_of_what_is_claimed_are_learnt(told):
     data = seen(landmark_form=told)
     assert odometry_factor(data)["covariance_factor"] == pytest.approx(4.0, rel=0.25)
     found = landmark_factor(data, ROBOTS[0].sensor)["covariance_factor"]
     assert found == pytest.approx(4.0, rel=0.1)
 
 
-def test_without_claims_there_is_no_factor() -> None:
+def test_without_claims_there_is_no_factor():
     data = seen(odometry_claims=False, landmark_claims=None)
     assert odometry_factor(data) == landmark_factor(data, ROBOTS[0].sensor) == {}
 
 
-def test_a_mount_that_is_not_the_scenarios_is_told_and_where_it_is() -> None:
+def test_a_mount_that_is_not_the_scenarios_is_told_and_where_it_is():
     assert mount_note(seen(), ROBOTS[0].sensor) == ()
     wrong = msgspec.structs.replace(ROBOTS[0].sensor, mount=(0.0, 0.0, 0.3))
     (note,) = mount_note(seen(wrong.mount), wrong)
@@ -60,7 +60,7 @@ def test_a_mount_that_is_not_the_scenarios_is_told_and_where_it_is() -> None:
     np.testing.assert_allclose([float(x) for x in told.split(",")], MOUNT, atol=0.03)
 
 
-def test_a_place_that_the_view_does_not_determine_is_refused_by_name() -> None:
+def test_a_place_that_the_view_does_not_determine_is_refused_by_name():
     data = seen()
     for k, each in enumerate(data):
         object.__setattr__(each, "seen", each.seen.only(0, 3 + k))
@@ -68,7 +68,7 @@ def test_a_place_that_the_view_does_not_determine_is_refused_by_name() -> None:
     assert note.startswith("mount: the sensor's place on the base is not learnt")
 
 
-def test_what_a_depth_can_not_say_is_left_out_of_the_mount() -> None:
+def test_what_a_depth_can_not_say_is_left_out_of_the_mount():
     behind = msgspec.structs.replace(ROBOTS[0].sensor, range_is_depth=True, optical_axis=2.5)
     (note,) = mount_note(seen(), behind)
     assert note.startswith("mount: the sensor's place on the base is not learnt (± 0.0")

@@ -38,7 +38,7 @@ def map_error(scenario: Scenario) -> float:
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def places(tmp_path_factory):
     """A data set whose clocks are right, and the same with late detections of r2."""
     late = StressWorld(**{**vars(SMALL), "late": {"r2": OFFSET_S}})
     root = tmp_path_factory.mktemp("sets")
@@ -46,8 +46,8 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_good(
-    places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    places, monkeypatch
+):
     """The scenario has a part of the offset already; the rest adds to it.
 
     The figures of the joined map, which take most of the time, have tests of their own.
@@ -81,7 +81,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     assert "clock_offset_s" in scenario_toml(found, late, ["late"])
 
 
-def test_clocks_that_are_right_are_left_alone(places: tuple[Path, Path]) -> None:
+def test_clocks_that_are_right_are_left_alone(places):
     right = opened(places[0])
     data = against_truth([("right", streams_of(right))], right)[0]
     clocks = clocks_of(data, right.robots[0].sensor)
@@ -89,7 +89,7 @@ def test_clocks_that_are_right_are_left_alone(places: tuple[Path, Path]) -> None
     assert not any(clock.is_off for clock in clocks.values())
 
 
-def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path: Path) -> None:
+def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path):
     """A scenario that names one robot names all of the team."""
     own = tmp_path / "scenario.toml"
     for robot in ("r1", "r2", "r3"):
@@ -104,7 +104,7 @@ def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path: Path) ->
     assert clocks == {"r1": 0.0, "r2": 0.5, "r3": 0.0}
 
 
-def test_a_late_robot_is_compared_with_its_teammates_at_one_time(places: tuple[Path, Path]) -> None:
+def test_a_late_robot_is_compared_with_its_teammates_at_one_time(places):
     """Detections and odometry are moved to the clock of the true paths, which all robots share."""
     streams = streams_of(opened(places[0]))
     late = Clock(*(Figure(name, s, 0.01, "s") for name, s in (("a", 0.3), ("b", -0.2), ("c", 0.5))))

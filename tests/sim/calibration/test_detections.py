@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from teamslam.central.config import CentralConfig
-from teamslam.sim.calibration.calibrate import Calibration
 from teamslam.sim.calibration.consistency import factor_by_cost
 from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
 from teamslam.sim.calibration.figures import Figure
 from teamslam.sim.calibration.join import fold_of
-from teamslam.sim.calibration.scenario import scenario_toml
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import NO_LABEL
@@ -85,7 +83,6 @@ def test_submaps_that_claim_too_little_give_the_factor_and_a_warning():
     ]
     central = CentralConfig(association=AssociationProfile(recent=4))
     factor = factor_by_cost(lambda config: fold_of(overconfident, (), config), central)
-    assert factor is not None
     assert factor.value == pytest.approx(3.0, rel=0.2)
     rates = (
         Figure("errors_over_claims", 0.5, 0.1, ""),
@@ -97,19 +94,3 @@ def test_submaps_that_claim_too_little_give_the_factor_and_a_warning():
     assert detected.startswith("60% of the landmarks in view are detected")
     holds = claim_notes((), (replace(factor, value=1.2),), AssociationSettings())
     assert holds == ()
-
-
-def test_what_was_learnt_is_in_the_scenario(tmp_path):
-    rates = (
-        Figure("detection_probability", 0.75, 0.01, ""),
-        Figure("clutter_share", 0.2, 0.01, ""),
-    )
-    found = Calibration((), (), False, (), detections=rates)
-    place = tmp_path / "learnt.toml"
-    text = scenario_toml(found, load("dlr"), ["a set"])
-    place.write_text(text, "utf-8")
-    settings = load(str(place)).robots[0].front_end.association
-    assert settings == msgspec.structs.replace(
-        load("dlr").robots[0].front_end.association, detection_probability=0.75
-    )
-    assert "# clutter_share: 0.2 ± 0.01" in text

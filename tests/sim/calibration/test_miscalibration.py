@@ -55,15 +55,13 @@ def joined(biases: tuple[Bias, ...], true_scale: float) -> Run:
         )
         for robot in told.robots
     )
-    assert isinstance(told.world, SimulatedWorld)
     fused = evaluate(run_team(told, simulated(told.world, truly, 11))).map
-    assert fused is not None
     a, b = (of - of.mean(axis=0) for of in (fused.means, fused.truth))
     along, across = np.sum(a * b), np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     return Run(fused, float(np.hypot(along, across) / np.sum(b * b)))
 
 
-def test_an_odometry_that_is_5_percent_off_at_unseen_speeds_spoils_the_map_and_is_told() -> None:
+def test_an_odometry_that_is_5_percent_off_at_unseen_speeds_spoils_the_map_and_is_told():
     run = joined(("range_scale",), 1.05)
     assert run.scale < 0.985
     assert any(
@@ -72,10 +70,9 @@ def test_an_odometry_that_is_5_percent_off_at_unseen_speeds_spoils_the_map_and_i
     )
 
 
-def test_the_scale_of_unseen_speeds_is_estimated_from_the_ranges() -> None:
+def test_the_scale_of_unseen_speeds_is_estimated_from_the_ranges():
     run = joined(("forward_scale", "range_scale"), 1.05)
     assert run.scale == pytest.approx(1.0, abs=0.008)
-    assert run.map.errors is not None
     assert run.map.errors.in_band
     told = [each for each in run.map.diagnosis if each.cause == "odometry_scale"]
     assert len({each.robot for each in told}) == len(told) == 3
@@ -83,7 +80,7 @@ def test_the_scale_of_unseen_speeds_is_estimated_from_the_ranges() -> None:
     assert not any("not valid" in words for words in run.map.reasons)
 
 
-def test_models_that_fit_give_no_alarm() -> None:
+def test_models_that_fit_give_no_alarm():
     run = joined(("range_scale",), 1.0)
     assert run.scale == pytest.approx(1.0, abs=0.008)
     assert not any("calibrated" in words for words in run.map.reasons)
@@ -100,8 +97,6 @@ def test_models_that_fit_give_no_alarm() -> None:
     ],
     ids=["they differ", "all long", "all short", "hardly known", "small"],
 )
-def test_the_alarm_is_of_the_mean_beyond_its_level_and_its_uncertainty(
-    scales: tuple[float, ...], sigma: float, told: bool
-) -> None:
+def test_the_alarm_is_of_the_mean_beyond_its_level_and_its_uncertainty(scales, sigma, told):
     biases = [BiasEstimate((f"r{i}", 1), "range_scale", v, sigma) for i, v in enumerate(scales)]
     assert bool(miscalibrations(biases)) == told

@@ -60,7 +60,7 @@ def team(cameras: dict[str, tuple[float, float, float]], *, depth: bool = True) 
     return [looking(r, w, camera, depth=depth) for w in (1, 2) for r, camera in cameras.items()]
 
 
-def test_each_cameras_own_constants_come_out_where_they_differ() -> None:
+def test_each_cameras_own_constants_come_out_where_they_differ():
     own = own_constants(team(CAMERAS), depth=True)
     assert list(own.robots) == list(CAMERAS)
     for robot, (scale, offset, axis) in CAMERAS.items():
@@ -76,12 +76,12 @@ def test_each_cameras_own_constants_come_out_where_they_differ() -> None:
     assert max(f.value for f in own.strays if f.name.endswith("range_scale")) < 0.003
 
 
-def test_cameras_that_are_alike_have_nothing_of_their_own() -> None:
+def test_cameras_that_are_alike_have_nothing_of_their_own():
     alike = dict.fromkeys(CAMERAS, CAMERAS["r1"])
     assert own_constants(team(alike), depth=True).robots == {}
 
 
-def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have() -> None:
+def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have():
     data = team(CAMERAS | {"r4": CAMERAS["r1"]})
     before = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
     data[-1] = replace(looking("r4", 2, (1.08, 0.0, 0.0)), name="2 r4")
@@ -89,7 +89,7 @@ def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have()
     assert after["bias_sigma.range_scale"] < 3.0 * before["bias_sigma.range_scale"] + 1e-3
 
 
-def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world() -> None:
+def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world():
     read = [
         looking(robot, world, (scale + by, *rest))
         for world, by in ((1, 0.02), (2, -0.02))
@@ -102,7 +102,7 @@ def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world()
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_the_wrong_model_of_the_range_is_told(depth: bool) -> None:
+def test_the_wrong_model_of_the_range_is_told(depth):
     data = team(CAMERAS, depth=depth)
     assert fit_sensor(data, depth=depth)["range_sigma_per_m"] == pytest.approx(0.01, rel=0.1)
     assert _other_model(data, depth) == ()
@@ -110,7 +110,7 @@ def test_the_wrong_model_of_the_range_is_told(depth: bool) -> None:
     assert f"set range_is_depth = {str(depth).lower()}" in told
 
 
-def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike() -> None:
+def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike():
     """Six worlds of eight landmarks; the fitted constants absorb a part of the spread."""
     marked = [
         looking(r, world, camera, marker=0.02)
@@ -118,7 +118,6 @@ def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike() -> 
         for r, camera in CAMERAS.items()
     ]
     found = marker_spread(marked, depth=True)
-    assert found is not None
     assert found.name == "common_bias_sigma.marker"
     assert found.value == pytest.approx(0.02, abs=3.0 * found.sigma)
     assert 0.0005 < found.sigma < 0.004

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -45,7 +44,7 @@ def published() -> list[Sample]:
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "log.mcap"
     with Recorder(path, "small", {"seed": "1", "note": "x" * 200 + "\n\x1b[2J[bold]"}) as recorder:
         recorder.write(published())
@@ -53,9 +52,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("options", [(), ("--keys",)])
-def test_info_names_each_key_and_sends_no_control_sequence_to_the_terminal(
-    log: Path, options: tuple[str, ...]
-) -> None:
+def test_info_names_each_key_and_sends_no_control_sequence_to_the_terminal(log, options):
     status, out, _ = run("info", log, *options)
     lines = [line for line in out.splitlines() if str(log) not in line]
     assert status == 0
@@ -65,7 +62,7 @@ def test_info_names_each_key_and_sends_no_control_sequence_to_the_terminal(
     assert ("source/r1/odometry" if options else "odometry") in out
 
 
-def test_the_figures_of_info_are_written_for_machines(log: Path, tmp_path: Path) -> None:
+def test_the_figures_of_info_are_written_for_machines(log, tmp_path):
     assert run("info", log, "--json", tmp_path / "info.json")[0] == 0
     figures = json.loads((tmp_path / "info.json").read_text())
     odometry = next(each for each in figures["keys"] if each["key"] == "source/r1/odometry")
@@ -76,7 +73,7 @@ def test_the_figures_of_info_are_written_for_machines(log: Path, tmp_path: Path)
     assert figures["span_ns"] == [0, 20 * 10**9]
 
 
-def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path) -> None:
+def test_check_ends_with_1_and_a_line_for_each_finding(log, tmp_path):
     assert run("check", log)[:2] == (0, f"{log}: nothing wrong\n")
     lost = tmp_path / "lost.mcap"
     with Recorder(lost, "small", {}) as recorder:
@@ -91,7 +88,7 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log: Path, tmp_path: Path
     assert all(" missing: " in line for line in out.splitlines())
 
 
-def test_parts_by_the_command_merge_to_a_sound_log(log: Path, tmp_path: Path) -> None:
+def test_parts_by_the_command_merge_to_a_sound_log(log, tmp_path):
     a, b, m = (tmp_path / f"{name}.mcap" for name in "abm")
     assert run("cut", log, "-o", a, "--to", 7.5)[0] == 0
     assert run("cut", log, "-o", b, "--from", 7.5)[0] == 0
@@ -101,7 +98,7 @@ def test_parts_by_the_command_merge_to_a_sound_log(log: Path, tmp_path: Path) ->
     assert run("check", m)[0] == 0
 
 
-def test_a_log_that_is_cut_off_is_repaired(log: Path, tmp_path: Path) -> None:
+def test_a_log_that_is_cut_off_is_repaired(log, tmp_path):
     (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-100])
     assert run("check", tmp_path / "cut.mcap")[0] == 1
     assert run("repair", tmp_path / "cut.mcap", "-o", tmp_path / "whole.mcap")[0] == 0
@@ -110,9 +107,7 @@ def test_a_log_that_is_cut_off_is_repaired(log: Path, tmp_path: Path) -> None:
     assert list(open_log(tmp_path / "whole.mcap").samples()) == published()
 
 
-def test_the_exported_data_set_is_the_one_that_the_world_would_write(
-    log: Path, tmp_path: Path
-) -> None:
+def test_the_exported_data_set_is_the_one_that_the_world_would_write(log, tmp_path):
     write_utias(streams(scenario(robots=2)), tmp_path / "world")
     status, out, _ = run("export", log, "--format", "utias", "-o", tmp_path / "log")
     assert status == 0
@@ -123,7 +118,7 @@ def test_the_exported_data_set_is_the_one_that_the_world_would_write(
         assert (tmp_path / "log" / name).read_bytes() == (tmp_path / "world" / name).read_bytes()
 
 
-def test_chosen_channels_are_exported_as_csv(log: Path, tmp_path: Path) -> None:
+def test_chosen_channels_are_exported_as_csv(log, tmp_path):
     status, out, _ = run("export", log, "-o", tmp_path / "out", "--channels", "odometry, truth")
     assert status == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -132,9 +127,7 @@ def test_chosen_channels_are_exported_as_csv(log: Path, tmp_path: Path) -> None:
     assert "odometry.csv: 40 rows" in out
 
 
-def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
-    log: Path, tmp_path: Path
-) -> None:
+def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(log, tmp_path):
     alone = tmp_path / "r1.mcap"
     own = [s for s in published() if s.key.startswith("source/r1")]
     with Recorder(alone, "small", {}) as recorder:
@@ -184,9 +177,8 @@ def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(
     ],
 )
 def test_what_a_user_gets_wrong_ends_with_2_and_leaves_nothing(
-    log: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str],
-    told: str,
-) -> None:  # fmt: skip
+    log, monkeypatch, tmp_path, arguments, told
+):
     monkeypatch.chdir(tmp_path)
     given = [
         log.parent if each == "LOG/.." else log if each == "LOG" else each for each in arguments
@@ -197,7 +189,7 @@ def test_what_a_user_gets_wrong_ends_with_2_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
+def test_the_program_itself_ends_with_2_and_one_line(tmp_path):
     (tmp_path / "hello.mcap").write_bytes(b"hello")
     done = subprocess.run(
         [sys.executable, "-m", "teamslam", "log", "check", str(tmp_path / "hello.mcap")],
@@ -225,9 +217,7 @@ def test_the_program_itself_ends_with_2_and_one_line(tmp_path: Path) -> None:
         ("log", "merge", "--output", "merged.mcap", "hole.mcap"),
     ],
 )
-def test_a_log_with_a_hole_says_so_in_every_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
-) -> None:
+def test_a_log_with_a_hole_says_so_in_every_command(tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     with Recorder(tmp_path / "hole.mcap", "small", {"seed": "1"}) as recorder:
         lost = [s for s in published() if s.key == "source/r2/odometry"][5:8]

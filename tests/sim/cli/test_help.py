@@ -1,18 +1,28 @@
-"""Help of the commands: sections, examples, suggestions."""
+"""The command line: help, suggestions, plain parsing, progress, comparison of runs."""
 
+import json
+from pathlib import Path
+
+import pytest
 import typer
 from typer.testing import CliRunner
 
+from teamslam.sim.cli import nodes, steps
+from teamslam.sim.cli.entry import PROCESSES
 from teamslam.sim.cli.help import SECTIONS
 from teamslam.sim.cli.main import app
+from teamslam.sim.cli.plain import parse_plainly
+from teamslam.sim.cli.steps import Steps
+from teamslam.team.recording.recorder import Recorder
+from tests.sim.logs import joined_log, scenario
 from tests.test_architecture import unknown
 
 RUN = CliRunner()
 WHOLE = typer.main.get_command(app)
-SHOWN = {name: each for name, each in WHOLE.commands.items() if not each.hidden}  # type: ignore[attr-defined]
+SHOWN = {name: each for name, each in WHOLE.commands.items() if not each.hidden}
 
 
-def test_every_command_is_in_one_section_and_has_an_example_that_it_understands() -> None:
+def test_every_command_is_in_one_section_and_has_an_example_that_it_understands():
     named = [name for names in SECTIONS.values() for name in names]
     assert sorted(named) == sorted(SHOWN)
     assert len(SECTIONS) == 5
@@ -25,7 +35,7 @@ def test_every_command_is_in_one_section_and_has_an_example_that_it_understands(
             assert unknown(line.removeprefix("teamslam ")) is None
 
 
-def test_help_has_the_sections_in_order_and_fits_80_columns() -> None:
+def test_help_has_the_sections_in_order_and_fits_80_columns():
     text = RUN.invoke(app, ["--help"], terminal_width=80).output
     places = [text.index(f"\n{title}:\n") for title in SECTIONS]
     assert places == sorted(places)
@@ -35,7 +45,7 @@ def test_help_has_the_sections_in_order_and_fits_80_columns() -> None:
     assert max(map(len, (text + launch).splitlines())) <= 80
 
 
-def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one() -> None:
+def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():
     for words, meant in (
         (["lunch"], "'launch'"),
         (["log", "chek"], "'check'"),
@@ -48,6 +58,88 @@ def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one() 
     assert "did you mean `waypoints`?" in str(RUN.invoke(app, ["launch", "waypoint"]).exception)
 
 
-def test_an_option_unlike_any_other_has_no_suggestion() -> None:
+def test_an_option_unlike_any_other_has_no_suggestion():
     output = RUN.invoke(app, ["launch", "--zzzz"]).output
     assert "No such option: --zzzz\n" in output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "router",
+        "router --listen tcp/0.0.0.0:7447 --insecure",
+        "router --insecure --no-insecure --keys=keys",
+        "world waypoints --speed max --no-recorder",
+        "world --dataset folder/set utias --connect tcp/h:1",
+        "robot s.json r1 --keys k --log own.mcap",
+        "robot s.json r1 --peers --set=r1.set --fold end",
+        "central s.json --peers --keys keys",
+        "record s.json -o a.mcap --no-join",
+        "record s.json --output a.mcap --resume",
+    ],
+)
+def test_what_is_parsed_is_as_by_typer(words):
+    name, *rest = words.split()
+    command = WHOLE.commands[name]
+    parsed = command.make_context(name, list(rest)).params
+    assert parse_plainly(getattr(nodes, name), rest) == parsed
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "robot", "robot s.json", "robot s.json r1 r2", "robot s.json r1 --help",
+        "robot s.json r1 --conect a", "robot s.json r1 --connect", "world s --seed 3",
+        "central s --patience 3", "central s --map a.toml", "record s", "record s -ofile",
+        "router --listen --insecure",
+    ],
+)  # fmt: skip
+def test_help_mistakes_and_numbers_are_left_to_typer(words):
+    name, *rest = words.split()
+    assert name in PROCESSES
+    assert parse_plainly(getattr(nodes, name), rest) is None
+
+
+def test_short_work_says_nothing_and_long_work_what_it_does_and_how_far_it_is(monkeypatch, capsys):
+    at_s = [0.0]
+    monkeypatch.setattr(steps.time, "monotonic", lambda: at_s[0])
+    told = Steps()
+    told.begin("scoring the run")
+    told.share(0.3)
+    assert capsys.readouterr().err == ""
+    at_s[0] = 3.5
+    told.share(0.42)
+    told.share(0.43)
+    told.begin("proving the ledger")
+    at_s[0] = 7.0
+    told.robot("r3")
+    assert capsys.readouterr().err == "scoring the run: 42%\nproving the ledger: r3\n"
+
+
+def written(path: Path, deviation: float) -> Path:
+    path.parent.mkdir(parents=True)
+    with Recorder(path, "small", {}) as recorder:
+        recorder.write(joined_log(scenario(robots=2), deviation))
+    return path
+
+
+def test_two_runs_stand_side_by_side(tmp_path):
+    near, far = (tmp_path / name / "log.mcap" for name in ("near", "far"))
+    written(near, 0.05)
+    written(far, 0.2)
+    picture, figures = tmp_path / "both.svg", tmp_path / "both.json"
+    done = CliRunner().invoke(
+        app, ["compare", str(near.parent), str(far), "-o", str(picture), "--json", str(figures)]
+    )
+    assert done.exit_code == 0, done.output
+    told = json.loads(figures.read_text())
+    assert float(told["near"]["landmark RMSE [m]"]) < float(told["far"]["landmark RMSE [m]"])
+    assert "near" in done.stdout
+    assert "<svg" in picture.read_text()
+
+
+def test_one_run_and_a_picture_of_no_kind_are_refused(tmp_path):
+    alone = CliRunner().invoke(app, ["compare", "a"])
+    assert (alone.exit_code, "two or more" in alone.output) == (2, True)
+    wrong = CliRunner().invoke(app, ["compare", "a", "b", "-o", str(tmp_path / "x.jpeg")])
+    assert (wrong.exit_code, ".svg" in wrong.output) == (2, True)

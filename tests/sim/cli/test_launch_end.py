@@ -3,7 +3,6 @@
 import errno
 import os
 from io import StringIO
-from pathlib import Path
 
 import pytest
 import typer
@@ -25,8 +24,8 @@ from tests.sim.logs import scenario, streams
 
 
 def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_leaves_no_half_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     log, figures = tmp_path / "run" / "log.mcap", tmp_path / "figures.json"
     outcome = Outcome(log=log, folder=log.parent, wall_s=1.0, processes=[])
 
@@ -42,7 +41,7 @@ def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_
     assert not figures.exists()
 
 
-def test_figures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_figures_are_written_whole_or_not_at_all(tmp_path):
     file = tmp_path / "figures.json"
     file.write_text("old")
     launch._check_writable(file)
@@ -53,8 +52,8 @@ def test_figures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     outcome = Outcome(log=tmp_path / "log.mcap", folder=tmp_path, wall_s=1.0, processes=[])
 
     def full(*_: object) -> None:
@@ -72,8 +71,8 @@ def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_els
 
 @pytest.mark.parametrize("lost", ["nothing", "a measurement", "the final map"])
 def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
-    lost: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    lost, tmp_path, capsys
+):
     of = scenario()
     samples = list(run_team(of, streams(of)))
     key = {"a measurement": ch.ODOMETRY.key("r1"), "the final map": ch.FINAL_MAP.key()}.get(lost)

@@ -35,7 +35,7 @@ def data_set(path: Path, **tables: str) -> Path:
 
 def read(path: Path, *robots: str, **options: object) -> WorldStreams:
     team = [RobotConfig(id=name) for name in robots or ("r1",)]
-    return folder(FolderWorld(path=str(path), **options), team)  # type: ignore[arg-type]
+    return folder(FolderWorld(path=str(path), **options), team)
 
 
 def only(path: Path, **options: object) -> RobotStream:
@@ -58,7 +58,7 @@ SPEEDS = "t_s,forward_m_s,yaw_rate_rad_s\n0,1,0.1\n1,2,0.2\n3,0,0\n"
 SEEN = "t_s,landmark,range_m,bearing_rad\n1,7,2.5,0.5\n1,3,1.5,-0.5\n2,7,2.4,0.4\n"
 
 
-def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path) -> None:
+def test_what_is_written_is_read_again_to_the_last_bit(tmp_path):
     names = ("r9", "r2", "r1")
     off = StartPose(np.array([0.1, 1 / 3, -2.0]), np.array([[2, 1, 0], [1, 3, 1], [0, 1, 1.5]]))
     streams = [teams.stream(name, 9, known=False, seen_every=2) for name in names]
@@ -76,16 +76,14 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path: Path) -> None:
     assert same((again.landmark_ids, again.landmarks), (world.landmark_ids, world.landmarks))
 
 
-def test_a_simulated_world_keeps_its_bits_with_its_empty_scans_and_sightings(
-    tmp_path: Path,
-) -> None:
+def test_a_simulated_world_keeps_its_bits_with_its_empty_scans_and_sightings(tmp_path):
     world = streams_of(load("waypoints"))
     assert any(0 in np.diff(each.landmark_detections.offsets) for each in world.streams)
     write_folder(world, tmp_path)
     assert same(read(tmp_path, *(each.robot for each in world.streams)), world)
 
 
-def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
+def test_stamps_keep_their_nanoseconds(tmp_path):
     text = f"t_s,landmark,range_m,bearing_rad\n{HOUR}000001,7,1,0\n{HOUR}000002,7,1,0\n"
     stamps = only(data_set(tmp_path, observations=text)).landmark_detections.stamps_ns
     assert stamps.tolist() == [1248272272841000001, 1248272272841000002]
@@ -93,7 +91,7 @@ def test_stamps_keep_their_nanoseconds(tmp_path: Path) -> None:
     assert [seconds(each) for each in (0, -1, 10 * 10**9)] == ["0", "-0.000000001", "10"]
 
 
-def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path: Path) -> None:
+def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path):
     held = only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN)).intervals
     assert held.end_ns.tolist() == [10**9, 3 * 10**9]
     assert held.forward.tolist() == [1.0, 2.0]
@@ -103,7 +101,7 @@ def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path: Path) -> Non
     assert means.duration_ns.tolist() == [5 * 10**8, 2 * 10**9]
 
 
-def test_poses_are_taken_as_the_increments_between_them(tmp_path: Path) -> None:
+def test_poses_are_taken_as_the_increments_between_them(tmp_path):
     x, y = 5 + np.cos(3) - np.sin(3), 5 + np.sin(3) + np.cos(3)
     text = f"t_s,x_m,y_m,theta_rad\n0,5,5,3\n2,{x},{y},{3 + np.pi / 2 - 2 * np.pi}\n"
     driven = only(data_set(tmp_path, odometry=text)).intervals
@@ -115,19 +113,17 @@ def test_poses_are_taken_as_the_increments_between_them(tmp_path: Path) -> None:
 INCREMENTS = "t_s,dx_m,dy_m,dtheta_rad,c_xx,c_xy,c_yy,c_xt,c_yt,c_tt\n"
 
 
-def test_increments_come_with_their_covariances(tmp_path: Path) -> None:
+def test_increments_come_with_their_covariances(tmp_path):
     text = INCREMENTS + "1,1,0.5,0.1,4,1,5,2,3,6\n3,2,0,0,1,0,1,0,0,1\n"
     stream = only(data_set(tmp_path, odometry=text))
     driven = stream.intervals
-    assert driven.increments is not None
-    assert driven.covariances is not None
     assert driven.increments.tolist() == [[1, 0.5, 0.1], [2, 0, 0]]
     assert driven.covariances[0].tolist() == [[4, 1, 2], [1, 5, 3], [2, 3, 6]]
     assert driven.duration_ns.tolist() == [2 * 10**9, 2 * 10**9]
     assert stream.notes[0] == "the first increment is taken to last as long as the second"
 
 
-def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path: Path) -> None:
+def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path):
     text = "t_s,wheel_speed_m_s,steering_rad\n0,1,0.1\n1,0,0\n"
     world = read(data_set(tmp_path, odometry=text))
     assert 'r1: wheel speed and steering can not be used: give kind = "acker' in world.notes[1]
@@ -135,19 +131,17 @@ def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path: Path) -> N
     assert (driven.steered, driven.forward.tolist(), driven.yaw_rate.tolist()) == (True, [1], [0.1])
 
 
-def test_points_stay_points_and_have_their_range_and_bearing(tmp_path: Path) -> None:
+def test_points_stay_points_and_have_their_range_and_bearing(tmp_path):
     text = "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,7,3,4,2,0.5,1\n1,8,-1,0,1,0,1\n1,9,1,1,1,2,1\n"
     stream = only(data_set(tmp_path, observations=text))
     seen = stream.landmark_detections
     assert (seen.ranges.tolist(), seen.bearings.tolist()) == ([5, 1], [np.arctan2(4, 3), np.pi])
-    assert seen.points is not None
-    assert seen.covariances is not None
     assert seen.points.tolist() == [[3, 4], [-1, 0]]
     assert seen.covariances.tolist() == [[2, 0.5, 1], [1, 0, 1]]
     assert "1 measurement dropped: its covariance is not positive definite" in stream.notes[1]
 
 
-def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path: Path) -> None:
+def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path):
     """A mark at the beginning, CRLF, quotes, spaces, empty rows and columns, numbers as pandas'."""
     plain = only(data_set(tmp_path / "plain", odometry=SPEEDS, observations=SEEN))
     odd = tmp_path / "odd" / "r1"
@@ -160,7 +154,6 @@ def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path: Path) -> None
     (odd / "observations.csv").write_text(spaced)
     (odd / "start.csv").write_text("t_s,x_m,y_m,theta_rad\n0,1,2,3\n")
     found = only(tmp_path / "odd")
-    assert found.start is not None
     assert found.start.pose.tolist() == [1, 2, 3]
     assert same(dataclasses.replace(found, start=None), plain)
 
@@ -168,7 +161,7 @@ def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path: Path) -> None
 CLAIM = "0.04,0,0.05,0,0.01,0.06"
 
 
-def test_any_odometry_may_claim_its_covariance(tmp_path: Path) -> None:
+def test_any_odometry_may_claim_its_covariance(tmp_path):
     columns = ",c_xx,c_xy,c_yy,c_xt,c_yt,c_tt"
     speeds = f"t_s,forward_m_s,yaw_rate_rad_s{columns}\n0,1,0.5,{CLAIM}\n2,0,0,0,0,0,0,0,0\n"
     held = only(data_set(tmp_path / "a", odometry=speeds)).intervals
@@ -177,7 +170,6 @@ def test_any_odometry_may_claim_its_covariance(tmp_path: Path) -> None:
     between = only(data_set(tmp_path / "b", odometry=poses)).intervals
     for found in (held, between):
         assert found.increments is not None
-        assert found.covariances is not None
         expected = [[2 * np.sin(1), 2 - 2 * np.cos(1), 1.0]]  # an arc of 2 m and 1 rad
         np.testing.assert_allclose(found.increments, expected, rtol=1e-14)
         assert found.covariances[0, [0, 1, 2], [0, 1, 2]].tolist() == [0.04, 0.05, 0.06]
@@ -185,7 +177,7 @@ def test_any_odometry_may_claim_its_covariance(tmp_path: Path) -> None:
         only(data_set(tmp_path / "c", odometry=speeds.replace("0.04", "0")))
 
 
-def test_what_is_hardly_meant_is_noted(tmp_path: Path) -> None:
+def test_what_is_hardly_meant_is_noted(tmp_path):
     data_set(tmp_path, odometry=SPEEDS + "4,1,200\n5,0,0\n", observations=SEEN + "-9,7,1,0\n")
     place = tmp_path / "r2"
     place.mkdir()
@@ -233,7 +225,7 @@ def general(robot: RobotStream, form: str) -> RobotStream:
 
 
 @pytest.mark.parametrize("form", ["steered", "plain", "claimed"])
-def test_general_measurements_keep_their_bits(tmp_path: Path, form: str) -> None:
+def test_general_measurements_keep_their_bits(tmp_path, form):
     robot = dataclasses.replace(general(teams.stream("r9", 9), form), teammates=("r1", "r9"))
     other = dataclasses.replace(teams.stream("r1", 9), teammates=("r1", "r9"))
     world = WorldStreams((other, robot), np.empty(0, np.uint32), None, "test")
@@ -241,13 +233,13 @@ def test_general_measurements_keep_their_bits(tmp_path: Path, form: str) -> None
     assert same(read(tmp_path, "r1", "r9").streams[1], robot)
 
 
-def test_tables_of_one_robot_may_lie_in_the_folder_itself(tmp_path: Path) -> None:
+def test_tables_of_one_robot_may_lie_in_the_folder_itself(tmp_path):
     (tmp_path / "odometry.csv").write_text(SPEEDS)
     stream = only(tmp_path)
     assert (stream.robot, stream.start) == ("r1", None)
 
 
-def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path: Path) -> None:
+def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
     seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
     stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
     assert stream.notes == (
@@ -264,7 +256,7 @@ def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path: Path) -> 
     assert stream.landmark_detections.ids.tolist() == [9, 7, 3, 7]
 
 
-def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> None:
+def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path):
     text = "t_s,teammate,range_m,bearing_rad\n1,r2,1,0\n1,r9,1,0\n1,r1,1,0\n"
     data_set(tmp_path, odometry=SPEEDS, sightings=text)
     (tmp_path / "r2").mkdir()
@@ -327,9 +319,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path: Path) -> Non
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
     ],
 )
-def test_damage_names_file_line_column_and_remedy(
-    tmp_path: Path, table: str, text: str, words: str
-) -> None:
+def test_damage_names_file_line_column_and_remedy(tmp_path, table, text, words):
     with pytest.raises(DatasetError) as error:
         only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN, **{table: text})
              if table not in ("odometry", "observations")
@@ -337,7 +327,7 @@ def test_damage_names_file_line_column_and_remedy(
     assert words in str(error.value)
 
 
-def test_only_a_part_is_read_when_asked(tmp_path: Path) -> None:
+def test_only_a_part_is_read_when_asked(tmp_path):
     data_set(tmp_path, odometry=SPEEDS, observations=SEEN)
     stream = only(tmp_path, duration_s=1.5)
     assert stream.intervals.end_ns.tolist() == [10**9]
@@ -351,7 +341,7 @@ def two_robots(path: Path) -> Scenario:
     return with_options(load("recorded"), dataset=path)
 
 
-def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path: Path) -> None:
+def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path):
     scenario = two_robots(tmp_path)
     assert [robot.id for robot in scenario.robots] == ["alice", "bob"]
     assert scenario.robots[0].motion == load("recorded").robots[0].motion
@@ -362,21 +352,20 @@ def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path
     assert [robot.id for robot in with_options(load(own), dataset=tmp_path).robots] == ["bob"]
 
 
-def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path: Path) -> None:
+def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
     scenario = two_robots(tmp_path)
     (tmp_path / "bob" / "odometry.csv").unlink()
     kept, said = with_present_robots(scenario)
     assert [robot.id for robot in kept.robots] == ["alice"]
-    assert said is not None
     assert said.startswith("bob: no files in")
 
 
-def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path: Path) -> None:
+def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path):
     scenario = with_options(load("waypoints"), robots=1)
     world = scenario.world
     scenario = msgspec.structs.replace(
         scenario,
-        world=msgspec.structs.replace(world, steps=25),  # type: ignore[arg-type]
+        world=msgspec.structs.replace(world, steps=25),
     )
     streams = streams_of(scenario)
     write_folder(streams, tmp_path)
@@ -385,7 +374,7 @@ def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path: Pa
     assert final_map(list(run_team(again, streams_of(again)))) == first
 
 
-def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path: Path) -> None:
+def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path):
     data_set(tmp_path, odometry=SPEEDS, observations=SEEN + "x,1,1,1\n")
     result = CliRunner().invoke(app, ["launch", "--dataset", str(tmp_path)])
     assert "no scenario given" in result.output
@@ -394,7 +383,7 @@ def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path: Path) -> 
     assert "line 5, column t_s: 'x' is not a time" in str(result.exception)
 
 
-def test_a_folder_around_the_data_set_is_named(tmp_path: Path) -> None:
+def test_a_folder_around_the_data_set_is_named(tmp_path):
     data_set(tmp_path / "inner", odometry=SPEEDS, observations=SEEN)
     with pytest.raises(DatasetError, match=r"the data set is in its folder .*inner: give that"):
         kind_of(tmp_path)
@@ -403,7 +392,7 @@ def test_a_folder_around_the_data_set_is_named(tmp_path: Path) -> None:
         kind_of(tmp_path / "none")
 
 
-def test_import_of_a_folder_without_measurements_makes_none(tmp_path: Path) -> None:
+def test_import_of_a_folder_without_measurements_makes_none(tmp_path):
     data_set(tmp_path / "a", landmarks="landmark,x_m,y_m\n1,2,3\n")
     done = CliRunner().invoke(app, ["import", str(tmp_path / "a"), "-o", str(tmp_path / "b")])
     assert isinstance(done.exception, DatasetError)
@@ -412,9 +401,7 @@ def test_import_of_a_folder_without_measurements_makes_none(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("wrong", [(12, "0,0,0"), (12, "90,3,1"), (1, "0,-60,0")])
-def test_odometry_that_is_reset_or_has_a_wrong_row_goes_on_as_before(
-    tmp_path: Path, wrong: tuple[int, str]
-) -> None:
+def test_odometry_that_is_reset_or_has_a_wrong_row_goes_on_as_before(tmp_path, wrong):
     """Ten poses a second, half a metre a second ahead; from one on they begin at another pose."""
     first, pose = wrong
     rows = ["t_s,x_m,y_m,theta_rad"]
@@ -435,7 +422,7 @@ def test_odometry_that_is_reset_or_has_a_wrong_row_goes_on_as_before(
     assert "at which its pose jumps, by" in " ".join(stream.notes)
 
 
-def test_landmarks_whose_names_end_in_numbers_have_these(tmp_path: Path) -> None:
+def test_landmarks_whose_names_end_in_numbers_have_these(tmp_path):
     head = "t_s,landmark,range_m,bearing_rad\n"
     named = head + "1,tag36h11:5,2,0\n1,tag36h11:12,3,0.5\n2,,,\n"
     stream = only(data_set(tmp_path / "a", odometry=SPEEDS, observations=named))
@@ -458,13 +445,13 @@ def test_landmarks_whose_names_end_in_numbers_have_these(tmp_path: Path) -> None
     ],
     ids=["decimal commas", "tabs", "quotes, order and capitals", "an index"],
 )
-def test_tables_as_other_programs_write_them_are_the_same(tmp_path: Path, odometry: str) -> None:
+def test_tables_as_other_programs_write_them_are_the_same(tmp_path, odometry):
     plain = only(data_set(tmp_path / "a", odometry=SPEEDS, observations=SEEN))
     other = only(data_set(tmp_path / "b", odometry=odometry, observations=SEEN))
     assert same(plain, other)
 
 
-def test_ranges_that_are_hardly_metres_are_noted(tmp_path: Path) -> None:
+def test_ranges_that_are_hardly_metres_are_noted(tmp_path):
     far = SEEN.replace("2.5", "2500").replace("1.5,", "1500,").replace("2.4", "2400")
     notes = only(data_set(tmp_path, odometry=SPEEDS, observations=far)).notes
     assert any("the median range is 2,400 m" in note for note in notes)

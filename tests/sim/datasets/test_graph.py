@@ -65,7 +65,7 @@ def streams(path: Path, robots: int = 1, **fields: object):
     return graph_world(GraphWorld(path=str(path), **fields), robots)
 
 
-def test_isams_weights_are_roots_in_the_axes_of_the_first_pose(tmp_path: Path) -> None:
+def test_isams_weights_are_roots_in_the_axes_of_the_first_pose(tmp_path):
     path = written(tmp_path, ISAM)
     world = streams(path)
     (stream,) = world.streams
@@ -82,7 +82,7 @@ def test_isams_weights_are_roots_in_the_axes_of_the_first_pose(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("text", [G2O, TORO])
-def test_g2o_and_toro_state_the_information(tmp_path: Path, text: str) -> None:
+def test_g2o_and_toro_state_the_information(tmp_path, text):
     (stream,) = streams(written(tmp_path, text)).streams
     stated = np.linalg.inv(np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 16.0]]))
     if text is TORO:  # in the axes of the first pose, a quarter turn back
@@ -93,7 +93,7 @@ def test_g2o_and_toro_state_the_information(tmp_path: Path, text: str) -> None:
     assert stream.start.pose.tolist() == ([5.0, 1.0, 0.0] if text is G2O else [0.0, 0.0, 0.0])
 
 
-def test_an_errorless_twin_is_the_truth(tmp_path: Path) -> None:
+def test_an_errorless_twin_is_the_truth(tmp_path):
     path = written(tmp_path, ISAM)
     written(tmp_path, ISAM.replace(" 2 0 1.5", " 2.5 0 1.5"), "graph_groundtruth.txt")
     world = streams(path)
@@ -101,7 +101,7 @@ def test_an_errorless_twin_is_the_truth(tmp_path: Path) -> None:
     assert np.allclose(world.streams[0].truth[:, :2], [[0.0, 0.0], [2.5, 0.0], [2.5, 1.0]])
 
 
-def test_pyfg_has_robots_times_priors_and_the_truth(tmp_path: Path) -> None:
+def test_pyfg_has_robots_times_priors_and_the_truth(tmp_path):
     world = streams(written(tmp_path, PYFG), robots=2)
     first, second = world.streams
     assert first.start.covariance is None
@@ -132,7 +132,7 @@ def drive(poses: int = 60, landmarks: int = 12, noise: float = 1.0) -> str:
     return "\n".join(lines)
 
 
-def test_pieces_know_the_first_start_alone_and_keep_every_measurement(tmp_path: Path) -> None:
+def test_pieces_know_the_first_start_alone_and_keep_every_measurement(tmp_path):
     path = written(tmp_path, drive())
     (whole,) = streams(path).streams
     parts = streams(path, 3).streams
@@ -149,7 +149,7 @@ def test_pieces_know_the_first_start_alone_and_keep_every_measurement(tmp_path: 
 
 
 @pytest.mark.parametrize("robots", [1, 2])
-def test_a_team_maps_a_graph(tmp_path: Path, robots: int) -> None:
+def test_a_team_maps_a_graph(tmp_path, robots):
     path = written(tmp_path, drive())
     written(tmp_path, drive(noise=0.0), "graph_groundtruth.txt")
     scenario = with_options(load("graph"), dataset=path, robots=robots)
@@ -158,7 +158,7 @@ def test_a_team_maps_a_graph(tmp_path: Path, robots: int) -> None:
     assert joined.errors.rmse_m < 0.2
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_what_is_written_is_read_back(tmp_path):
     graph = read_graph(written(tmp_path, drive()))
     from teamslam.sim.datasets.factor_graph import dead_reckoned
 
@@ -177,7 +177,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
             assert np.allclose(seen.covariance, old_seen.covariance)
 
 
-def test_robots_of_numbered_poses_end_where_no_edge_leads_on(tmp_path: Path) -> None:
+def test_robots_of_numbered_poses_end_where_no_edge_leads_on(tmp_path):
     two = ISAM.replace("EDGE2 1 2", "EDGE2 4 5").replace("LANDMARK 2", "LANDMARK 5")
     world = streams(written(tmp_path, two.replace("EDGE2 2 0", "EDGE2 5 0")), robots=2)
     assert [len(stream.intervals.end_ns) for stream in world.streams] == [1, 1]
@@ -196,7 +196,7 @@ def test_robots_of_numbered_poses_end_where_no_edge_leads_on(tmp_path: Path) -> 
         ("some words", "no keyword 'some'"),
     ],
 )
-def test_a_malformed_line_is_named_with_its_remedy(tmp_path: Path, line: str, defect: str) -> None:
+def test_a_malformed_line_is_named_with_its_remedy(tmp_path, line, defect):
     path = written(tmp_path, ISAM.replace("EDGE2 1 2 1 0 0 50 0 0 20 0 100", line))
     done = CliRunner().invoke(app, ["launch", "--dataset", str(path), "-o", str(tmp_path / "run")])
     status, text = _advice(done.exception)
@@ -205,13 +205,13 @@ def test_a_malformed_line_is_named_with_its_remedy(tmp_path: Path, line: str, de
     assert defect in text
 
 
-def test_a_graph_without_landmarks_is_refused(tmp_path: Path) -> None:
+def test_a_graph_without_landmarks_is_refused(tmp_path):
     poses = "".join(f"{line}\n" for line in ISAM.splitlines() if not line.startswith("LANDMARK"))
     with pytest.raises(DatasetError, match="give a graph with landmarks"):
         streams(written(tmp_path, poses))
 
 
-def test_import_writes_tables_of_a_graph(tmp_path: Path) -> None:
+def test_import_writes_tables_of_a_graph(tmp_path):
     path = written(tmp_path, drive())
     out = tmp_path / "set"
     done = CliRunner().invoke(app, ["import", str(path), "-o", str(out)])
@@ -224,7 +224,7 @@ def test_import_writes_tables_of_a_graph(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not CITY.is_file(), reason="no cityTrees10000 here")
 @pytest.mark.parametrize(("robots", "batch_m"), [(1, 0.0504), (5, 0.0510)])
-def test_city_trees_is_mapped_as_well_as_by_the_batch(robots: int, batch_m: float) -> None:
+def test_city_trees_is_mapped_as_well_as_by_the_batch(robots, batch_m):
     scenario = with_options(load("graph"), dataset=CITY, robots=robots)
     run = evaluate(run_team(scenario, streams_of(scenario)))
     assert run.map.errors.aligned_rmse_m < 1.03 * batch_m

@@ -11,7 +11,6 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
 from teamslam.sim.studies.experiments.team_runs import Figures, team_figures
-from teamslam.sim.world.config import UtiasWorld
 
 SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 
@@ -19,7 +18,6 @@ SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 def slice_of_set_6() -> Scenario:
     """Its first 100 s, with poses once a window: nothing here judges the running ones."""
     scenario = with_options(load("utias"), dataset=SET_6)
-    assert isinstance(scenario.world, UtiasWorld)
     world = msgspec.structs.replace(scenario.world, duration_s=100.0)
     robots = tuple(msgspec.structs.replace(robot, pose_s=60.0) for robot in scenario.robots)
     return msgspec.structs.replace(scenario, world=world, robots=robots)
@@ -30,7 +28,7 @@ def figures(scenario: Scenario) -> Figures:
 
 
 @pytest.mark.skipif(not SET_6.exists(), reason="the data set is not here: it is not shipped")
-def test_one_declared_start_gives_the_map_that_five_give_and_joins_nobody_wrongly() -> None:
+def test_one_declared_start_gives_the_map_that_five_give_and_joins_nobody_wrongly():
     declared = figures(slice_of_set_6())
     found = figures(unknown_starts(slice_of_set_6()))
     assert found["not_joined"] == []

@@ -1,6 +1,5 @@
 """Bags of other labs: a robot's topics, its sensors' mounts, a clock that is set."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,9 +33,7 @@ def static(topic: str, *frames: tuple[str, str, Any, Any]) -> list[ros.Message]:
 
 
 @pytest.mark.parametrize("space", ["", "/anna"])
-def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(
-    tmp_path: Path, space: str
-) -> None:
+def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(tmp_path, space):
     wheels, fused = f"{space}/wheel/odometry", f"{space}/odometry/filtered"
     messages = [*odometry(fused, "base_footprint", 2.0), *odometry(wheels, "base_footprint")]
     bag = ros.write_bag(tmp_path / "bag", [*messages, *seen(f"{space}/tags", "base_footprint")])
@@ -54,13 +51,10 @@ def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(
         topics.write_text(text.replace(f'"{wheels}"   # or "{fused}"', f'"{topic}"'))
         assert run(bag, "-o", tmp_path / f"{speed}", "--ros2", topics).exit_code == 0
         (stream,) = read(tmp_path / f"{speed}").streams
-        assert stream.intervals.increments is not None
         assert stream.intervals.increments[:, 0].tolist() == [speed, speed]
 
 
-def test_each_camera_sees_from_its_own_place_and_frames_may_hang_below_either_base(
-    tmp_path: Path,
-) -> None:
+def test_each_camera_sees_from_its_own_place_and_frames_may_hang_below_either_base(tmp_path):
     frames = [
         ("base_link", "base_footprint", ros.vector(0.1), LEVEL),  # the odometry's frame is a leaf
         ("base_link", "front", ros.vector(0.3, 0.1), LEVEL),
@@ -88,7 +82,7 @@ def test_each_camera_sees_from_its_own_place_and_frames_may_hang_below_either_ba
     np.testing.assert_allclose(at[2] + (0.2, 0.1), (-3.0, 1.0), atol=1e-12)
 
 
-def test_robots_whose_frames_are_called_alike_keep_their_own_cameras(tmp_path: Path) -> None:
+def test_robots_whose_frames_are_called_alike_keep_their_own_cameras(tmp_path):
     messages: list[ros.Message] = []
     for robot, ahead in (("ann", 0.2), ("bob", 0.7)):
         camera = ("base_link", "camera", ros.vector(ahead), LEVEL)
@@ -101,7 +95,7 @@ def test_robots_whose_frames_are_called_alike_keep_their_own_cameras(tmp_path: P
     assert [f"{ahead}," in text for ahead in (0.2, 0.7)] == [True, True]
 
 
-def test_a_detection_with_two_names_is_told_and_either_may_count(tmp_path: Path) -> None:
+def test_a_detection_with_two_names_is_told_and_either_may_count(tmp_path):
     (tag,) = seen("/tags", "base_link", ("tag36h11:12", ros.pose(2.0)))
     tag[3].detections[0].id = "3"
     bag = ros.write_bag(tmp_path / "bag", [*odometry("/odom", "base_link"), tag])
@@ -115,7 +109,7 @@ def test_a_detection_with_two_names_is_told_and_either_may_count(tmp_path: Path)
     assert found == [[3], [12]]
 
 
-def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_path):
     year = 55 * 365 * 86_400 * S
     messages = []
     for k in range(6):
@@ -152,9 +146,7 @@ def shared_tf(*, bases: tuple[str, str], odoms: tuple[str, str], linked: bool = 
 
 
 @pytest.mark.parametrize("by", ["base", "odometry frame"])
-def test_in_a_shared_tf_each_robot_has_the_detections_of_its_own_camera(
-    tmp_path: Path, by: str
-) -> None:
+def test_in_a_shared_tf_each_robot_has_the_detections_of_its_own_camera(tmp_path, by):
     bases, odoms = ("ann/base_link", "bob/base_link"), ("ann/odom", "bob/odom")
     messages = shared_tf(bases=bases, odoms=odoms)
     if by == "odometry frame":  # the base of the odometry is not in the tree of transforms
@@ -173,8 +165,8 @@ def test_in_a_shared_tf_each_robot_has_the_detections_of_its_own_camera(
     ("names", "linked"), [(("base_link", "base_link"), True), (("a/base", "b/base"), False)]
 )
 def test_detections_that_may_be_of_either_robot_are_refused_with_their_frames_and_a_remedy(
-    tmp_path: Path, names: tuple[str, str], linked: bool
-) -> None:
+    tmp_path, names, linked
+):
     messages = shared_tf(bases=names, odoms=("odom", "odom"), linked=linked)
     bag = ros.write_bag(tmp_path / "bag", messages)
     topics = tmp_path / "topics.toml"
@@ -195,8 +187,8 @@ def test_detections_that_may_be_of_either_robot_are_refused_with_their_frames_an
 
 @pytest.mark.parametrize("linked", [True, False])
 def test_tags_of_a_robot_that_is_not_imported_are_not_guessed_to_be_of_the_one_that_is(
-    tmp_path: Path, linked: bool
-) -> None:
+    tmp_path, linked
+):
     bases, odoms = ("ann/base_link", "bob/base_link"), ("ann/odom", "bob/odom")
     messages = shared_tf(bases=bases, odoms=odoms, linked=linked)
     bag = ros.write_bag(tmp_path / "bag", messages)

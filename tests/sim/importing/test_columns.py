@@ -28,9 +28,7 @@ def proposal(folder: Path, **files: str) -> str:
     ["gt", "truth", "ref", "my_reference", "mocap", "optitrack_1", "vicon", "groundTruth", "r1-gt"],
 )
 @pytest.mark.parametrize("odometry", ["odom", "zz_encoders"])
-def test_a_reference_is_proposed_as_the_truth_and_never_as_odometry(
-    tmp_path: Path, name: str, odometry: str
-) -> None:
+def test_a_reference_is_proposed_as_the_truth_and_never_as_odometry(tmp_path, name, odometry):
     said = proposal(tmp_path / "a", **{name: TRACK, odometry: TRACK})
     assert f'[truth]\nfiles = ["{name}.csv"]' in said
     assert f'[odometry]\nfiles = ["{odometry}.csv"]' in said
@@ -39,7 +37,7 @@ def test_a_reference_is_proposed_as_the_truth_and_never_as_odometry(
     assert "[odometry]" not in alone
 
 
-def test_columns_of_a_reference_are_no_odometry(tmp_path: Path) -> None:
+def test_columns_of_a_reference_are_no_odometry(tmp_path):
     said = proposal(tmp_path / "a", robot="t,gt_x,gt_y,gt_yaw\n0,0,0,0\n")
     assert "[odometry]" not in said
     assert '[truth]\nfiles = ["robot.csv"]\n[truth.columns]\nt_s = "t"\nx_m = "gt_x"' in said
@@ -47,7 +45,7 @@ def test_columns_of_a_reference_are_no_odometry(tmp_path: Path) -> None:
     assert 'forward_m_s = "v"\nyaw_rate_rad_s = "w"\n\n[truth]\nfiles = ["robot.csv"]' in both
 
 
-def test_odometry_is_the_wheels_own_where_there_is_a_choice(tmp_path: Path) -> None:
+def test_odometry_is_the_wheels_own_where_there_is_a_choice(tmp_path):
     said = proposal(tmp_path / "a", a_path=TRACK, ekf_odom=TRACK, wheels=TRACK)
     assert '[odometry]\nfiles = ["wheels.csv"]' in said
     assert "# a_path.csv: might be odometry, too" in said
@@ -55,7 +53,7 @@ def test_odometry_is_the_wheels_own_where_there_is_a_choice(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("form", ["polar", "points"])
-def test_detections_without_identities_are_proposed_and_imported(tmp_path: Path, form: str) -> None:
+def test_detections_without_identities_are_proposed_and_imported(tmp_path, form):
     r, b = np.array([2.0, 3.0, 2.0]), np.array([0.5, -0.5, 0.25])
     points = "t,x,y,c_xx,c_xy,c_yy\n" + "".join(
         f"{t},{x!r},{y!r},0.01,0.002,0.04\n"
@@ -77,7 +75,6 @@ def test_detections_without_identities_are_proposed_and_imported(tmp_path: Path,
     assert result.exit_code == 0, result.output
     (stream,) = read(tmp_path / "set").streams
     seen = stream.landmark_detections
-    assert seen.hidden is not None
     assert seen.hidden.all()
     np.testing.assert_allclose(seen.ranges, r, atol=1e-15)
     np.testing.assert_allclose(seen.bearings, b, atol=1e-15)
@@ -91,7 +88,7 @@ def test_detections_without_identities_are_proposed_and_imported(tmp_path: Path,
             np.testing.assert_allclose(packed, moved[np.triu_indices(2)], rtol=1e-12)
 
 
-def test_observations_without_identities_are_told_their_table(tmp_path: Path) -> None:
+def test_observations_without_identities_are_told_their_table(tmp_path):
     (tmp_path / "odom.csv").write_text(TRACK)
     (tmp_path / "columns.toml").write_text(
         ODOMETRY + '[observations]\nfiles = ["cones.csv"]\n[observations.columns]\nt_s = "t"\n'
@@ -100,7 +97,7 @@ def test_observations_without_identities_are_told_their_table(tmp_path: Path) ->
     assert "measurements without identities are [detections]" in str(result.exception)
 
 
-def test_the_truth_of_several_robots_has_its_remedy_named(tmp_path: Path) -> None:
+def test_the_truth_of_several_robots_has_its_remedy_named(tmp_path):
     for name in ("ann", "bob"):
         (tmp_path / "logs" / name).mkdir(parents=True)
         (tmp_path / "logs" / name / "odom.csv").write_text(TRACK)
@@ -114,7 +111,7 @@ def test_the_truth_of_several_robots_has_its_remedy_named(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("place", ["", "ann"])
-def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path: Path, place: str) -> None:
+def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     (tmp_path / place / "wheels.csv").write_text(TRACK)
     with pytest.raises(

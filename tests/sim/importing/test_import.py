@@ -50,14 +50,13 @@ def drive(robot: str = "") -> list[ros.Message]:
 
 
 @pytest.mark.parametrize("db3", [False, True])
-def test_a_bag_becomes_tables(tmp_path: Path, db3: bool) -> None:
+def test_a_bag_becomes_tables(tmp_path, db3):
     bag = ros.write_bag(tmp_path / "bag", drive(), db3=db3)
     result = run(bag, "-o", tmp_path / "set", "--start", "1,2,0.5")
     assert result.exit_code == 0, result.output
     assert "6 messages" in result.output
     (stream,) = read(tmp_path / "set").streams
     assert stream.robot == "r1"
-    assert stream.start is not None
     assert stream.start.pose.tolist() == [1.0, 2.0, 0.5]
     assert stream.intervals.end_ns.tolist() == [S, 2 * S]
     assert stream.landmark_detections.ids.tolist() == [5, 7, 5, 7] or (
@@ -70,7 +69,7 @@ def test_a_bag_becomes_tables(tmp_path: Path, db3: bool) -> None:
     np.testing.assert_allclose(stream.truth, [[1.0, 0.0, 0.1]], atol=1e-15)
 
 
-def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path: Path) -> None:
+def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path):
     bag = ros.write_bag(tmp_path / "bag", [*drive("ann"), *drive("bob")])
     topics = tmp_path / "topics.toml"
     topics.write_text(
@@ -89,7 +88,7 @@ def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path: Pa
     assert [each.robot for each in read(tmp_path / "own").streams] == ["ann", "bob"]
 
 
-def test_tags_on_tf_are_seen_from_where_the_camera_sits(tmp_path: Path) -> None:
+def test_tags_on_tf_are_seen_from_where_the_camera_sits(tmp_path):
     camera = (0, "base_link", "cam_optical", ros.vector(0.3, 0.1, 0.5), OPTICAL)
     tag = (S, "cam_optical", "tag36h11:7", ros.vector(-1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
     still = [m for m in drive() if m[1] == "/odom"]
@@ -107,14 +106,14 @@ def test_tags_on_tf_are_seen_from_where_the_camera_sits(tmp_path: Path) -> None:
     np.testing.assert_allclose(scenario.robots[0].sensor.mount, [0.3, 0.1, 0.0], atol=1e-12)
 
 
-def test_damage_is_counted_with_the_first_message(tmp_path: Path) -> None:
+def test_damage_is_counted_with_the_first_message(tmp_path):
     bad: Any = ros.cdr(ODOMETRY, drive()[0][3])[:-9]
     bag = ros.write_bag(tmp_path / "bag", [*drive(), (3 * S, "/odom", ODOMETRY, bad)])
     result = run(bag, "-o", tmp_path / "set")
     assert "/odom: 1 of 4 messages dropped: damaged (first: message 4: no sound" in result.output
 
 
-def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path: Path) -> None:
+def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path):
     bag = ros.write_bag(tmp_path / "bag", drive())
     (bag / "metadata.yaml").unlink()
     assert run(bag, "-o", tmp_path / "without_metadata").exit_code == 0
@@ -136,7 +135,7 @@ def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path:
     assert not (tmp_path / "none.mcap").exists()
 
 
-def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_path: Path) -> None:
+def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_path):
     other = [(at, "/wheels", kind, m) for at, topic, kind, m in drive() if topic == "/odom"]
     bag = ros.write_bag(tmp_path / "bag", [*drive(), *other])
     for arguments in ((bag,), (bag, "-o", tmp_path / "set")):
@@ -149,7 +148,7 @@ def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_pa
     assert "2 topics may be its odometry" in said
 
 
-def test_launch_takes_a_bag_and_says_what_is_wrong_with_it(tmp_path: Path) -> None:
+def test_launch_takes_a_bag_and_says_what_is_wrong_with_it(tmp_path):
     (tmp_path / "bag.mcap").write_bytes(b"not a bag")
     result = CliRunner().invoke(
         app, ["launch", "--dataset", str(tmp_path / "bag.mcap"), "-o", str(tmp_path / "run")]
@@ -186,7 +185,7 @@ def files(path: Path) -> list[Path]:
     return [path / name for name in texts]
 
 
-def test_csv_files_with_other_names_come_by_a_map(tmp_path: Path) -> None:
+def test_csv_files_with_other_names_come_by_a_map(tmp_path):
     (tmp_path / "columns.toml").write_text(MAP)
     to = tmp_path / "set"
     result = run(
@@ -205,8 +204,8 @@ def test_csv_files_with_other_names_come_by_a_map(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("unit", "a_second"), [("ns", 10**9), ("us", 10**6), ("ms", 1000)])
 def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_exactly(
-    tmp_path: Path, unit: str, a_second: int
-) -> None:
+    tmp_path, unit, a_second
+):
     logs, first = tmp_path / "logs", 1763800000 * a_second
     (logs / "ann").mkdir(parents=True)
     (logs / "ann" / "mocap.csv").write_text("t_s,x_m,y_m,theta_rad\n1763800000,0,0,0\n")
@@ -248,7 +247,7 @@ def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_ex
         ),
     ],
 )
-def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: str) -> None:
+def test_names_as_labs_give_them_are_proposed(header, row, expected):
     names = header.split(",")
     columns = dict(zip(names, [[cell] for cell in row.split(",")], strict=True))
     text, lacking = propose_map({"log.csv": CsvTable("log.csv", columns, [2])})
@@ -256,9 +255,7 @@ def test_names_as_labs_give_them_are_proposed(header: str, row: str, expected: s
     assert [each for each in expected.split("|") if each not in text] == []
 
 
-def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(
-    tmp_path: Path,
-) -> None:
+def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(tmp_path):
     odometry = tmp_path / "odometry.csv"
     head = "t_s,forward_m_s,yaw_rate_rad_s\n"
     odometry.write_text(head + "0,1,0\n100,1,0\n200,1,0\n")
@@ -286,14 +283,14 @@ def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(
         ("[odometry]", "[odometry", "no map of columns"),
     ],
 )
-def test_a_mistake_in_a_map_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_mistake_in_a_map_is_named(tmp_path, old, new, words):
     (tmp_path / "columns.toml").write_text(MAP.replace(old, new))
     result = run(*files(tmp_path), "-o", tmp_path / "set", "--columns", tmp_path / "columns.toml")
     assert isinstance(result.exception, DatasetError)
     assert words in str(result.exception)
 
 
-def test_folders_of_csv_files_with_other_names_are_robots(tmp_path: Path) -> None:
+def test_folders_of_csv_files_with_other_names_are_robots(tmp_path):
     logs = tmp_path / "logs"
     for name in ("ann", "bob"):
         (logs / name).mkdir(parents=True)
@@ -330,12 +327,11 @@ def test_folders_of_csv_files_with_other_names_are_robots(tmp_path: Path) -> Non
     assert "Ann: no robot's name" in str(run(logs, "-o", tmp_path / "x", *mapped).exception)
 
 
-def test_a_data_set_keeps_its_tables_and_takes_an_initial_pose(tmp_path: Path) -> None:
+def test_a_data_set_keeps_its_tables_and_takes_an_initial_pose(tmp_path):
     write_folder(teams.world_of(teams.stream("r1", 3)), tmp_path / "set")
     result = run(tmp_path / "set", "-o", tmp_path / "again", "--start", "1,2,3,0.5,0.1")
     assert result.exit_code == 0, result.output
     (stream,) = read(tmp_path / "again").streams
-    assert stream.start is not None
     assert stream.start.covariance is not None
     assert stream.start.pose.tolist() == [1, 2, 3]
     assert np.diag(stream.start.covariance).tolist() == pytest.approx([0.25, 0.25, 0.01])
@@ -343,20 +339,19 @@ def test_a_data_set_keeps_its_tables_and_takes_an_initial_pose(tmp_path: Path) -
     assert "--robot: " in str(other.exception)
 
 
-def test_truth_comes_from_a_trajectory_of_tum(tmp_path: Path) -> None:
+def test_truth_comes_from_a_trajectory_of_tum(tmp_path):
     bag = ros.write_bag(tmp_path / "bag", [m for m in drive() if "truth" not in m[1]])
     tum = tmp_path / "truth.txt"
     tum.write_text("# t x y z qx qy qz qw\n0.5 1 2 0 0 0 0 1\n1.5 2 2 0 0 0 1 0\n")
     assert run(bag, "-o", tmp_path / "set", "--truth", tum).exit_code == 0
     (stream,) = read(tmp_path / "set").streams
-    assert stream.truth is not None
     assert stream.truth.tolist() == [[1, 2, 0], [2, 2, np.pi]]
     tum.write_text("0.5 1 2 0 0 0 0 1\n1.5 2 2 0 0 0 x 0\n")
     result = run(bag, "-o", tmp_path / "bad", "--truth", tum)
     assert "truth.txt, line 2: expected t x y z qx qy qz qw" in str(result.exception)
 
 
-def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path: Path) -> None:
+def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path):
     streams = [replace(teams.stream(name, 9), teammates=("r2", "r1")) for name in ("r1", "r2")]
     write_utias(teams.world_of(*streams), tmp_path / "utias")
     result = run(tmp_path / "utias", "-o", tmp_path / "set")
@@ -368,7 +363,7 @@ def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path: Pat
     assert same(read(tmp_path / "set"), streams_of(scenario))
 
 
-def test_wrong_use_is_said(tmp_path: Path) -> None:
+def test_wrong_use_is_said(tmp_path):
     write_folder(teams.world_of(teams.stream("r1", 3)), tmp_path / "set")
     bag = ros.write_bag(tmp_path / "bag", drive())
     for arguments, words in (
@@ -386,9 +381,7 @@ def test_wrong_use_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("db3", [False, True])
-def test_commands_on_data_sets_read_a_bag_as_what_it_is_imported_into(
-    tmp_path: Path, db3: bool
-) -> None:
+def test_commands_on_data_sets_read_a_bag_as_what_it_is_imported_into(tmp_path, db3):
     bag = ros.write_bag(tmp_path / "bag", drive(), db3=db3)
     for path in (bag, next(bag.glob("*.db3" if db3 else "*.mcap"))):
         with readable(path) as folder:

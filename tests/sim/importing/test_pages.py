@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -34,7 +33,7 @@ def made(command: str, folder: Path) -> None:
     subprocess.run([sys.executable, ROOT / program, name], cwd=folder, check=True)
 
 
-def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first, second = blocks("your_data.md", "sh")[0].splitlines()
     made(first, tmp_path)
@@ -63,9 +62,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     assert f"{LEAST_SPANS} stretches of {SPAN_S:.0f} s" in page
 
 
-def test_the_scenario_and_the_map_of_the_page_are_sound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_scenario_and_the_map_of_the_page_are_sound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     clock, columns, further, own = blocks("your_data.md", "toml")
     (tmp_path / "columns.toml").write_text(columns)
@@ -82,13 +79,10 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(
     assert [robot.clock_offset_s for robot in late.robots] == [0.0, 0.12]
 
 
-def test_the_bag_of_the_page_is_listed_and_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bag_of_the_page_is_listed_and_imported(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "your_ros2_robot.md").read_text("utf-8")
     command = re.search(r"`(python examples/\S+ my_bag)`", page)
-    assert command is not None
     made(command[1], tmp_path)
     listed = CliRunner().invoke(app, ["import", "my_bag"])
     assert listed.exit_code == 2
@@ -103,19 +97,16 @@ def test_the_bag_of_the_page_is_listed_and_imported(
     assert scenario.robots[0].sensor.mount == pytest.approx((0.2, 0.0, 0.0), abs=1e-12)
     (stream,) = streams_of(scenario).streams
     assert set(stream.landmark_detections.ids.tolist()) == {7, 12, 13}
-    assert stream.landmark_detections.points is not None
     assert stream.landmark_detections.points[0] == pytest.approx([1.8, 1.0])
 
 
-def test_the_topics_of_the_page_are_sound(tmp_path: Path) -> None:
+def test_the_topics_of_the_page_are_sound(tmp_path):
     (tmp_path / "topics.toml").write_text(blocks("your_ros2_robot.md", "toml")[0])
     topics = load_topics(tmp_path / "topics.toml")
     assert topics.robots["r1"].teammates == {"5": "r2"}
 
 
-def test_the_commands_of_a_team_over_wifi_are_sound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_of_a_team_over_wifi_are_sound(tmp_path, monkeypatch):
     """The page's command makes the certificates; the others find their files and options."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lab.toml").write_text(blocks("your_robot.md", "toml")[0])
@@ -129,7 +120,6 @@ def test_the_commands_of_a_team_over_wifi_are_sound(
     for node in ("robot-r1", "source-r1", "robot-r2", "central", "recorder"):
         assert any(name.startswith(node) for name in names), node
     commands = get_command(app)
-    assert isinstance(commands, TyperGroup)
     for name, *words in typed[1:]:
         context = commands.commands[name].make_context(name, list(words))
         assert context.params["keys"] == Path("keys")

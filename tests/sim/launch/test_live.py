@@ -4,7 +4,6 @@ import time
 from io import StringIO
 
 import msgspec
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -20,9 +19,7 @@ def status(node: str, state: str, *warnings: str, **figures: float) -> m.Status:
     return build.status(node=node, state=state, figures=figures, warnings=warnings)
 
 
-def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(monkeypatch):
     monkeypatch.setattr(live, "LINE_S", 0.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
@@ -41,8 +38,8 @@ def test_plain_lines_count_the_robots_that_have_come_while_the_world_waits(
 
 
 def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repeats_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(live, "LINE_S", 0.0)
     monkeypatch.setattr(live, "SETTLED_S", 0.0)
     out = StringIO()
@@ -77,7 +74,7 @@ def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repea
     assert any("the driver of r2 is away" in line for line in printed(watch, 300))
 
 
-def told(robots: int, *, truth: bool) -> Watch:
+def told(robots: int) -> Watch:
     watch = Watch(robots=tuple(f"r{k}" for k in range(1, robots + 1)))
     watch.statuses["world"] = status("world", "publishing", measurements=5.0, of=10.0)
     watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
@@ -86,8 +83,6 @@ def told(robots: int, *, truth: bool) -> Watch:
             f"robot/r{k}", "mapping", steps=12345.0, submaps=1234.0, landmarks=1000.0,
             pose_sigma_m=12.34, nis_per_dof=1.05, messages_per_s=1500.0, bytes_per_s=150_000.0,
         )  # fmt: skip
-        if truth:
-            watch.errors._robot(f"r{k}").tally.take(np.array([3.0, 9.0]), 3)
     watch.fused = fused_map(
         ids=from_ids([1, 2]),
         means=from_floats([0.0] * 4),
@@ -95,8 +90,6 @@ def told(robots: int, *, truth: bool) -> Watch:
         chi2=1.0,
         dof=1,
     )
-    if truth:
-        watch.errors.landmarks.take(np.array([1.0, 2.0]), 2)
     return watch
 
 
@@ -116,14 +109,14 @@ def printed(watch: Watch, width: int) -> list[str]:
     return out.getvalue().splitlines()
 
 
-def test_without_truth_there_are_the_monitor_and_nis_alone() -> None:
-    lines = printed(told(2, truth=False), 80)
+def test_without_truth_there_are_the_monitor_and_nis_alone():
+    lines = printed(told(2), 80)
     assert any("NIS" in line for line in lines)
     assert not any("NEES" in line or "95 %" in line for line in lines)
     assert "joint cost per dof 1.07" in lines
 
 
-def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     watch = Watch(robots=("r1", "r2"))
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
@@ -139,7 +132,7 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch: pytest.Mo
     assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
 
 
-def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
@@ -157,7 +150,7 @@ def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch: pytest.Monk
     assert out.getvalue().count("submap 20 disagrees") == 1
 
 
-def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one() -> None:
+def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one():
     out = StringIO()
     lines = live._Lines(Console(file=out, width=100))
     watch = Watch(robots=("r1",), began=-1e9)
@@ -173,11 +166,9 @@ def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one()
     assert [line.partition("warning: ")[2] for line in said] == ["central: two maps disagree"]
 
 
-def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_who_joins_whom_is_one_line_and_who_waits_no_warning(monkeypatch):
     lines, out = impatient(monkeypatch)
-    watch = told(3, truth=False)
+    watch = told(3)
     joined = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: {} landmarks that both show"
 
     def shown(waits: str, why: str, *words: str, final: bool = False) -> list[str]:
@@ -204,11 +195,9 @@ def test_who_joins_whom_is_one_line_and_who_waits_no_warning(
     assert any("not joined yet: r2: with r1 evidence 9" in line for line in printed(watch, 100))
 
 
-def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_not(monkeypatch):
     lines, out = impatient(monkeypatch)
-    watch = told(2, truth=False)
+    watch = told(2)
     for k in range(6):
         slip = f"the odometry slipped by 0.1{k} m, -{k}° before {k}.00 s"
         watch.statuses["robot/r1"] = build.status(node="robot/r1", warnings=(slip,))
@@ -221,7 +210,7 @@ def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_n
     assert progress.warnings(watch, silent_s=5.0) == []
 
 
-def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
+def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such():
     watch = Watch()
     watch.statuses["world"] = world = build.status(
         stamp_ns=310 * 10**9,
@@ -237,7 +226,7 @@ def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such() -> None:
     assert progress.times(watch, world) == "team time 300 s"
 
 
-def test_a_run_that_has_ended_gives_the_reason() -> None:
+def test_a_run_that_has_ended_gives_the_reason():
     watch = Watch()
     assert watch.end_reason == "all processes have ended, without a final map"
     watch.given_up.append("central")

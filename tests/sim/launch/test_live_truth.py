@@ -35,7 +35,7 @@ def line(seconds: list[float]) -> np.ndarray:
     return np.array([[s, 0.0, (3.0 + s + np.pi) % (2 * np.pi) - np.pi] for s in seconds])
 
 
-def test_the_nees_of_poses_is_against_the_truth_between_its_samples() -> None:
+def test_the_nees_of_poses_is_against_the_truth_between_its_samples():
     errors, rng = LiveErrors(), np.random.default_rng(1)
     seconds = [float(s) for s in range(6)]
     expected = []
@@ -51,7 +51,7 @@ def test_the_nees_of_poses_is_against_the_truth_between_its_samples() -> None:
     assert tally.coverage == np.mean(np.array(expected) <= chi2.ppf(0.95, 3))
 
 
-def test_a_pose_that_comes_behind_its_truth_is_judged_too() -> None:
+def test_a_pose_that_comes_behind_its_truth_is_judged_too():
     errors = LiveErrors()
     for start in range(0, 40, 4):
         seconds = [start + 0.5 * k for k in range(9)]
@@ -63,7 +63,7 @@ def test_a_pose_that_comes_behind_its_truth_is_judged_too() -> None:
     assert errors.of("r1").coverage == 1.0
 
 
-def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
+def test_poses_given_the_map_replace_those_of_the_robot_alone():
     errors, far = LiveErrors(), np.array([9.0, 9.0, 0.0])
     seconds = [float(s) for s in range(6)]
     errors.take(ch.TRUTH, truth(seconds, line(seconds)))
@@ -78,9 +78,7 @@ def test_poses_given_the_map_replace_those_of_the_robot_alone() -> None:
 
 
 @pytest.mark.parametrize("joint", [True, False])
-def test_the_newest_map_is_judged_by_its_joint_covariance_if_there_is_one(
-    joint: bool,
-) -> None:
+def test_the_newest_map_is_judged_by_its_joint_covariance_if_there_is_one(joint):
     errors, ids = LiveErrors(), [2, 5, 7]
     positions = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 6.0]])
     errors.take(
@@ -109,7 +107,7 @@ def test_the_newest_map_is_judged_by_its_joint_covariance_if_there_is_one(
     assert errors.landmarks.count == 3
 
 
-def test_a_watch_without_truth_has_the_robots_own_figures_only() -> None:
+def test_a_watch_without_truth_has_the_robots_own_figures_only():
     bus, others = (MemoryBus(network := MemoryNetwork()), MemoryBus(network))
     for channel in (ch.STATUS, *LiveErrors.listens):
         bus.subscribe(channel)

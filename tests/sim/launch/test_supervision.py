@@ -1,13 +1,21 @@
-"""Notes on silent processes."""
+"""Supervised processes: silence, restarts, memory."""
 
+import os
+import signal
+import subprocess
+import sys
 import time
 
 import pytest
 
+from teamslam.sim.launch import launch as launching
+from teamslam.sim.launch.launch import entered
+from teamslam.sim.launch.processes import Process, Starter
 from teamslam.sim.launch.supervision import FEW, Silence, supervise
-from teamslam.sim.launch.supervisor import Child, Supervised
+from teamslam.sim.launch.supervisor import Child, Supervised, end_all
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
+from teamslam.team.wire.zenoh.bus import ZenohBus
 
 
 class Quiet(Child):
@@ -60,9 +68,7 @@ class Team:
         return self.watch.notes[known:]
 
 
-def test_a_few_silent_processes_are_named_each_once_a_minute(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_few_silent_processes_are_named_each_once_a_minute(monkeypatch):
     team = Team(monkeypatch, FEW)
     team.hears(*range(FEW))
     assert team.after(9.0) == []
@@ -77,7 +83,7 @@ def test_a_few_silent_processes_are_named_each_once_a_minute(
     assert len(team.after(60.0)) == 1
 
 
-def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch):
     team = Team(monkeypatch, 2)
     team.services[1].child = Busy(101)
     team.hears(0, 1)
@@ -96,7 +102,7 @@ def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch: pytest.Mo
     assert team.after(2.0)[0].endswith("kill -9 100")
 
 
-def test_of_many_silent_processes_one_line_says_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_silent_processes_one_line_says_how_many(monkeypatch):
     team = Team(monkeypatch, 50)
     team.hears(*range(50))
     (said,) = team.after(11.0)
@@ -116,10 +122,10 @@ class Ending(Quiet):
     """A process that has ended with this status."""
 
     def __init__(self, status: int) -> None:
-        self.exit = status  # type: ignore[misc]
+        self.exit = status
 
 
-def test_a_process_that_fails_five_times_is_given_up_whatever_it_says() -> None:
+def test_a_process_that_fails_five_times_is_given_up_whatever_it_says():
     """No router that answers ends a process with status 2, as wrong use does; it may come back."""
     service = Service(0)
     service.fruitless, service.reached, service.given_up = 0, -1.0, False
@@ -138,13 +144,13 @@ class Refused(MemoryBus):
         raise BusError("operator.pem has expired")
 
 
-def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_have_ended() -> None:
+def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_have_ended():
     services = [Service(k) for k in range(3)]
     turns: list[list[str]] = []
     for service in services:
         service.over = service.given_up = False
         service.due = service.ended_s = None
-        service.child.measure = lambda: None  # type: ignore[method-assign]
+        service.child.measure = lambda: None
 
     def show(watch: Watch) -> None:
         turns.append(list(watch.failures))
@@ -156,3 +162,50 @@ def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_ha
     assert len(turns) == 4
     assert turns[-1] == ["operator.pem has expired"]
     assert all(service.over for service in services)
+
+
+BALLAST_BYTES = 200_000_000
+WAITS = "print('ready', flush=True); input()"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a share of memory")
+def test_the_peak_of_a_process_is_its_own_and_not_that_of_who_started_it():
+    ballast = bytearray(b"x") * BALLAST_BYTES
+    started = subprocess.Popen(
+        [sys.executable, "-S", "-c", WAITS], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    with started.stdin, started.stdout:
+        process = Process(started)
+        assert started.stdout.readline() == b"ready\n"
+        process.measure()
+        started.stdin.write(b"\n")
+    assert process.wait(20.0)
+    assert len(ballast) == BALLAST_BYTES
+    assert process.used.pss_mb is not None
+    assert 1.0 < process.used.pss_mb < process.used.peak_rss_mb < 100.0
+
+
+def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
+    tmp_path, monkeypatch
+):
+    """The router restarts at its former address before the team receives it."""
+    monkeypatch.setattr(launching, "ROUTER_PATIENCE_S", 120.0)  # a busy machine
+    router = Supervised(
+        "router", ["router", "--listen", "tcp/127.0.0.1:0"], tmp_path, Starter(time.time_ns())
+    )
+    tried: list[str] = []
+
+    def enter(endpoint: str) -> ZenohBus:
+        tried.append(endpoint)
+        if len(tried) == 1:
+            os.kill(router.child.pid, signal.SIGKILL)
+            while router.child.exit is None:
+                time.sleep(0.01)
+            raise BusError("no router answers")
+        return ZenohBus("team", endpoint, 60.0)
+
+    endpoint, bus = entered(router, enter)
+    bus.close()
+    end_all([router.child])
+    assert tried == [endpoint, endpoint]
+    assert router.restarts == 1

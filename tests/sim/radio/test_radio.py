@@ -20,14 +20,14 @@ PAIR = (stream("r1", 20), stream("r2", 20, y=30.0))
 """They drive side by side, 30 m apart."""
 
 
-def test_robots_reach_each_other_within_the_range_by_the_truth() -> None:
+def test_robots_reach_each_other_within_the_range_by_the_truth():
     for range_m, reached in ((29.0, False), (31.0, True)):
         reach = reach_of(Radio(comm_range_m=range_m), PAIR)
         assert reach.between("r1", "r2", 5 * SECOND) is reached
         assert reach.between("r1", "r2", 20 * SECOND), "collected at the end"
 
 
-def test_windows_open_for_whom_they_name() -> None:
+def test_windows_open_for_whom_they_name():
     three = (*PAIR, stream("r3", 20, y=5.0))
     window = RadioWindow(robots=("r1", "r3"), from_s=3.0, to_s=6.0)
     reach = reach_of(Radio(windows=(window,)), three)
@@ -37,11 +37,10 @@ def test_windows_open_for_whom_they_name() -> None:
     assert not any(reach.between("r1", "r2", t * SECOND) for t in range(1, 19))
 
 
-def test_the_worlds_plan_says_what_the_world_knows() -> None:
+def test_the_worlds_plan_says_what_the_world_knows():
     three = (*PAIR, stream("r3", 20, y=5.0))
     reach = reach_of(Radio(comm_range_m=26.0), three)
     again = reach_in(encoded(plan_of(reach)))
-    assert again is not None
     assert (again.robots, again.first_ns, again.ends_ns) == (
         reach.robots,
         reach.first_ns,
@@ -50,7 +49,7 @@ def test_the_worlds_plan_says_what_the_world_knows() -> None:
     assert np.array_equal(again.pairs, reach.pairs)
 
 
-def test_what_is_out_of_reach_does_not_come_in_and_nobody_hears_its_question() -> None:
+def test_what_is_out_of_reach_does_not_come_in_and_nobody_hears_its_question():
     network = MemoryNetwork()
     mate, world, own = (MemoryBus(network) for _ in range(3))
     door = behind_radio(own, "r1", Radio(comm_range_m=29.0))

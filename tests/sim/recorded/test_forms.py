@@ -1,7 +1,6 @@
 """A stream that mixes forms of measurements: from a log to tables and back, message for message."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -80,9 +79,7 @@ def published(world: WorldStreams) -> list[m.Measurement]:
 
 
 @pytest.mark.parametrize("messages", [MIXED, HIDDEN], ids=["named", "hidden"])
-def test_a_mixed_stream_comes_out_of_tables_as_it_was(
-    messages: list[m.Message], tmp_path: Path
-) -> None:
+def test_a_mixed_stream_comes_out_of_tables_as_it_was(messages, tmp_path):
     labels = from_ids(np.array([7, 2**32 - 1] * 2, dtype=np.uint32))
     stamps = from_stamps(np.array([SECOND, 3 * SECOND // 2]))
     counts = from_ids(np.array([2, 2], dtype=np.uint32))
@@ -102,7 +99,7 @@ def test_a_mixed_stream_comes_out_of_tables_as_it_was(
         assert "without a covariance, as others have" in "".join(again.streams[0].notes)
 
 
-def test_later_incarnations_are_left_out_and_counted() -> None:
+def test_later_incarnations_are_left_out_and_counted():
     begin = build.initial_pose(stamp_ns=9 * SECOND, incarnation=2)
     later = [begin, seeing(9.5, m.Points, **AHEAD)]
     later[1] = msgspec.structs.replace(later[1], incarnation=2, number=1)

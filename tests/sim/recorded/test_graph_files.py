@@ -1,7 +1,9 @@
-"""A log as a graph file: an independent optimiser finds the same map from it."""
+"""Logs as graph files and data sets as logs."""
 
+import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -9,11 +11,16 @@ from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import app
+from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph_lines import read_graph
 from teamslam.sim.datasets.pyfg import read_pyfg
-from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.recorded.data_set import log_or_run
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import channels as ch
 from tests.sim.logs import scenario, streams, world_log
 
 
@@ -68,7 +75,7 @@ def solved(text):
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory) -> Path:
+def log(tmp_path_factory):
     of = scenario()
     path = tmp_path_factory.mktemp("g2o") / "log.mcap"
     with Recorder(path, "small", {}) as recorder:
@@ -82,9 +89,8 @@ def exported(log: Path, folder: Path, form: str) -> str:
     return (folder / f"graph.{form}").read_text()
 
 
-def test_another_optimiser_finds_the_map_from_the_file(log: Path, tmp_path: Path) -> None:
+def test_another_optimiser_finds_the_map_from_the_file(log, tmp_path):
     joined = evaluate(open_log(log).samples()).map
-    assert joined is not None
     found = solved(exported(log, tmp_path / "out", "g2o"))
     landmarks = np.array([found[k] for k in joined.ids.tolist()])
     sigma = np.sqrt(np.diag(joined.covariance)).reshape(-1, 2)
@@ -92,7 +98,7 @@ def test_another_optimiser_finds_the_map_from_the_file(log: Path, tmp_path: Path
     assert np.abs(landmarks - joined.means).max() > 0.0
 
 
-def test_every_format_holds_the_same_edges(log: Path, tmp_path: Path) -> None:
+def test_every_format_holds_the_same_edges(log, tmp_path):
     exported(log, tmp_path / "g2o", "g2o")
     exported(log, tmp_path / "pyfg", "pyfg")
     isam = ["log", "export", str(log), "-o", str(tmp_path / "isam"), "--format", "isam"]
@@ -111,12 +117,11 @@ def test_every_format_holds_the_same_edges(log: Path, tmp_path: Path) -> None:
     for one_edge, edge in zip(g2o.pose_edges, pyfg.pose_edges, strict=True):
         assert np.allclose(one_edge.covariance, edge.covariance)
     truth = evaluate(open_log(log).samples()).map
-    assert truth is not None
     shown = dict(zip(truth.ids.tolist(), truth.truth, strict=True))
     assert all(np.allclose(pyfg.landmarks[i], shown[i]) for i in pyfg.landmarks)
 
 
-def test_a_log_without_a_map_is_placed_by_odometry(tmp_path: Path) -> None:
+def test_a_log_without_a_map_is_placed_by_odometry(tmp_path):
     path = tmp_path / "log.mcap"
     with Recorder(path, "small", {}) as recorder:
         recorder.write(world_log(scenario()))
@@ -126,3 +131,49 @@ def test_a_log_without_a_map_is_placed_by_odometry(tmp_path: Path) -> None:
         assert read_graph(tmp_path / "out" / "graph.g2o").point_edges
     else:
         assert "no scenario" in str(done.exception)
+
+
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data")
+    team = scenario(robots=2)
+    robots = tuple(
+        msgspec.structs.replace(
+            robot, front_end=msgspec.structs.replace(robot.front_end, particles=20)
+        )
+        for robot in team.robots
+    )
+    team = msgspec.structs.replace(team, robots=robots)
+    write_folder(streams_of(team), path)
+    (path / "scenario.toml").write_text(folder_scenario(team))
+    return path
+
+
+def test_the_run_of_a_data_set_reads_as_a_log_of_it(data_set):
+    run = log_or_run(data_set)
+    team = scenario(robots=2)
+    assert {sample.key for sample in run.samples([ch.FINAL_MAP])} == {ch.FINAL_MAP.key()}
+    assert (
+        final_map(list(run.samples())).ids == final_map(list(run_team(team, streams_of(team)))).ids
+    )
+
+
+def test_a_data_set_is_rerun_under_other_conditions(data_set, tmp_path):
+    to = tmp_path / "figures.json"
+    arguments = ["rerun", str(data_set), "--delay", "2", "--json", str(to)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "final map: the same bytes" in result.output
+    assert json.loads(to.read_text())["same_final_map"]
+
+
+def test_a_data_set_without_changes_is_computed_once_and_told_with_its_notes(data_set, monkeypatch):
+    monkeypatch.setattr(
+        "teamslam.sim.recorded.changed_run.changed_run", None
+    )  # a second run would call it
+    (data_set / "r2" / "truth.csv").unlink()
+    result = CliRunner().invoke(app, ["rerun", str(data_set)])
+    assert result.exit_code == 0, result.output
+    assert "computed" in result.output
+    assert "recorded" not in result.output
+    assert "note: r2: no truth.csv" in result.output

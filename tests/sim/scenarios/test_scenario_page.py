@@ -1,7 +1,6 @@
 """docs/scenario.md has every field with its values and its default; what pages show does run."""
 
 import re
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -65,9 +64,7 @@ def rows_of(page: str, cls: type[msgspec.Struct]) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("cls", STRUCTS)
-def test_the_page_has_every_field_with_its_default_its_values_and_a_meaning(
-    cls: type[msgspec.Struct],
-) -> None:
+def test_the_page_has_every_field_with_its_default_its_values_and_a_meaning(cls):
     rows = rows_of(PAGE.read_text("utf-8"), cls)
     expected = described(cls)
     assert rows.keys() == expected.keys()
@@ -75,7 +72,7 @@ def test_the_page_has_every_field_with_its_default_its_values_and_a_meaning(
     assert [name for name, row in rows.items() if len(row) != 2 or not all(row)] == []
 
 
-def test_the_page_has_every_estimator_and_every_rule() -> None:
+def test_the_page_has_every_estimator_and_every_rule():
     section = (
         PAGE.read_text("utf-8").partition("## Estimators and rules\n")[2].partition("\n## ")[0]
     )
@@ -86,9 +83,7 @@ def test_the_page_has_every_estimator_and_every_rule() -> None:
 
 
 @pytest.mark.parametrize("page", ["docs/your_own_world.md", "docs/scenario.md"])
-def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(
-    page: str, tmp_path: Path
-) -> None:
+def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(page, tmp_path):
     shown, *changes = re.findall(r"```toml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
     file = tmp_path / "mine.toml"
     file.write_text(shown, encoding="utf-8")
@@ -100,14 +95,14 @@ def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(
         assert load(file) != load("thesis"), "a change of a built-in one"
 
 
-def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path: Path) -> None:
+def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path):
     shown = CliRunner().invoke(app, ["scenarios", "--show", "waypoints"])
     file = tmp_path / "waypoints.toml"
     file.write_text(shown.stdout, encoding="utf-8")
     assert load(file) == load("waypoints")
 
 
-def test_a_scenario_that_is_not_built_in_can_not_be_shown() -> None:
+def test_a_scenario_that_is_not_built_in_can_not_be_shown():
     refused = CliRunner().invoke(app, ["scenarios", "--show", "thesis-c"])
     assert refused.exit_code == 2
     assert "thesis, thesis-b, utias" in refused.stderr

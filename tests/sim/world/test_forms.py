@@ -1,9 +1,11 @@
-"""Forms of simulated measurements: errors of the claimed size, and circles of a car."""
+"""Forms of simulated measurements, layouts of landmarks, hidden identities."""
 
 import msgspec
 import numpy as np
 import pytest
 
+from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.forms import (
     claimed,
@@ -27,7 +29,7 @@ def rotation(pose: np.ndarray) -> np.ndarray:
     return np.array([[c, -s, pose[0]], [s, c, pose[1]], [0.0, 0.0, 1.0]])
 
 
-def test_told_increments_err_by_what_they_claim() -> None:
+def test_told_increments_err_by_what_they_claim():
     count = 4000
     rng = np.random.default_rng(1)
     poses = np.tile([[0.0, 0.0, 0.3], [0.8, 0.5, 0.9]], (count, 1))
@@ -46,7 +48,7 @@ def test_told_increments_err_by_what_they_claim() -> None:
     assert C[0, 1, 2] == pytest.approx(0.7 * 0.04 * 0.05)
 
 
-def test_a_car_that_circles_reads_the_angle_and_the_speed_of_its_circle() -> None:
+def test_a_car_that_circles_reads_the_angle_and_the_speed_of_its_circle():
     car = MotionModel("ackermann", wheel_base=2.0, wheel_offset=0.5, steering_offset=0.1)
     wheel, angle = measured_steering(car, np.array([2.0, 0.0]), np.array([0.2, 0.0]))
     radius = 10.0
@@ -54,13 +56,13 @@ def test_a_car_that_circles_reads_the_angle_and_the_speed_of_its_circle() -> Non
     np.testing.assert_allclose(wheel, [0.2 * (radius - 0.5), 0.0])
 
 
-def test_a_mounted_sensor_is_where_its_base_carries_it() -> None:
+def test_a_mounted_sensor_is_where_its_base_carries_it():
     there = seen_from(np.array([[1.0, 2.0, np.pi / 2]]), (3.0, 0.5, 0.1))
     np.testing.assert_allclose(there, [[0.5, 5.0, np.pi / 2 + 0.1]])
 
 
 @pytest.mark.parametrize("points", [False, True])
-def test_measurements_err_by_the_covariances_that_come_with_them(points: bool) -> None:
+def test_measurements_err_by_the_covariances_that_come_with_them(points):
     rng = np.random.default_rng(2)
     count = 6000
     seen = Visible(*np.zeros((2, count), np.int64), np.full(count, 5.0), np.zeros(count))
@@ -73,7 +75,7 @@ def test_measurements_err_by_the_covariances_that_come_with_them(points: bool) -
     assert np.abs(of[:, 1]).max() > 0.0
 
 
-def test_forms_that_do_not_fit_are_named() -> None:
+def test_forms_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match="odometry_claims"):
         msgspec.structs.replace(WORLD, odometry_claims=True)
     with pytest.raises(ValueError, match="outliers"):
@@ -83,11 +85,72 @@ def test_forms_that_do_not_fit_are_named() -> None:
         simulated(steered, [RobotConfig("r1")], 1)
 
 
-def test_a_car_never_turns_on_the_spot() -> None:
+def test_a_car_never_turns_on_the_spot():
     car = MotionModel("ackermann", wheel_base=2.0)
     world = simulated(WORLD, [RobotConfig("r1", motion=car)], 1)
     truth = world.streams[0].truth
-    assert truth is not None
     turns = np.abs(np.angle(np.exp(1j * np.diff(truth[:, 2]))))
     chords = np.hypot(*np.diff(truth[:, :2], axis=0).T)
     assert np.all(turns <= chords / 3.0 + 1e-2)
+
+
+def streams(form: str, identities: str):
+    """Waypoints whose sensors claim the covariance of each measurement, in a form."""
+    scenario = load("waypoints")
+    world = msgspec.structs.replace(
+        scenario.world,
+        steps=60,
+        landmark_form=form,
+        landmark_claims=(0.5, 2.0),
+        identities=identities,
+    )
+    return streams_of(msgspec.structs.replace(scenario, world=world)).streams
+
+
+@pytest.mark.parametrize("form", ["ranges", "points"])
+def test_hidden_detections_have_the_covariances_of_their_range_and_bearing(form):
+    known, hidden = streams(form, "known")[0], streams(form, "hidden")[0]
+    seen, unnamed = known.landmark_detections, hidden.landmark_detections
+    assert len(unnamed.ranges) > 20
+    np.testing.assert_allclose(unnamed.ranges, seen.ranges)
+    rr, rb, bb = unnamed.covariances.T
+    # A point's covariance, turned into the line of sight: along it, and across it by the range.
+    if form == "ranges":
+        np.testing.assert_array_equal(unnamed.covariances, seen.covariances)
+        return
+    c, s = np.cos(seen.bearings), np.sin(seen.bearings)
+    xx, xy, yy = seen.covariances.T
+    np.testing.assert_allclose(rr, c * c * xx + 2 * c * s * xy + s * s * yy, rtol=1e-9)
+    across = s * s * xx - 2 * c * s * xy + c * c * yy
+    np.testing.assert_allclose(bb, across / seen.ranges**2, rtol=1e-9)
+    np.testing.assert_allclose(
+        rb * seen.ranges, c * s * (yy - xx) + (c * c - s * s) * xy, atol=1e-9
+    )
+
+
+ROBOT = RobotConfig("r1")
+
+
+def landmarks(**fields) -> np.ndarray:
+    world = SimulatedWorld(steps=1, size_m=30.0, **fields)
+    found = simulated(world, (ROBOT,), 3).landmarks
+    assert found is not None
+    return found
+
+
+def test_of_twins_each_has_another_one_beside_it():
+    at = landmarks(landmark_count=12, layout="twins", twin_m=0.7)
+    away = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    np.fill_diagonal(away, np.inf)
+    assert len(at) == 12
+    assert np.allclose(np.diag(away[:6, 6:]), 0.7)
+    assert (away.min(axis=1) <= 0.7 + 1e-9).all()
+
+
+def test_rooms_are_all_alike():
+    at = landmarks(landmark_count=27, layout="rooms", rooms=3).reshape(9, 3, 2)
+    corners = np.round((at - at[0]).mean(axis=1), 9)
+    assert (at - corners[:, None] - at[0] < 1e-9).all()
+    assert sorted(map(tuple, corners.tolist())) == [
+        (10.0 * i, 10.0 * j) for i in range(3) for j in range(3)
+    ]

@@ -65,7 +65,7 @@ def moments_agree(errors: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_samples_of_simulated_odometry_have_the_filters_moments(name: str) -> None:
+def test_samples_of_simulated_odometry_have_the_filters_moments(name):
     assert moments_agree(whitened(MODELS[name], MODELS[name]))
 
 
@@ -81,12 +81,12 @@ def test_samples_of_simulated_odometry_have_the_filters_moments(name: str) -> No
         ("calibrated", {"veer": 0.0}),
     ],
 )
-def test_a_filter_with_another_model_is_found_out(name: str, wrong: dict[str, object]) -> None:
+def test_a_filter_with_another_model_is_found_out(name, wrong):
     other = msgspec.structs.replace(MODELS[name], **wrong)
     assert not moments_agree(whitened(MODELS[name], other))
 
 
-def test_wheels_that_differ_make_errors_of_way_and_turn_that_go_together() -> None:
+def test_wheels_that_differ_make_errors_of_way_and_turn_that_go_together():
     steps = np.tile([1.0, 0.0], (4000, 1))
     normals = np.random.default_rng(1).standard_normal((4000, 2))
     forward, yaw_rate = measured_speeds(
@@ -111,7 +111,7 @@ def mixed_team(**of_first: object) -> Scenario:
     return msgspec.structs.replace(load("waypoints"), name="mixed", world=world, robots=robots)
 
 
-def test_a_team_of_three_different_robots_has_one_consistent_map() -> None:
+def test_a_team_of_three_different_robots_has_one_consistent_map():
     scenario = mixed_team()
     world = streams_of(scenario)
     found = final_map(list(run_team(scenario, world)))
@@ -129,9 +129,7 @@ def test_a_team_of_three_different_robots_has_one_consistent_map() -> None:
 
 
 @pytest.mark.parametrize("offset_s", [0.25, -0.75, 3.0])
-def test_a_clock_offset_that_the_robot_knows_changes_nothing_of_its_submaps(
-    offset_s: float,
-) -> None:
+def test_a_clock_offset_that_the_robot_knows_changes_nothing_of_its_submaps(offset_s):
     exact, off = mixed_team(), mixed_team(clock_offset_s=offset_s)
     one, other = (submaps_of(each.robots[0], streams_of(each)) for each in (exact, off))
     assert len(one) == 15
@@ -140,7 +138,7 @@ def test_a_clock_offset_that_the_robot_knows_changes_nothing_of_its_submaps(
     ]
 
 
-def test_a_clock_offset_that_the_robot_does_not_know_is_found_out() -> None:
+def test_a_clock_offset_that_the_robot_does_not_know_is_found_out():
     off, ignorant = mixed_team(clock_offset_s=0.75), mixed_team()
     world = streams_of(off)
     good, bad = (final_map(list(run_team(each, world))) for each in (off, ignorant))
@@ -159,7 +157,7 @@ def cost_per_dof(of: m.FusedMap) -> float:
     return of.chi2 / of.dof
 
 
-def test_a_centre_that_takes_raw_measurements_puts_the_clock_right_too() -> None:
+def test_a_centre_that_takes_raw_measurements_puts_the_clock_right_too():
     exact, off = (
         team_keyframes(each.robots[0], streams_of(each))
         for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))

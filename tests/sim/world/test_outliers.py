@@ -18,7 +18,7 @@ def world_with(outlier_share: float, kind: str, name: str = "thesis-b") -> World
 
 
 @pytest.fixture(scope="module")
-def clean() -> WorldStreams:
+def clean():
     return world_with(0.0, "measurement")
 
 
@@ -26,9 +26,7 @@ def joined(world: WorldStreams, field: str) -> np.ndarray:
     return np.concatenate([getattr(s.landmark_detections, field) for s in world.streams])
 
 
-def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(
-    clean: WorldStreams,
-) -> None:
+def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(clean):
     spoilt = world_with(0.3, "measurement")
     other = world_with(0.3, "identity")
     dropped = world_with(0.3, "drop")
@@ -42,7 +40,7 @@ def test_three_in_ten_measurements_are_spoilt_the_same_ones_for_every_kind(
     assert np.array_equal(joined(other, "ranges"), joined(clean, "ranges"))
 
 
-def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean: WorldStreams) -> None:
+def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean):
     for kind in ("measurement", "identity", "drop"):
         for before, after in zip(clean.streams, world_with(0.3, kind).streams, strict=True):
             assert np.array_equal(before.stamps_ns, after.stamps_ns), "no message is lost"
@@ -53,14 +51,14 @@ def test_what_is_spoilt_is_the_landmarks_measurements_alone(clean: WorldStreams)
             assert np.array_equal(before.truth, after.truth)
 
 
-def test_a_spoilt_measurement_is_uniform_over_what_can_be_seen(clean: WorldStreams) -> None:
+def test_a_spoilt_measurement_is_uniform_over_what_can_be_seen(clean):
     spoilt = world_with(1.0, "measurement")
     assert kstest((joined(spoilt, "ranges") - 3.0) / 17.0, "uniform").pvalue > 1e-3
     assert kstest(joined(spoilt, "bearings") / (2.0 * np.pi) + 0.5, "uniform").pvalue > 1e-3
     assert kstest((joined(clean, "ranges") - 3.0) / 17.0, "uniform").pvalue < 1e-3
 
 
-def test_a_spoilt_identity_is_any_other_landmarks(clean: WorldStreams) -> None:
+def test_a_spoilt_identity_is_any_other_landmarks(clean):
     was, is_now = joined(clean, "ids"), joined(world_with(1.0, "identity"), "ids")
     assert not np.any(was == is_now)
     ahead = np.bincount((is_now.astype(int) - was.astype(int)) % 18, minlength=18)[1:]
@@ -68,12 +66,12 @@ def test_a_spoilt_identity_is_any_other_landmarks(clean: WorldStreams) -> None:
     assert ahead.max() < 1.2 * len(was) / 17
 
 
-def test_a_world_without_outliers_is_as_it_was_whatever_its_kind(clean: WorldStreams) -> None:
+def test_a_world_without_outliers_is_as_it_was_whatever_its_kind(clean):
     for before, after in zip(clean.streams, world_with(0.0, "drop").streams, strict=True):
         assert content(before) == content(after)
 
 
-def test_without_limits_of_sight_outliers_lie_within_the_place() -> None:
+def test_without_limits_of_sight_outliers_lie_within_the_place():
     scenario = load("waypoints")
     world = msgspec.structs.replace(
         scenario.world, outlier_share=1.0, visible_to_m=None, visible_from_m=None, steps=50
@@ -82,7 +80,7 @@ def test_without_limits_of_sight_outliers_lie_within_the_place() -> None:
         assert stream.landmark_detections.ranges.max() <= 100.0 * np.sqrt(2.0)
 
 
-def test_the_measurements_that_stay_are_true() -> None:
+def test_the_measurements_that_stay_are_true():
     world = world_with(0.3, "drop")
     for stream in world.streams:
         true_range, _ = true_detections(stream, world.landmarks)

@@ -95,13 +95,6 @@ def test_the_gaussian_in_x_y_theta_is_the_first_order_image_of_the_one_on_se2(fi
     np.testing.assert_array_equal(P, P.T)
 
 
-def test_an_uncertain_start_is_a_first_step_that_stands_still():
-    spread = np.diag([0.3, 0.2, 0.1]) ** 2
-    state = reckoned([Increment(np.zeros(3), spread)])
-    np.testing.assert_allclose(state.pose.mean, START)
-    np.testing.assert_allclose(state.pose.covariance, spread)
-
-
 def test_measurements_change_nothing_and_no_landmark_is_known():
     told, _ = drive(0)
     seen = (np.array([4], np.uint32), np.array([5.0]), np.array([0.1]))

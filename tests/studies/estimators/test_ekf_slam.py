@@ -134,18 +134,6 @@ def test_a_first_sight_adds_the_landmark_with_its_cross_terms_and_changes_nothin
     np.testing.assert_allclose(after.covariance[n:, :n], J[:, :n] @ state.covariance, atol=1e-7)
 
 
-def test_further_measurements_of_a_new_landmark_update_it_as_in_a_keyframe_of_their_own():
-    first = (np.array([5], np.uint32), np.array([8.0]), np.array([0.4]))
-    again = (np.array([5], np.uint32), np.array([8.3]), np.array([0.38]))
-    start = ekf_slam.initial_state(np.array([1.0, 2.0, 0.3]))
-    together = tuple(np.concatenate(pair) for pair in zip(first, again, strict=True))
-    one = ekf_slam.filter_step(start, STANDING, SENSOR, *together)
-    two = ekf_slam.filter_step(start, STANDING, SENSOR, *first)
-    two = ekf_slam.filter_step(two, STANDING, SENSOR, *again)
-    np.testing.assert_array_equal(one.mean, two.mean)
-    np.testing.assert_array_equal(one.covariance, two.covariance)
-
-
 def test_landmarks_are_reported_by_id_beside_the_pose():
     state = some_state(np.random.default_rng(4))
     ids, means, P = ekf_slam.landmark_gaussian(state)

@@ -107,40 +107,6 @@ def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
     assert len(np.unique(particles.log_weights)) > 400
 
 
-def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter():
-    far = 10.0 * LANDMARKS
-    sensor = Sensor(range_sigma=0.2, bearing_sigma=0.003)
-    random = np.random.default_rng(2)
-    start = np.diag([0.1, 0.1, 0.005]) ** 2
-    state = localisation.initial_state(np.zeros(3), 20_000, IDS, far)
-    state = localisation.filter_step(state, Increment(np.zeros(3), start), sensor, *NOTHING, random)
-    motion = Increment(np.array([1.0, 0.0, 0.1]), np.diag([0.1, 0.05, 0.004]) ** 2)
-    truth, mean, P = np.array([0.1, -0.05, 0.003]), np.zeros(3), start
-    for k in range(3):
-        truth = compose(truth, motion.mean)
-        z = np.array(sights(truth, far)) + np.array([[0.2], [0.003]]) * [1.0, -0.5, 0.3 * k]
-        state = localisation.filter_step(state, motion, sensor, IDS, z[0], z[1], random)
-        c, s = np.cos(mean[2]), np.sin(mean[2])
-        F = np.array([[1.0, 0.0, -s], [0.0, 1.0, c], [0.0, 0.0, 1.0]])
-        mean = compose(mean, motion.mean)
-        c, s = np.cos(mean[2]), np.sin(mean[2])
-        G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        P = F @ P @ F.T + G @ motion.covariance @ G.T
-        d = far - mean[:2]
-        r = np.hypot(*d.T)
-        H = np.zeros((6, 3))
-        H[:3, :2] = -d / r[:, None]
-        H[3:, 0], H[3:, 1], H[3:, 2] = d[:, 1] / r**2, -d[:, 0] / r**2, -1.0
-        R = np.diag([0.2**2] * 3 + [0.003**2] * 3)
-        innovation = np.concatenate((z[0] - r, wrap(z[1] - np.array(sights(mean, far))[1])))
-        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
-        mean, P = mean + K @ innovation, P - K @ H @ P
-    found, spread = localisation.pose_gaussian(state)
-    sigma = np.sqrt(np.diag(P))
-    assert np.abs((found - mean) / sigma).max() < 0.1
-    assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 0.1
-
-
 def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
     state = localisation.initial_state(np.zeros(3), 50, IDS, LANDMARKS)
     ranges, bearings = sights(np.array([1.0, 0.0, 0.2]))
@@ -156,16 +122,6 @@ def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
     )
     assert one.cloud.poses.tobytes() == other.cloud.poses.tobytes()
     assert one.cloud.log_weights.tobytes() == other.cloud.log_weights.tobytes()
-
-
-def test_without_measurements_the_cloud_spreads_and_stays_equally_weighted():
-    state = localisation.initial_state(np.zeros(3), 2000, IDS, LANDMARKS)
-    random = np.random.default_rng(3)
-    for _ in range(4):
-        state = localisation.filter_step(state, MOTION, SENSOR, *NOTHING, random)
-    np.testing.assert_array_equal(state.cloud.log_weights, np.full(2000, -np.log(2000)))
-    spread = localisation.pose_gaussian(state).covariance
-    np.testing.assert_allclose(spread[2, 2], 4 * 0.05**2, rtol=0.15)
 
 
 @functools.cache

@@ -12,7 +12,7 @@ from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.estimation.map_joining import joining
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD
-from teamslam.team.estimation.se2 import compose, transformed
+from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth, team, wrap
 
@@ -90,36 +90,6 @@ def test_the_full_covariance_is_the_joining_of_the_team():
     state = joined(made, "full")
     np.testing.assert_allclose(state.fold.main.state, fold.main.state, atol=1e-9)
     assert svd_joining.variance_factor(state) == 1.0
-
-
-@quick
-@given(st.integers(0, 10_000), poses)
-def test_spherical_blocks_are_those_that_a_turn_leaves_alone(seed, turn):
-    made = team(seed, robots=1, submaps=1)
-    local = made.submaps[0].local
-    c, s = np.cos(turn[2]), np.sin(turn[2])
-    for weighting in ("identity", "spherical"):
-        weighted = svd_joining.weighted(local, weighting)
-        np.testing.assert_array_equal(weighted.mean, local.mean)
-        for at in (0, *range(3, len(local.mean), 2)):
-            block = weighted.covariance[at : at + 2, at : at + 2]
-            R = np.array([[c, -s], [s, c]])
-            np.testing.assert_allclose(block @ R, R @ block, atol=1e-15)
-            if weighting == "spherical":
-                trace = np.trace(local.covariance[at : at + 2, at : at + 2])
-                np.testing.assert_allclose(np.trace(block), trace)
-        assert np.count_nonzero(weighted.covariance) == len(local.mean)
-    assert svd_joining.weighted(local, "full") is local
-
-
-def test_without_redundancy_the_identity_stands_as_it_is():
-    made = team(5, robots=1, submaps=1)
-    state = joined(made, "identity")
-    landmarks = svd_joining.landmark_gaussian(state)
-    assert svd_joining.variance_factor(state) == 1.0
-    np.testing.assert_allclose(landmarks.covariance, np.eye(landmarks.means.size), atol=1e-12)
-    expected = compose(made.starts[0].pose, made.submaps[0].local.end_pose)
-    np.testing.assert_allclose(svd_joining.pose_gaussian(state, "r0").mean, expected)
 
 
 def map_nees(weighting, honest, runs=200):
@@ -200,16 +170,6 @@ def test_turning_by_svd_and_taking_the_middle_is_the_minimum_of_the_whole_cost(s
     P = np.linalg.inv(found.jac.T @ found.jac) * 2.0 * found.cost / redundancy
     np.testing.assert_allclose(merged.landmarks.covariance, P[3:, 3:], rtol=1e-2, atol=1e-5)
     np.testing.assert_allclose(merged.a_from_b.covariance, P[:3, :3], rtol=1e-2, atol=1e-5)
-
-
-@quick
-@given(st.integers(0, 10_000))
-def test_maps_without_errors_are_laid_on_each_other_exactly(seed):
-    (a, b), a_from_b, points = two_maps(seed, sigma=0.0, common=2)
-    merged = svd_joining.exchanged(a, b)
-    np.testing.assert_allclose(merged.landmarks.means, points, atol=1e-9)
-    np.testing.assert_allclose(merged.a_from_b.mean[:2], a_from_b[:2], atol=1e-8)
-    np.testing.assert_allclose(wrap(merged.a_from_b.mean[2] - a_from_b[2]), 0.0, atol=1e-9)
 
 
 @quick

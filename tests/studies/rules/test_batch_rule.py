@@ -136,8 +136,3 @@ def test_a_robust_scale_is_that_of_the_configuration():
     )
     assert plain.chi2 != robust.chi2
     assert robust.reasons == ()
-
-
-def test_before_the_starts_there_is_nothing_to_tell():
-    node = make_centre(CentralConfig(fusion="batch"), ["r1"])
-    assert "poses" not in node.status().figures

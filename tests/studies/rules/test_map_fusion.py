@@ -31,24 +31,6 @@ def random_map(ids, seed, sigma=1.0):
     )
 
 
-@pytest.mark.parametrize("rule", [kalman, kalman_per_axis])
-def test_two_measurements_of_one_coordinate_are_weighted_by_their_precision(rule):
-    fused = rule([one(2.0, 4.0), one(7.0, 1.0)])
-    assert fused.means[0, 0] == pytest.approx(2.0 + 4.0 / 5.0 * 5.0)
-    assert fused.covariance[0, 0] == pytest.approx(4.0 / 5.0)
-
-
-def test_the_intersection_of_two_scalars_is_the_better_one():
-    maps = [
-        LandmarkGaussian(np.array([1], np.uint32), np.array([[x, x]]), v * np.eye(2))
-        for x, v in ((2.0, 4.0), (7.0, 1.0))
-    ]
-    for criterion in ("trace", "det"):
-        fused = covariance_intersection(maps, criterion)
-        np.testing.assert_allclose(fused.means, [[7.0, 7.0]], atol=1e-9)
-        np.testing.assert_allclose(fused.covariance, np.eye(2), atol=1e-9)
-
-
 def test_the_intersection_of_crossed_ellipses_meets_in_the_middle():
     a = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 0.0]]), np.diag([1.0, 4.0]))
     b = LandmarkGaussian(np.array([1], np.uint32), np.array([[0.0, 1.0]]), np.diag([4.0, 1.0]))

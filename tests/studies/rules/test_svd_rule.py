@@ -125,7 +125,7 @@ def _map_of(points: np.ndarray, ids: list[int], frame: np.ndarray) -> LandmarkGa
     return LandmarkGaussian(np.array(ids, np.uint32), own, 0.01 * np.eye(2 * len(ids)))
 
 
-def test_maps_without_a_common_landmark_are_tied_where_their_robots_saw_each_other() -> None:
+def test_maps_without_a_common_landmark_are_tied_where_their_robots_saw_each_other():
     generator = np.random.default_rng(1)
     points = generator.uniform(-5.0, 5.0, (9, 2))
     frames = {("r1", 0): np.zeros(3), ("r2", 0): np.array([2.0, -1.0, 0.7]),
