@@ -373,7 +373,7 @@ function bytesOf(key) {
   return i < 0 ? 0 : of.b[i];
 }
 
-let listed = null;
+let listed = null, newest = null;
 function lookAtEvents() {
   const list = $('events');
   if (listed !== store.events.length || list.store !== store.hello) {
@@ -407,7 +407,8 @@ function lookAtEvents() {
     list.children[i].classList.toggle('future', future);
     if (!future) last = list.children[i];
   });
-  if (last && moving()) list.scrollTop = last.offsetTop - list.clientHeight + last.clientHeight + 8;
+  if (last && last !== newest) list.scrollTop = last.offsetTop + last.offsetHeight - list.clientHeight + 8;
+  newest = last;
 }
 
 let ticked = 0;

@@ -72,7 +72,7 @@ export class MapView {
     const width = Math.max(right - left, 1), height = Math.max(top - bottom, 1);
     this.resize();
     const w = this.canvas.width / this.ratio, h = this.canvas.height / this.ratio;
-    const above = 46, room = 34;  // the chips are above
+    const room = 34, above = Math.max(46, document.querySelector('.chips').offsetHeight + 12);
     this.scale = Math.min((w - 2 * room) / width, (h - above - 2 * room) / height, 400);
     this.centre = [(left + right) / 2, (bottom + top) / 2 + above / 2 / this.scale];
     this.fitted = true;
