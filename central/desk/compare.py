@@ -1,7 +1,6 @@
 """Compare runs: one row per figure, one cell per run, and pictures."""
 
-from collections.abc import Callable, Mapping, Sequence
-from math import degrees
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +15,11 @@ from teamslam.central.desk.drawing import (
     landmark_blocks,
     robot_colours,
 )
-from teamslam.central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult, figure
 from teamslam.central.desk.names import OUTSIDE, in_order
-from teamslam.central.desk.pictures.run import new_figure
+from teamslam.central.desk.pictures.run import new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
-from teamslam.central.desk.report.tables import format_figure
+from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable, format_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,20 +34,43 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
     A run in an arbitrary frame has aligned errors only.
     """
     every = list(runs.values())
-    rows = [(name, tuple(of(run) for run in every)) for name, of in _TEAM]
+    columns = [_team_cells(run) for run in every]
+    rows = [(name, tuple(of[name] for of in columns)) for name in (columns[0] if columns else ())]
     matched = tuple(run.matched_by for run in every)
     rows += [("landmark errors by", matched)] if any(matched) else []
     for robot in in_order({name for run in every for name in run.states}):
-        states = [run.states.get(robot) for run in every]
-        cells = tuple("–" if of is None else of.state for of in states)
-        rows.append((f"{robot}: in the final map", cells))
+        states = tuple(format_figure(figure(run.states.get(robot), "state"), "") for run in every)
+        rows.append((f"{robot}: in the final map", states))
     for robot in in_order({name for run in every for name in run.robots}):
-        results = [(run, run.robots.get(robot)) for run in every]
-        rows += [
-            (f"{robot}: {name}", tuple("–" if r is None else of(run, r) for run, r in results))
-            for name, of in _ROBOT
-        ]
+        of_runs = zip(*(_robot_cells(run, run.robots.get(robot)) for run in every), strict=True)
+        names = (f"{robot}: {column.heading}" for column in _ROBOT)
+        rows += zip(names, of_runs, strict=True)
     return rows
+
+
+def _team_cells(run: Evaluation) -> dict[str, str]:
+    """Cells of one run by figure."""
+    fused, scenario = run.map, run.scenario
+    shown = {c.heading: cells(run, [c])[0] for c in _MAP}
+    if run.arbitrary_frame:
+        shown |= {c.heading: "–" for c in _MAP if c.path in _IN_THE_FRAME}
+    broadcast = run.channels.get("central/map")
+    return {
+        "scenario": "–" if scenario is None else run.title,
+        "method": "–" if scenario is None else f"{scenario.estimator} + {scenario.fusion}",
+        "landmarks": "–" if fused is None else str(len(fused.ids)),
+        **shown,
+        "maps broadcast": str(0 if broadcast is None else broadcast.messages),
+        "rule of the final map": "–" if fused is None else fused.rule,
+        "final map, its bytes": "–" if fused is None else fused.payload_sha256[:16],
+    }
+
+
+def _robot_cells(run: Evaluation, robot: RobotResult | None) -> list[str]:
+    if robot is None:
+        return ["–"] * len(_ROBOT)
+    online, *rest = cells(comparable(run, robot), _ROBOT)
+    return [OUTSIDE if robot.outside else online, *rest]
 
 
 def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
@@ -119,11 +141,7 @@ def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
     for (name, run), (colour, marker) in zip(runs.items(), MAP_STYLES, strict=True):
         if run.map is not None:
             _draw_map(axis, run.map, colour, name, marker)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
-    axis.grid(color="#e4e4e4", linewidth=0.6)
-    axis.set_axisbelow(True)
+    set_up_map(axis)
     axis.set_title("Final maps with 95 % ellipses", fontsize=12)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)
     save(figure, path)
@@ -137,61 +155,21 @@ def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: s
     draw_ellipses(axis, fused.means, landmark_blocks(fused.covariance), colour)
 
 
-def _of_map(name: str, form: str) -> Callable[[Evaluation], str]:
-    return lambda run: format_figure(None if run.map is None else getattr(run.map, name), form, "")
-
-
-def _of_map_errors(name: str, form: str) -> Callable[[Evaluation], str]:
-    def cell(run: Evaluation) -> str:
-        errors = None if run.map is None else run.map.errors
-        if errors is None or (run.arbitrary_frame and name != "aligned_rmse_m"):
-            return "–"
-        return format_figure(getattr(errors, name), form, "")
-
-    return cell
-
-
-def _of_path(
-    kind: str, name: str, form: str, convert: Callable[[float], float] = float
-) -> Callable[[Evaluation, RobotResult], str]:
-    def cell(run: Evaluation, robot: RobotResult) -> str:
-        if kind == "online" and robot.outside:
-            return OUTSIDE
-        errors = None if run.arbitrary_frame else getattr(robot, kind)
-        return format_figure(None if errors is None else convert(getattr(errors, name)), form, "")
-
-    return cell
-
-
-def _maps_broadcast(run: Evaluation) -> str:
-    traffic = run.channels.get("central/map")
-    return str(0 if traffic is None else traffic.messages)
-
-
-_TEAM: Sequence[tuple[str, Callable[[Evaluation], str]]] = (
-    ("scenario", lambda run: "–" if run.scenario is None else run.title),
-    (
-        "method",
-        lambda run: (
-            "–" if run.scenario is None else f"{run.scenario.estimator} + {run.scenario.fusion}"
-        ),
-    ),
-    ("landmarks", lambda run: "–" if run.map is None else str(len(run.map.ids))),
-    ("landmark RMSE [m]", _of_map_errors("rmse_m", ".4f")),
-    ("… after rigid alignment [m]", _of_map_errors("aligned_rmse_m", ".4f")),
-    ("map NEES per dof", _of_map_errors("nees_per_dof", ".4g")),
-    ("joint cost per dof", _of_map("cost_per_dof", ".4g")),
-    ("covariance scale", _of_map("covariance_scale", ".2f")),
-    ("maps broadcast", _maps_broadcast),
-    ("rule of the final map", lambda run: "–" if run.map is None else run.map.rule),
-    ("final map, its bytes", lambda run: "–" if run.map is None else run.map.payload_sha256[:16]),
+_MAP = (
+    Column("landmark RMSE [m]", "map.errors.rmse_m", ".4f"),
+    Column("… after rigid alignment [m]", "map.errors.aligned_rmse_m", ".4f"),
+    Column("map NEES per dof", "map.errors.nees_per_dof", ".4g"),
+    Column("joint cost per dof", "map.cost_per_dof", ".4g"),
+    Column("covariance scale", "map.covariance_scale", ".2f"),
 )
-_ROBOT: Sequence[tuple[str, Callable[[Evaluation, RobotResult], str]]] = (
-    ("online position RMSE [m]", _of_path("online", "position_rmse_m", ".4f")),
-    ("… aligned [m]", lambda _, robot: format_figure(robot.online_aligned_rmse_m, ".4f", "")),
-    ("smoothed position RMSE [m]", _of_path("smoothed", "position_rmse_m", ".4f")),
-    ("… aligned, smoothed [m]", lambda _, robot: format_figure(robot.aligned_rmse_m, ".4f", "")),
-    ("heading RMSE, smoothed [°]", _of_path("smoothed", "heading_rmse_rad", ".3f", degrees)),
-    ("pose NEES per dof", _of_path("smoothed", "nees_per_dof", ".3g")),
-    ("uplink [bytes/step]", lambda _, robot: format_figure(robot.uplink_bytes_per_step, ".1f", "")),
+_IN_THE_FRAME = ("map.errors.rmse_m", "map.errors.nees_per_dof")
+"""Figures that an arbitrary frame makes meaningless."""
+_ROBOT = (
+    Column("online position RMSE [m]", "online.position_rmse_m", ".4f"),
+    Column("… aligned [m]", "online_aligned_rmse_m", ".4f"),
+    Column("smoothed position RMSE [m]", "smoothed.position_rmse_m", ".4f"),
+    Column("… aligned, smoothed [m]", "aligned_rmse_m", ".4f"),
+    Column("heading RMSE, smoothed [°]", "smoothed.heading_rmse_rad", ".3f", DEGREES),
+    Column("pose NEES per dof", "smoothed.nees_per_dof", ".3g"),
+    Column("uplink [bytes/step]", "uplink_bytes_per_step", ".1f"),
 )

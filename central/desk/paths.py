@@ -6,16 +6,16 @@ measurements, and each window path is fitted between its ends
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
+from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team import translate
-from teamslam.team.containment import Boundary
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed, window_path
-from teamslam.team.robot.node import robot_node
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -54,27 +54,14 @@ def smoothed_paths(
 
 def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
     """Windows of an incarnation by end stamp, as far as its measurements reach."""
-    try:
-        config, _ = found.robot_config(robot)
-    except RerunError:
-        return {}
-    if config.estimator != "hybrid":
-        return {}
     windows: dict[int, ClosedWindow] = {}
 
     def keep(closed: ClosedWindow) -> None:
         windows[closed.end_ns] = closed
 
-    node, boundary = robot_node(config, on_window=keep), Boundary(ch.robot_node(robot))
-    boundary.give(node, m.Liveliness(stamp_ns=0, node="central", alive=False))
-    count = 0
-    measurements = found.measurements.get((robot, incarnation))
-    if measurements is not None:
-        count = max(measurements) + 1
-        for each in measurements.consecutive(0, count):
-            boundary.give(node, each)
-    end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
-    boundary.give(node, m.End(stamp_ns=0, streams=(end,)))
+    with suppress(RerunError):
+        if found.robot_config(robot)[0].estimator == "hybrid":
+            run_alone(found, robot, incarnation, on_window=keep)
     return windows
 
 
@@ -102,18 +89,12 @@ def _between_ends(
             parts.append((path.stamps_ns[within], placed_poses[within], placed_covariances[within]))
         parts.append((np.array([stamp]), pose[None], covariance[None]))
         before, spread = pose, covariance
-    return SmoothedPath(
-        np.concatenate([part[0] for part in parts]),
-        np.concatenate([part[1] for part in parts]),
-        np.concatenate([part[2] for part in parts]),
-        at_keyframes=True,
-    )
+    stamps, poses, covariances = map(np.concatenate, zip(*parts, strict=True))
+    return SmoothedPath(stamps, poses, covariances, at_keyframes=True)
 
 
 def _joined(parts: list[SmoothedPath]) -> SmoothedPath:
-    return SmoothedPath(
-        np.concatenate([part.stamps_ns for part in parts]),
-        np.concatenate([part.poses for part in parts]),
-        np.concatenate([part.covariances for part in parts]),
-        at_keyframes=all(part.at_keyframes for part in parts),
-    )
+    arrays = zip(*((part.stamps_ns, part.poses, part.covariances) for part in parts), strict=True)
+    stamps, poses, covariances = map(np.concatenate, arrays)
+    dense = all(part.at_keyframes for part in parts)
+    return SmoothedPath(stamps, poses, covariances, at_keyframes=dense)

@@ -380,7 +380,8 @@ def _conclude(
     """Evaluate the log, print the result and write the report; exits with 1 on failure."""
     from rich.console import Console
 
-    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate, to_json
+    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
+    from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.evaluation.states import not_in_the_map
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.run import run_figures

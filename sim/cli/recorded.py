@@ -152,7 +152,8 @@ def report(
     """Write page, pictures, tables and figures of a run from its log."""
     from rich.console import Console
 
-    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate, to_json
+    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
+    from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_pictures, write_report
     from teamslam.central.desk.report.run import run_figures
     from teamslam.team.recording.reader import open_log

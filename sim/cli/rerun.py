@@ -29,8 +29,8 @@ from teamslam.sim.recorded.changes import Changes
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teamslam.central.desk.evaluation.evaluation import Evaluation
     from teamslam.central.desk.evaluation.history import History
+    from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.verification.verification import Verification
 
 app = typer.Typer()
@@ -220,7 +220,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         largest_move_m,
         same_final_map,
     )
-    from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+    from teamslam.central.desk.evaluation.evaluation import evaluate
+    from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.evaluation.history import history
     from teamslam.central.desk.evaluation.states import not_in_the_map
     from teamslam.central.desk.verification.recorded import RerunError

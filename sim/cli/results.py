@@ -1,5 +1,7 @@
 """Common steps of result commands: read, print, name files."""
 
+import shlex
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +11,7 @@ from teamslam.sim.cli.steps import Steps
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teamslam.central.desk.evaluation.evaluation import Evaluation
+    from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.report.run import Run
     from teamslam.team.recording.reader import Log
 
@@ -34,7 +36,8 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
     steps.begin("smoothing the paths")
     home = take_home(messages, steps.robot)
     steps.begin("reading the run's history")
-    return Run(evaluation, history(log.samples()), log.metadata, found, why, home)
+    command = shlex.join(("teamslam", *sys.argv[1:]))
+    return Run(evaluation, history(log.samples()), log.metadata, found, why, home, command)
 
 
 def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:

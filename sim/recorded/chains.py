@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import structs
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
-from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.team_config import TeamConfig
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor

@@ -11,7 +11,8 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import interpolate_truth
-from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.sim.datasets.factor_graph import (
     FactorGraph,
     Key,

@@ -15,7 +15,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "eclipse-zenoh", "msgpack", "mcap")
 
 def provenance() -> dict[str, str]:
     """Versions, processor, core and estimation of this process for a log's metadata."""
-    versions = {f"version.{package}": _version(package) for package in _PACKAGES}
+    versions = {f"version.{package}": version(package) for package in _PACKAGES}
     return {
         **versions,
         "version.python": python_version(),
@@ -72,7 +72,8 @@ def _processor() -> str:
     return processor() or machine()
 
 
-def _version(package: str) -> str:
+def version(package: str) -> str:
+    """Installed version of a package, or "unknown"."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

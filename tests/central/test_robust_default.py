@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.errors import MapErrors, map_errors
-from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of

@@ -21,7 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of

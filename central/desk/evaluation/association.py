@@ -103,9 +103,9 @@ def association_result(log: Collected) -> AssociationResult | None:
         for number in label_of
         if label_of[number] != UNKNOWN and (len(submaps[number]) > 1 or not several)
     ]
-    final = log.sound(log.last(ch.FINAL_MAP))
-    decisions = final.decisions if isinstance(final, m.FusedMap) else ()
-    in_map = {*ids(final.ids, "ids").tolist()} if isinstance(final, m.FusedMap) else {*confirmed}
+    final = log.newest(ch.FINAL_MAP, m.FusedMap)
+    decisions = () if final is None else final.decisions
+    in_map = {*confirmed} if final is None else {*ids(final.ids, "ids").tolist()}
     right, wrong = _merges(label, places, identity)
     return AssociationResult(
         pairs=_pairs(label[known], joined[known]),
@@ -127,48 +127,14 @@ def _beyond_the_first(numbers: Collection[int], label_of: Mapping[int, int]) -> 
     return len(numbers) - len({label_of[number] for number in numbers})
 
 
-def association_json(result: AssociationResult) -> dict[str, object]:
-    """Scores under their JSON names."""
-    pairs, inside = result.pairs, result.inside
-    return {
-        "precision": pairs.precision,
-        "recall": pairs.recall,
-        "f1": pairs.f1,
-        "wrong_percent": pairs.wrong_percent,
-        "windows": {
-            "precision": inside.precision,
-            "recall": inside.recall,
-            "f1": inside.f1,
-            "wrong_percent": inside.wrong_percent,
-        },
-        "landmarks": result.landmarks,
-        "duplicates": result.duplicates,
-        "duplicates_confirmed": result.duplicates_confirmed,
-        "duplicates_shown": result.duplicates_shown,
-        "merges_right": result.merges_right,
-        "merges_wrong": result.merges_wrong,
-        "merges_refused": result.merges_refused,
-        "labelled_detections": pairs.detections,
-        "labelled_detections_left_out": result.left_out,
-        "unlabelled_detections_in_the_map": result.clutter_in_map,
-    }
-
-
-def _robots(log: Collected, channel: ch.Channel) -> list[str]:
-    return sorted(name for key in log.samples if (name := channel.owner(key)) is not None)
-
-
 def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
     found: dict[tuple[str, int, int], int] = {}
-    for robot in _robots(log, ch.TRUTH_LABELS):
-        for message in log.messages(ch.TRUTH_LABELS, robot):
-            if not isinstance(message, m.TruthLabels):
-                continue
-            counts = ids(message.counts, "counts").tolist()
-            labels = iter(ids(message.labels, "labels").tolist())
-            for stamp, count in zip(stamps(message.stamps, "stamps").tolist(), counts, strict=True):
-                for row in range(count):
-                    found[robot, stamp, row] = next(labels)
+    for message in log.of_all(ch.TRUTH_LABELS, m.TruthLabels):
+        counts = ids(message.counts, "counts").tolist()
+        labels = iter(ids(message.labels, "labels").tolist())
+        for stamp, count in zip(stamps(message.stamps, "stamps").tolist(), counts, strict=True):
+            for row in range(count):
+                found[message.robot, stamp, row] = next(labels)
     return found
 
 
@@ -176,31 +142,25 @@ def _detections(
     log: Collected, labels: Mapping[tuple[str, int, int], int]
 ) -> Iterable[tuple[int, Place | None, tuple[str, int, int]]]:
     """Each detection's label, its place in a submap (None: in none) and its window."""
-    for robot in _robots(log, ch.ASSOCIATION):
-        seen: set[tuple[int, int]] = set()
-        for message in log.messages(ch.ASSOCIATION, robot):
-            if not isinstance(message, m.Association):
-                continue
-            window = (message.incarnation, message.sequence)
-            if window in seen:
-                continue
-            seen.add(window)
-            scans = np.repeat(stamps(message.stamps, "stamps"), ids(message.counts, "counts"))
-            rows = ids(message.rows, "rows").tolist()
-            numbers = ids(message.landmarks, "landmarks").tolist()
-            for stamp, row, number in zip(scans.tolist(), rows, numbers, strict=True):
-                label = labels.get((robot, stamp, row), UNKNOWN)
-                place = (robot, *window, number) if number >= UNNAMED else None
-                yield label, place, (robot, *window)
+    seen: set[tuple[str, int, int]] = set()
+    for message in log.of_all(ch.ASSOCIATION, m.Association):
+        window = (message.robot, message.incarnation, message.sequence)
+        if window in seen:
+            continue
+        seen.add(window)
+        scans = np.repeat(stamps(message.stamps, "stamps"), ids(message.counts, "counts"))
+        rows = ids(message.rows, "rows").tolist()
+        numbers = ids(message.landmarks, "landmarks").tolist()
+        for stamp, row, number in zip(scans.tolist(), rows, numbers, strict=True):
+            label = labels.get((message.robot, stamp, row), UNKNOWN)
+            yield label, (*window, number) if number >= UNNAMED else None, window
 
 
 def _identities(log: Collected) -> dict[Place, int]:
     """Number in the final map of each local landmark."""
-    final = log.sound(log.last(ch.FINAL_MAP))
+    final = log.newest(ch.FINAL_MAP, m.FusedMap)
     found: dict[Place, int] = {}
-    if not isinstance(final, m.FusedMap):
-        return found
-    for each in final.memberships:
+    for each in () if final is None else final.memberships:
         columns = (each.sequences, each.locals, each.identities)
         rows = zip(*(ids(column, "members").tolist() for column in columns), strict=True)
         for sequence, local, identity in rows:

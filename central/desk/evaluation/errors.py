@@ -87,6 +87,11 @@ class MapErrors:
         """Whether this run's NEES lies in its band."""
         return self.band[0] <= self.nees_per_dof <= self.band[1]
 
+    @property
+    def band_text(self) -> str:
+        """The band as text."""
+        return f"{self.band[0]:.2f}…{self.band[1]:.2f}"
+
 
 @dataclass(frozen=True)
 class ShapeErrors:

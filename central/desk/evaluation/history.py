@@ -1,4 +1,4 @@
-"""History of a run over team time: consistency, traffic, latency, events, in one pass.
+"""History of a run over team time: consistency, latency, events, in one pass.
 
 `evaluation` has the figures at the end. Only the plotted numbers of each message are kept.
 """
@@ -49,8 +49,13 @@ class Innovations:
     @property
     def per_dof(self) -> float | None:
         """NIS per degree of freedom over the run."""
-        total = int(self.dof.sum())
+        total = self.total_dof
         return float(self.squared.sum()) / total if total else None
+
+    @property
+    def total_dof(self) -> int:
+        """Degrees of freedom over the run."""
+        return int(self.dof.sum())
 
 
 @dataclass(frozen=True)
@@ -64,14 +69,6 @@ class Latencies:
     stamps_ns: Int64[np.ndarray, " n"]
     first_s: Float[np.ndarray, " n"]
     last_s: Float[np.ndarray, " n"]
-
-
-@dataclass(frozen=True)
-class Traffic:
-    """Messages of one key: team time [ns] and payload bytes."""
-
-    stamps_ns: Int64[np.ndarray, " n"]
-    sizes: Int64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +87,6 @@ class History:
     map_cost: Series
     robot_cost: Mapping[str, Series]
     latencies: Mapping[str, Latencies]
-    traffic: Mapping[str, Traffic]
     events: tuple[Event, ...]
 
     def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -148,7 +144,6 @@ class _Submap:
 
 @dataclass
 class _Gathering:
-    traffic: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
     innovations: dict[str, list[m.Innovation]] = field(default_factory=lambda: defaultdict(list))
     map_nees: _Column = field(default_factory=_Column)
     map_cost: _Column = field(default_factory=_Column)
@@ -164,10 +159,11 @@ class _Gathering:
     )
     truth: TrueLandmarks = field(default_factory=TrueLandmarks)
     frames: TruthFrames = field(default_factory=TruthFrames)
-    span: tuple[int, int] = _NO_SPAN
+    measured_ns: tuple[int, int] = _NO_SPAN
+    logged_ns: tuple[int, int] = _NO_SPAN
 
     def take(self, sample: Sample, channel: ch.Channel | None) -> None:
-        self.traffic[sample.key].take(sample.stamp_ns, float(len(sample.payload)))
+        self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
         if channel in ch.SENSORS:
             self._take_measurement(sample)
         self.take_contents(sample, channel)
@@ -211,7 +207,7 @@ class _Gathering:
         self.published[measurement.robot, measurement.incarnation].take(
             measurement.number, sample.wall_ns
         )
-        self.span = (min(self.span[0], sample.stamp_ns), max(self.span[1], sample.stamp_ns))
+        self.measured_ns = _extend(self.measured_ns, sample.stamp_ns)
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
@@ -247,10 +243,8 @@ def history(samples: Iterable[Sample]) -> History:
         if as_centre_sample is not None:
             as_centre = ch.channel_of(as_centre_sample.key)
             found.take_contents(as_centre_sample, None if as_centre is None else as_centre[0])
-    stamps = [column.stamps for column in found.traffic.values()]
-    span = found.span
-    if span == _NO_SPAN:
-        span = (min(map(min, stamps), default=0), max(map(max, stamps), default=0))
+    spans = (found.measured_ns, found.logged_ns, (0, 0))
+    span = next(each for each in spans if each != _NO_SPAN)
     return History(
         start_ns=span[0],
         end_ns=span[1],
@@ -263,12 +257,12 @@ def history(samples: Iterable[Sample]) -> History:
         latencies={
             robot: _latencies(found.latencies[robot]) for robot in in_order(found.latencies)
         },
-        traffic={
-            key: Traffic(series.stamps_ns, series.values.astype(np.int64))
-            for key, series in ((k, found.traffic[k].series) for k in in_order(found.traffic))
-        },
         events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )
+
+
+def _extend(span_ns: tuple[int, int], stamp_ns: int) -> tuple[int, int]:
+    return min(span_ns[0], stamp_ns), max(span_ns[1], stamp_ns)
 
 
 def _innovations(of: list[m.Innovation]) -> Innovations:

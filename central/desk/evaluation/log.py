@@ -7,6 +7,7 @@ their stream's `Timed`. All other messages are decoded and checked by `shown`.
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import msgspec
 
@@ -20,6 +21,7 @@ from teamslam.team.wire.bus import Sample, shown
 from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError, decoded
 
+M = TypeVar("M", bound=m.Message)
 _SENSORS = frozenset(channel.name for channel in ch.SENSORS)
 _TIMED: tuple[type[m.AnyOdometry | m.AnyScan], ...] = (
     m.Odometry, m.Increment, m.Steering, m.Observations, m.Points,
@@ -118,24 +120,20 @@ class Collected:
                 names.add(found[1])
         return in_order(names)
 
-    def last(self, channel: Channel) -> Sample | None:
-        """Newest sample of a channel with one key."""
-        return self.latest.get(channel.key())
+    def newest(self, channel: Channel, kind: type[M], name: str = "") -> M | None:
+        """Newest message of a channel (with this name), if valid."""
+        found = self.sound(self.latest.get(channel.key(name)))
+        return found if isinstance(found, kind) else None
 
-    def messages(self, channel: Channel, robot: str) -> list[m.Message]:
+    def messages(self, channel: Channel, kind: type[M], robot: str) -> list[M]:
         """Valid messages of a robot's channel, in log order."""
-        found = []
-        for sample in self.samples.get(channel.key(robot), []):
-            message = self.sound(sample)
-            if message is not None:
-                found.append(message)
-        return found
+        found = map(self.sound, self.samples.get(channel.key(robot), []))
+        return [each for each in found if isinstance(each, kind)]
 
-    def faults(self) -> list[m.Fault]:
-        """Faults of all nodes, ordered by node."""
-        keys = sorted(key for key in self.samples if ch.FAULT.owner(key) is not None)
-        found = (self.sound(sample) for key in keys for sample in self.samples[key])
-        return [fault for fault in found if isinstance(fault, m.Fault)]
+    def of_all(self, channel: Channel, kind: type[M]) -> list[M]:
+        """Valid messages of a channel, ordered by key, then in log order."""
+        names = sorted(name for key in self.samples if (name := channel.owner(key)) is not None)
+        return [each for name in names for each in self.messages(channel, kind, name)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
         """Message of a sample; None, counted once as unsound, if invalid."""
@@ -217,6 +215,6 @@ def collect_log(samples: Iterable[Sample]) -> Collected:
             found.keep(counterpart)
     found.disagreement = centre.agreement.disagreement
     largest = centre.agreement.largest
-    if found.last(ch.FINAL_MAP) is None and largest is not None:
+    if ch.FINAL_MAP.key() not in found.latest and largest is not None:
         found.keep(as_centre_final(largest))
     return found

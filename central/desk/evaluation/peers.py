@@ -14,17 +14,17 @@ _OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
 class PeerResult:
     """Announced conclusion of one peer.
 
-    complete_at_s: wall time from log start to its final map. uplink, downlink: bytes of set
-    messages published (each once) and received. have: submaps by robot. over: new members by
-    relaying node. agrees: peers whose last summary named the same set.
+    complete_at_s: wall time from log start to its final map. uplink_bytes, downlink_bytes:
+    set messages published (each once) and received. have: submaps by robot. over: new members by
+    relaying node. agrees_with: number of peers whose last summary named the same set.
     """
 
     final_map_sha256: str | None
     submaps: int
     complete_at_s: float | None
-    uplink: int | None
-    downlink: int | None
-    agrees: int
+    uplink_bytes: int | None
+    downlink_bytes: int | None
+    agrees_with: int
     have: Mapping[str, int] = field(default_factory=dict)
     over: Mapping[str, int] = field(default_factory=dict)
 
@@ -33,21 +33,20 @@ def peer_results(log: Collected) -> dict[str, PeerResult]:
     """Result of every robot with a copy of the set."""
     found = {}
     for robot in log.robots:
-        status = log.sound(log.latest.get(ch.STATUS.key(ch.robot_node(robot))))
-        figures = status.figures if isinstance(status, m.Status) else {}
+        status = log.newest(ch.STATUS, m.Status, ch.robot_node(robot))
+        figures = {} if status is None else status.figures
         if "set_submaps" not in figures:
             continue
         sample = log.latest.get(ch.CONCLUDED.key(robot))
-        message = log.sound(sample)
-        concluded = message if isinstance(message, m.Concluded) else None
+        concluded = log.newest(ch.CONCLUDED, m.Concluded, robot)
         at_ns = 0 if sample is None else sample.wall_ns - (log.first_ns or sample.wall_ns)
         found[robot] = PeerResult(
             final_map_sha256=None if concluded is None else concluded.sha256.hex(),
             submaps=int(figures["set_submaps"]) if concluded is None else concluded.submaps,
             complete_at_s=None if concluded is None else at_ns * 1e-9,
-            uplink=int(figures.get("set_uplink_bytes", 0.0)),
-            downlink=int(figures.get("set_downlink_bytes", 0.0)),
-            agrees=int(figures.get("set_agrees", 0.0)),
+            uplink_bytes=int(figures.get("set_uplink_bytes", 0.0)),
+            downlink_bytes=int(figures.get("set_downlink_bytes", 0.0)),
+            agrees_with=int(figures.get("set_agrees", 0.0)),
             have=_named(figures, _OF),
             over=_named(figures, _OVER),
         )
@@ -59,18 +58,4 @@ def _named(figures: Mapping[str, float], prefix: str) -> dict[str, int]:
         name.removeprefix(prefix): int(value)
         for name, value in figures.items()
         if name.startswith(prefix)
-    }
-
-
-def peer_json(peer: PeerResult) -> dict[str, object]:
-    """Figures under their JSON names."""
-    return {
-        "final_map_sha256": peer.final_map_sha256,
-        "submaps": peer.submaps,
-        "complete_at_s": peer.complete_at_s,
-        "uplink_bytes": peer.uplink,
-        "downlink_bytes": peer.downlink,
-        "agrees_with": peer.agrees,
-        "have": dict(peer.have),
-        "over": dict(peer.over),
     }

@@ -82,15 +82,15 @@ class Consumption:
 
 def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) -> RobotLog:
     """Collect one robot's paths; is_in_frame: whether a named frame is evaluated."""
-    trajectories = [t for t in log.messages(ch.TRAJECTORY, robot) if isinstance(t, m.Trajectory)]
-    truths = [t for t in log.messages(ch.TRUTH, robot) if isinstance(t, m.Truth)]
+    trajectories = log.messages(ch.TRAJECTORY, m.Trajectory, robot)
+    truths = log.messages(ch.TRUTH, m.Truth, robot)
     smoothed, smoothed_covariances = _stacked(
         [translate.trajectory_of(t) for t in trajectories],
         [floats(t.covariances, "covariances") for t in trajectories],
     )
     online_channel, estimates, outside = None, [], False
     for channel in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE):
-        poses = [p for p in log.messages(channel, robot) if isinstance(p, m.PoseEstimate)]
+        poses = log.messages(channel, m.PoseEstimate, robot)
         estimates = [p for p in poses if is_in_frame(p.frame)]
         outside = outside or bool(poses)
         if estimates:
@@ -113,12 +113,8 @@ def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) ->
 
 def consumption(log: Collected, robot: str) -> Consumption:
     """Measurements of one robot and their dispositions."""
-    dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, robot) if isinstance(d, m.Done)}
-    submaps = {
-        (s.incarnation, s.sequence): s
-        for s in log.messages(ch.SUBMAP, robot)
-        if isinstance(s, m.Submap)
-    }
+    dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, m.Done, robot)}
+    submaps = {(s.incarnation, s.sequence): s for s in log.messages(ch.SUBMAP, m.Submap, robot)}
     ledger: dict[str, int] = {}
     for incarnation in sorted(dones):
         for entry in dones[incarnation].ledger:

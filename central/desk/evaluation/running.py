@@ -86,22 +86,21 @@ class TrueLandmarks:
         """Convert the world's message."""
         return cls(*translate.landmarks_of(message))
 
-    def known(self, ids: UInt32[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
-        """Mask of landmarks with truth."""
-        return np.isin(ids, self.ids)
-
-    def at(self, ids: UInt32[np.ndarray, " L"]) -> Float[np.ndarray, "L 2"]:
-        """True positions; all must be known."""
-        return self.positions[np.searchsorted(self.ids, ids)]
+    def match(
+        self, ids: UInt32[np.ndarray, " L"]
+    ) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
+        """True positions by number (zero where unknown), and a mask of known ones."""
+        truth, known = np.zeros((len(ids), 2)), np.isin(ids, self.ids)
+        truth[known] = self.positions[np.searchsorted(self.ids, ids[known])]
+        return truth, known
 
     def fit(self, fused: m.FusedMap) -> MapFit | None:
         """Errors of a map's landmarks; None without truth."""
         ids, means = translate.landmarks_of(fused)
-        known = self.known(ids)
+        true, known = self.match(ids)
         if not known.any():
             return None
-        true = self.at(ids[known])
-        errors = means[known] - true
+        errors = (means - true)[known]
         blocks = translate.landmark_blocks_of(fused)[known]
         solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
         each = np.einsum("ki,ki->k", errors, solved)
@@ -110,7 +109,7 @@ class TrueLandmarks:
             of_known = np.flatnonzero(np.repeat(known, 2))
             P = translate.landmark_covariance_of(fused)[np.ix_(of_known, of_known)]
             squared = nees(errors.ravel(), P)
-        return MapFit(distance_rmse(means[known], true), squared / (2.0 * len(each)), each)
+        return MapFit(distance_rmse(means[known], true[known]), squared / (2.0 * len(each)), each)
 
 
 @dataclass

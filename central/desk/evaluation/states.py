@@ -1,6 +1,6 @@
 """State of each robot in the final map."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Literal, NamedTuple
 
 from teamslam.central.desk.evaluation.log import Collected
@@ -42,7 +42,8 @@ def robot_states(
         for who, why in not_joined(fused.reasons)
         for name in who.split(", ")
     }
-    because = dict(_withdrawals(log))
+    orders = (each for of in (ch.WITHDRAWAL, ch.ORDER) for each in log.of_all(of, m.Withdrawal))
+    because = {each.robot: f"by {each.by}: {each.reason}" for each in orders}  # orders prevail
 
     def state_of(name: str) -> RobotState:
         if name in fused.withdrawn:
@@ -56,18 +57,6 @@ def robot_states(
         return RobotState("not joined", _reason_in(fused, name) or NO_MEMBER)
 
     return {name: state_of(name) for name in in_order(team)}
-
-
-def _withdrawals(log: Collected) -> Iterator[tuple[str, str]]:
-    """Withdrawn robots, by whom and why; orders last, since they prevail."""
-    for channel in (ch.WITHDRAWAL, ch.ORDER):
-        for key in sorted(log.samples):
-            if channel.owner(key) is None:
-                continue
-            for sample in log.samples[key]:
-                message = log.sound(sample)
-                if isinstance(message, m.Withdrawal):
-                    yield message.robot, f"by {message.by}: {message.reason}"
 
 
 def _reason_in(fused: m.FusedMap, name: str) -> str:

@@ -70,8 +70,8 @@ def verdicts_given(log: Collected) -> tuple[str, ...]:
     keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
-    final = log.sound(log.last(ch.FINAL_MAP))
-    rests_on = final.verdicts if isinstance(final, m.FusedMap) else ()
+    final = log.newest(ch.FINAL_MAP, m.FusedMap)
+    rests_on = () if final is None else final.verdicts
     return tuple(_words(each, rests_on) for each in given)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from teamslam.central.desk.drawing import landmark_blocks
 from teamslam.central.desk.evaluation.errors import Path
-from teamslam.central.desk.evaluation.evaluation import MapResult
+from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.central.desk.export.tum import seconds, write_tum
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded

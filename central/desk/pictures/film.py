@@ -13,7 +13,7 @@ from teamslam.central.desk.drawing import (
     landmark_blocks,
     robot_colours,
 )
-from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.pictures.run import in_the_maps_frame, magnification, new_figure
 from teamslam.team import translate
 from teamslam.team.shapes import Float

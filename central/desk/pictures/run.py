@@ -20,7 +20,7 @@ from teamslam.central.desk.drawing import (
     robot_labels,
 )
 from teamslam.central.desk.evaluation.errors import Path, transform_points
-from teamslam.central.desk.evaluation.evaluation import Evaluation, MapResult, RobotResult
+from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
 from teamslam.central.desk.paths import SmoothedPath
 from teamslam.central.desk.pictures.style import save
 from teamslam.team.config import UNNAMED
@@ -36,6 +36,8 @@ DRAWN_ROBOTS = 12
 """Most rows of the error picture."""
 DRAWN_POINTS = 4000
 """Most points of a line; longer paths are thinned."""
+DRAWN_ERRORS = 1200
+"""Most points of a panel of errors, which has some 500 pixels."""
 DRAWN_BARS = 60
 """Most error bars, evenly spaced; more would hide the online poses."""
 LABELLED_LANDMARKS = 60
@@ -70,11 +72,7 @@ def map_picture(
             dense=paths.get(name), apart=bool(smoothed) and name not in smoothed,
         )  # fmt: skip
     _draw_landmarks(axis, evaluation)
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
-    axis.grid(color="#e4e4e4", linewidth=0.6)
-    axis.set_axisbelow(True)
+    set_up_map(axis)
     axis.set_title("\n".join(_title(evaluation)), fontsize=12)
     if smoothed:
         axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
@@ -161,6 +159,15 @@ def new_figure(
     FigureCanvasAgg(figure)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1, height_ratios=heights)
     return figure, [list(row) for row in grid]
+
+
+def set_up_map(axis: "Axes") -> None:
+    """Equal scales, labels in metres and a faint grid."""
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    axis.grid(color="#e4e4e4", linewidth=0.6)
+    axis.set_axisbelow(True)
 
 
 def _draw_paths(
@@ -288,7 +295,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
         axis.set_axisbelow(True)
         shown, largest = [np.empty(0)], 0.0
         if robot.online is not None:
-            drawn = thinning(len(robot.online.stamps_ns))
+            drawn = thinning(len(robot.online.stamps_ns), DRAWN_ERRORS)
             time_s = (robot.online.stamps_ns[drawn] - start_ns) * 1e-9
             bound = 3.0 * scale * robot.online.sigmas[drawn, k]
             error = scale * robot.online.errors[drawn, k]
@@ -338,9 +345,9 @@ def _thinned(path: Path) -> Path:
     return Path(path.stamps_ns[drawn], path.poses[drawn])
 
 
-def thinning(count: int) -> slice:
-    """Slice that leaves at most about DRAWN_POINTS."""
-    return slice(None, None, max(1, count // DRAWN_POINTS))
+def thinning(count: int, most: int = DRAWN_POINTS) -> slice:
+    """Slice that leaves at most about this many points."""
+    return slice(None, None, max(1, count // most))
 
 
 def _heading(evaluation: Evaluation) -> str:

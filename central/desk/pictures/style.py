@@ -58,7 +58,7 @@ class Look(StrEnum):
 
 @dataclass(frozen=True)
 class Style:
-    """Style and format of a report's pictures; only: the one picture drawn.
+    """Style and format of a report's pictures; only: the one picture drawn; vectors: SVG, too.
 
     width_in: paper width [inches]; None: COLUMN_IN, or TEXT_IN for several panels.
     """
@@ -67,6 +67,7 @@ class Style:
     form: Form = Form.PNG
     only: Picture | None = None
     width_in: float | None = None
+    vectors: bool = False
 
     def file_name(self, picture: Picture) -> str:
         """File name of a picture; differs between paper and page."""
@@ -80,6 +81,8 @@ class Style:
 
 
 SCREEN = Style()
+PAGE = Style(vectors=True)
+"""Screen pictures, and beside each the same as SVG for the page."""
 _current: ContextVar[Style] = ContextVar("style", default=SCREEN)
 
 
@@ -90,7 +93,7 @@ def drawn_in(style: Style) -> Iterator[None]:
 
     token = _current.set(style)
     try:
-        with rc_context():
+        with rc_context({"svg.hashsalt": "teamslam"}):
             if style.look is Look.PAPER:
                 rcParams["font.family"] = "serif"
                 rcParams["pdf.fonttype"] = 42
@@ -108,6 +111,8 @@ def save(figure: "Figure", path: Path) -> None:
     style = _current.get()
     if style.look is not Look.PAPER:
         figure.savefig(path, dpi=DPI)
+        if style.vectors:
+            figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
         return
     figure.suptitle("")
     if len(figure.axes) == 1:

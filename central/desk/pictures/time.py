@@ -12,8 +12,8 @@ from teamslam.central.desk.drawing import (
     robot_colours,
     robot_labels,
 )
-from teamslam.central.desk.evaluation.evaluation import Evaluation
 from teamslam.central.desk.evaluation.history import History
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.pictures.run import new_figure
 from teamslam.central.desk.pictures.style import save
 from teamslam.team.estimation.consistency import chi2_interval

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from teamslam.central.desk.evaluation.evaluation import Evaluation
 from teamslam.central.desk.evaluation.history import History
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
 from teamslam.central.desk.export.take_home import TakenHome
 from teamslam.central.desk.ledger import Ledger
@@ -19,7 +19,8 @@ class Run:
     """A run from its log.
 
     provenance: log metadata. ledger: result of `verify-ledger`; None if not requested, or without
-    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested.
+    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested. command: that
+    makes the report.
     """
 
     evaluation: Evaluation
@@ -28,6 +29,7 @@ class Run:
     ledger: Ledger | None = None
     no_ledger: str = "not asked for; `teamslam verify-ledger LOG` proves it"
     taken_home: TakenHome | None = None
+    command: str = ""
 
     @property
     def paths(self) -> Mapping[str, SmoothedPath]:
@@ -59,7 +61,7 @@ def run_figures(run: Run) -> dict[str, Any]:
     return {
         "team_time_s": span_s,
         "nis_per_dof": {robot: of.per_dof for robot, of in history.innovations.items()},
-        "nis_dof": {robot: int(of.dof.sum()) for robot, of in history.innovations.items()},
+        "nis_dof": {robot: of.total_dof for robot, of in history.innovations.items()},
         "latency_s": {
             robot: {
                 "last_measurement": _spread(of.last_s),
@@ -68,8 +70,8 @@ def run_figures(run: Run) -> dict[str, Any]:
             for robot, of in history.latencies.items()
         },
         "bytes_per_s": {
-            key: float(of.sizes.sum()) / span_s if span_s > 0.0 else None
-            for key, of in history.traffic.items()
+            key: traffic.bytes / span_s if span_s > 0.0 else None
+            for key, traffic in run.evaluation.channels.items()
         },
         "trajectories": {
             robot: {kind: errors.to_json() for kind, errors in of.items()}

@@ -1,17 +1,21 @@
-"""Tables of a report, for terminal and page."""
+"""Tables of a run, for terminal and page."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import degrees
 from typing import NamedTuple
 
+import numpy as np
 from rich import box
 from rich.console import JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from teamslam.central.desk.evaluation.association import AssociationResult
 from teamslam.central.desk.evaluation.errors import MapErrors
-from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult
-from teamslam.central.desk.names import OUTSIDE, not_joined, short
+from teamslam.central.desk.evaluation.results import Evaluation, RobotResult, figure
+from teamslam.central.desk.names import OUTSIDE, in_order, not_joined, short
+from teamslam.central.desk.report.run import Run
 from teamslam.central.diagnosis import describe
 from teamslam.team.config import MAP
 from teamslam.team.wire import messages as m
@@ -33,6 +37,41 @@ class Sheet(NamedTuple):
     note: str = ""
 
 
+class Column(NamedTuple):
+    """Column of figures: heading, path of attributes, format, factor to the unit shown, unit."""
+
+    heading: str
+    path: str
+    form: str
+    factor: float = 1
+    unit: str = ""
+
+
+DEGREES = degrees(1.0)
+
+
+def format_figure(value: float | str | None, form: str, unit: str = "", factor: float = 1) -> str:
+    """Format a number with its unit; a dash for None; text as it is."""
+    if value is None or isinstance(value, str):
+        return value or "–"
+    return f"{factor * value:{form}}{unit}"
+
+
+def cells(of: object, columns: Sequence[Column]) -> tuple[str, ...]:
+    """Figures of an object in these columns."""
+    return tuple(format_figure(figure(of, c.path), c.form, c.unit, c.factor) for c in columns)
+
+
+def headings(first: str, columns: Sequence[Column]) -> tuple[str, ...]:
+    """Headings of these columns, behind a first one."""
+    return (first, *(column.heading for column in columns))
+
+
+def comparable(evaluation: Evaluation, robot: RobotResult) -> RobotResult:
+    """Robot without the errors that an arbitrary frame makes meaningless."""
+    return replace(robot, smoothed=None, online=None) if evaluation.arbitrary_frame else robot
+
+
 def summary_tables(evaluation: Evaluation) -> list[Table]:
     """Team figures and one row per robot, at most 80 columns wide."""
     team = Table(title=Text(title_of(evaluation)), show_header=False)
@@ -41,11 +80,9 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
     sheets = [robot_sheet(evaluation)]
     if not evaluation.peers and is_unfused(evaluation):
         sheets.append(own_sheet(evaluation))
-    else:
-        if any(robot.smoothed is not None for robot in evaluation.robots.values()):
-            sheets.append(path_sheet(evaluation))
-        if evaluation.peers:
-            sheets.append(peer_sheet(evaluation))
+    elif any(robot.smoothed is not None for robot in evaluation.robots.values()):
+        sheets.append(path_sheet(evaluation))
+    sheets += [peer_sheet(evaluation)] if evaluation.peers else []
     return [team, *map(terminal_table, sheets)]
 
 
@@ -60,7 +97,12 @@ def terminal_table(sheet: Sheet) -> Table:
     return table
 
 
-PEER_HEADINGS = ("robot", "final map", "set", "at [s]", "sent [B]", "received [B]", "star", "over")
+_PEER = (
+    Column("set", "submaps", ""),
+    Column("at [s]", "complete_at_s", ".1f"),
+    Column("sent [B]", "uplink_bytes", ",.0f"),
+    Column("received [B]", "downlink_bytes", ",.0f"),
+)
 PEER_NOTE = (
     "set: submaps of all robots; at: wall time of the final map; sent, received: bytes of "
     "the set's channels; star: those of its own submaps, as a centre would get them; over: members "
@@ -70,29 +112,18 @@ PEER_NOTE = (
 
 def peer_sheet(evaluation: Evaluation) -> Sheet:
     """SHA-256 of each robot's final map, its part of the set, and traffic."""
-    rows: list[tuple[str, ...]] = []
+    rows = []
     for name, peer in evaluation.peers.items():
-        robot = evaluation.robots.get(name)
-        star = None if robot is None else robot.uplink_bytes
+        star = format_figure(figure(evaluation.robots.get(name), "uplink_bytes"), ",.0f")
         over = (
             f"{node.removeprefix('robot/')} {members}"
             for node, members in peer.over.items()
             if node.startswith("robot/") and node != f"robot/{name}"
         )
-        sha256 = peer.final_map_sha256
-        rows.append(
-            (
-                name,
-                "none" if sha256 is None else sha256[:12],
-                f"{peer.submaps}",
-                format_figure(peer.complete_at_s, ".1f", ""),
-                format_figure(peer.uplink, ",.0f", ""),
-                format_figure(peer.downlink, ",.0f", ""),
-                format_figure(star, ",.0f", ""),
-                ", ".join(over),
-            )
-        )
-    return Sheet(PEER_HEADINGS, rows, PEER_NOTE)
+        sha256 = (peer.final_map_sha256 or "none")[:12]
+        rows.append((name, sha256, *cells(peer, _PEER), star, ", ".join(over)))
+    first, *rest = headings("robot", _PEER)
+    return Sheet((first, "final map", *rest, "star", "over"), rows, PEER_NOTE)
 
 
 def title_of(evaluation: Evaluation) -> str:
@@ -129,7 +160,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("shape NEES per dof", nees))
         if not arbitrary:
             rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
-    rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f", "")))
+    rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f")))
     rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)
     rows += [("changes", change_words(fused.changes))] if fused.changes else []
@@ -219,12 +250,11 @@ def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
 
 def in_words(errors: MapErrors, *, joint: bool) -> str:
     """Map NEES and whether chance explains it; `joint`: of the joint covariance."""
-    low, high = errors.band
     kind = "joint" if joint else "blocks only"
-    band = f"95 % of {low:.2f}…{high:.2f} ({kind})"
+    band = f"95 % of {errors.band_text} ({kind})"
     if errors.in_band:
         return f"{errors.nees_per_dof:.4g}, in {band}"
-    if errors.nees_per_dof < low:
+    if errors.nees_per_dof < errors.band[0]:
         return f"{errors.nees_per_dof:.4g}, below {band}: the covariance is too large"
     return (
         f"{errors.nees_per_dof:.4g}, above {band}. WARNING: the errors are larger than the "
@@ -239,15 +269,9 @@ def _association_rows(evaluation: Evaluation) -> Rows:
     if found is None:
         return rows
     pairs = found.pairs
-    precision, recall, f1, wrong = (
-        format_figure(value, form, unit)
-        for value, form, unit in (
-            (pairs.precision, ".4f", ""),
-            (pairs.recall, ".3f", ""),
-            (pairs.f1, ".3f", ""),
-            (pairs.wrong_percent, ".3f", " %"),
-        )
-    )
+    recall, f1 = (format_figure(each, ".3f") for each in (pairs.recall, pairs.f1))
+    precision = format_figure(pairs.precision, ".4f")
+    wrong = format_figure(pairs.wrong_percent, ".3f", " %")
     scores = (
         f"precision {precision}, recall {recall}, F1 {f1}; {wrong} of the detections are in a "
         "wrong landmark"
@@ -305,34 +329,37 @@ ROBOT_HEADINGS = (
 
 def robot_sheet(evaluation: Evaluation) -> Sheet:
     """Measurements and errors of each robot; in an arbitrary frame, aligned errors only."""
-    arbitrary = evaluation.arbitrary_frame
-    rows = [_robot_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
+    rows = []
+    for name, robot in evaluation.robots.items():
+        used, shown = robot.consumption, comparable(evaluation, robot)
+        errors, mark = (shown.online, "*") if robot.smoothed is None else (shown.smoothed, "")
+        mark = "" if evaluation.arbitrary_frame else mark
+        position = figure(errors, "position_rmse_m")
+        position = robot.aligned_rmse_m if evaluation.arbitrary_frame else position
+        outside = robot.outside and not robot.smoothed_path.stamps_ns.size
+        rows.append((
+            name,
+            str(used.steps),
+            f"{'–' if used.used is None else used.used} of {used.published}",
+            str(used.submaps),
+            OUTSIDE if outside else format_figure(position, ".3f", mark),
+            format_figure(figure(errors, "heading_rmse_rad"), ".2f", mark, DEGREES),
+            format_figure(figure(errors, "nees_per_dof"), ".3g", mark),
+            format_figure(robot.uplink_bytes_per_step, ".1f"),
+        ))  # fmt: skip
     return Sheet(ROBOT_HEADINGS, rows, _robot_note(evaluation))
 
 
-def _robot_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, ...]:
-    used = robot.consumption
-    errors, mark = (robot.online, "*") if robot.smoothed is None else (robot.smoothed, "")
-    position = None if errors is None else errors.position_rmse_m
-    if arbitrary:
-        errors, mark, position = None, "", robot.aligned_rmse_m
-    outside = robot.outside and not robot.smoothed_path.stamps_ns.size
-    return (
-        name,
-        str(used.steps),
-        f"{'–' if used.used is None else used.used} of {used.published}",
-        str(used.submaps),
-        OUTSIDE if outside else format_figure(position, ".3f", mark),
-        format_figure(None if errors is None else degrees(errors.heading_rmse_rad), ".2f", mark),
-        format_figure(None if errors is None else errors.nees_per_dof, ".3g", mark),
-        format_figure(robot.uplink_bytes_per_step, ".1f", ""),
-    )
-
-
-PATH_HEADINGS = (
-    "robot", "path\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
-    "online\n[m]", "aligned\n[m]", "NEES\n/dof", "in\n95 %",
-)  # fmt: skip
+_PATH = (
+    Column("path\n[m]", "smoothed.position_rmse_m", ".3f"),
+    Column("aligned\n[m]", "aligned_rmse_m", ".3f"),
+    Column("NEES\n/dof", "smoothed.nees_per_dof", ".3g"),
+    Column("in\n95 %", "smoothed.coverage", ".0%"),
+    Column("online\n[m]", "online.position_rmse_m", ".3f"),
+    Column("aligned\n[m]", "online_aligned_rmse_m", ".3f"),
+    Column("NEES\n/dof", "online.nees_per_dof", ".3g"),
+    Column("in\n95 %", "online.coverage", ".0%"),
+)
 PATH_NOTE = (
     "position RMSE, smoothed and online; aligned: moved as the map is, or as all paths together "
     "where no true landmark is known"
@@ -343,32 +370,22 @@ def path_sheet(evaluation: Evaluation) -> Sheet:
     """Position errors, NEES and coverage of smoothed and online paths; in an arbitrary frame,
     aligned errors only.
     """
-    arbitrary = evaluation.arbitrary_frame
-    rows = [_path_row(n, robot, arbitrary=arbitrary) for n, robot in evaluation.robots.items()]
-    return Sheet(PATH_HEADINGS, rows, PATH_NOTE)
+    rows = []
+    for name, robot in evaluation.robots.items():
+        row = [name, *cells(comparable(evaluation, robot), _PATH)]
+        row[5] = OUTSIDE if robot.outside else row[5]
+        rows.append(row)
+    return Sheet(headings("robot", _PATH), rows, PATH_NOTE)
 
 
-def _path_row(name: str, robot: RobotResult, *, arbitrary: bool) -> tuple[str, ...]:
-    cells = [name]
-    for of, aligned, outside in (
-        (robot.smoothed, robot.aligned_rmse_m, False),
-        (robot.online, robot.online_aligned_rmse_m, robot.outside),
-    ):
-        errors = None if arbitrary else of
-        cells += [
-            OUTSIDE
-            if outside
-            else format_figure(None if errors is None else errors.position_rmse_m, ".3f", ""),
-            format_figure(aligned, ".3f", ""),
-            format_figure(None if errors is None else errors.nees_per_dof, ".3g", ""),
-            format_figure(None if errors is None else errors.coverage, ".0%", ""),
-        ]
-    return tuple(cells)
-
-
-OWN_HEADINGS = (
-    "robot", "land-\nmarks", "RMSE\n[m]", "aligned\n[m]", "NEES\n/dof", "95 % of it", "in\n95 %",
-)  # fmt: skip
+_OWN = (
+    Column("land-\nmarks", "own_map.count", ""),
+    Column("RMSE\n[m]", "own_map.rmse_m", ".3f"),
+    Column("aligned\n[m]", "own_map.aligned_rmse_m", ".3f"),
+    Column("NEES\n/dof", "own_map.nees_per_dof", ".4g"),
+    Column("95 % of it", "own_map.band_text", ""),
+    Column("in\n95 %", "own_map.coverage", ".0%"),
+)
 OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
@@ -380,25 +397,8 @@ def is_unfused(evaluation: Evaluation) -> bool:
 
 def own_sheet(evaluation: Evaluation) -> Sheet:
     """Errors, NEES with band, and coverage of every robot's own map."""
-    rows = []
-    for name, robot in evaluation.robots.items():
-        own = robot.own_map
-        if own is None:
-            rows.append((name, *["–"] * (len(OWN_HEADINGS) - 1)))
-            continue
-        low, high = own.band
-        rows.append(
-            (
-                name,
-                str(own.count),
-                f"{own.rmse_m:.3f}",
-                format_figure(own.aligned_rmse_m, ".3f", ""),
-                f"{own.nees_per_dof:.4g}",
-                f"{low:.2f}…{high:.2f}",
-                f"{own.coverage:.0%}",
-            )
-        )
-    return Sheet(OWN_HEADINGS, rows, OWN_NOTE)
+    rows = [(name, *cells(robot, _OWN)) for name, robot in evaluation.robots.items()]
+    return Sheet(headings("robot", _OWN), rows, OWN_NOTE)
 
 
 def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
@@ -410,6 +410,160 @@ def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
     return Sheet(("disposition", *ledgers, "all"), rows)
 
 
-def format_figure(value: float | None, form: str, unit: str) -> str:
-    """Format a number with its unit, or a dash."""
-    return "–" if value is None else f"{value:{form}}{unit}"
+NIS_NOTE = (
+    "NIS lies below 1 where a robot's sensor is configured with errors that last within a window "
+    "(range_white, bearing_white): the particles take every error for a new one."
+)
+_NIS = (Column("NIS\n/dof", "per_dof", ".3f"), Column("its\ndof", "total_dof", ","))
+_ONLINE = (
+    Column("online\nNEES/dof", "online.nees_per_dof", ".3g"),
+    Column("in\n95 %", "online.coverage", ".0%"),
+)
+
+
+def consistency_sheet(run: Run) -> Sheet:
+    """Consistency of the covariances: NEES and coverage with truth, otherwise NIS and cost."""
+    evaluation, innovations = run.evaluation, run.history.innovations
+    cost, scale = evaluation.cost_by_robot, evaluation.scale_by_robot
+    rows = []
+    for name in in_order(evaluation.robots.keys() | innovations.keys() | cost.keys()):
+        robot = evaluation.robots.get(name)
+        online = [*cells(robot and comparable(evaluation, robot), _ONLINE)]
+        online[0] = OUTSIDE if robot is not None and robot.outside else online[0]
+        of_map = format_figure(cost.get(name), ".3f"), format_figure(scale.get(name), ".2f")
+        rows.append((name, *cells(innovations.get(name), _NIS), *of_map, *online))
+    columns = headings("robot", _NIS)
+    of_map = "joint cost\n/dof", "covariance\nscale"
+    filled = [row for row in rows if any(cell != "–" for cell in row[1:])]
+    return Sheet((*columns, *of_map, *(each.heading for each in _ONLINE)), filled, NIS_NOTE)
+
+
+_APE = (
+    Column("poses", "poses", ","),
+    Column("APE\n[m]", "ape_m", ".3f"),
+    Column("APE by\nitself [m]", "ape_aligned_m", ".3f"),
+    Column("APE by\nitself [°]", "ape_aligned_rad", ".2f", DEGREES),
+    Column("RPE\n[m]", "rpe_m", ".3f"),
+    Column("RPE\n[°]", "rpe_rad", ".2f", DEGREES),
+)
+APE_NOTE = (
+    "RMS with evo's definitions; by itself: after the rigid motion that aligns this path, not the "
+    "map; RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
+    "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
+)
+
+
+def ape_sheet(run: Run) -> Sheet:
+    """Absolute and relative errors of every path."""
+    rows = [
+        [name, kind, *cells(errors, _APE)]
+        for name, of in run.trajectories().items()
+        for kind, errors in of.items()
+    ]
+    for row in rows if run.evaluation.arbitrary_frame else ():
+        row[3] = "–"
+    return Sheet(("robot", *headings("path", _APE)), rows, APE_NOTE)
+
+
+LATENCY_NOTE = (
+    "Wall time [s] from the publication of a submap's last and first measurement to that of "
+    "the first map that used it, by the publishers' clocks."
+)
+
+
+def latency_sheet(run: Run) -> Sheet:
+    """Median, 95 % quantile and maximum of each robot's latencies."""
+    rows = [
+        (
+            name,
+            f"{len(of.last_s):,}",
+            *(f"{np.quantile(v, q):.3g}" for v in (of.last_s, of.first_s) for q in (0.5, 0.95, 1)),
+        )
+        for name, of in run.history.latencies.items()
+    ]
+    columns = (f"{of}\n{which}" for of in ("last", "first") for which in ("median", "95 %", "max"))
+    return Sheet(("robot", "submaps", *columns), rows, LATENCY_NOTE)
+
+
+def traffic_sheet(run: Run) -> Sheet:
+    """Messages, bytes and mean rate of every key."""
+    span_s = (run.history.end_ns - run.history.start_ns) * 1e-9
+    rows = [
+        (key, f"{t.messages:,}", f"{t.bytes:,}", f"{t.bytes / span_s:,.1f}" if span_s > 0 else "–")
+        for key, t in run.evaluation.channels.items()
+    ]
+    return Sheet(("key", "messages", "bytes", "B/s"), rows)
+
+
+PSS_NOTE = (
+    "RSS: resident memory, shared pages included. PSS at the end of the run: a page that n "
+    "processes share counts 1/n in each."
+)
+
+
+def process_sheet(processes: Mapping[str, Mapping[str, float | None]]) -> Sheet:
+    """Resources of each launched process, which are not in the log."""
+    rows = [
+        (
+            name,
+            format_figure(took.get("cpu_s"), ".2f"),
+            *(format_figure(took.get(memory), ".0f") for memory in ("peak_rss_mb", "pss_mb")),
+        )
+        for name, took in processes.items()
+    ]
+    return Sheet(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows, PSS_NOTE)
+
+
+_SCORE = (
+    Column("precision", "precision", ".5f"),
+    Column("recall", "recall", ".4f"),
+    Column("F1", "f1", ".4f"),
+    Column("wrong\ndetections", "wrong_percent", ".3f", unit=" %"),
+)
+
+
+def score_sheet(found: AssociationResult) -> Sheet:
+    """Scores of the association inside windows and over all."""
+    note = (
+        f"{found.landmarks} landmarks without names in all submaps, with those that the final map "
+        "leaves out, that were given up, and that are of robots that are not joined; "
+        f"{found.duplicates} of them are duplicates, "
+        f"{found.duplicates_confirmed} among those of two submaps or more; pairs of robots that "
+        f"share landmarks: {found.merges_right} rightly, {found.merges_wrong} wrongly; "
+        f"{found.merges_refused} attempts wait. Scored by labels that no node receives."
+    )
+    rows = [
+        (name, *cells(of, _SCORE))
+        for name, of in (("inside windows", found.inside), ("over all", found.pairs))
+    ]
+    return Sheet(headings("pairs of detections", _SCORE), rows, note)
+
+
+_DECISION = (
+    Column("at [s]", "stamp_ns", ".1f", 1e-9),
+    Column("pairs", "pairs", ""),
+    Column("LLR", "llr", ".0f"),
+    Column("absent", "absent", ""),
+    Column("rival's\npairs", "rival_pairs", ""),
+    Column("rival's\nevidence", "rival_llr", ".0f"),
+    Column("share", "share", ".2f"),
+    Column("sd [m]", "sd", ".2f"),
+)
+DECISION_NOTE = (
+    "LLR: log-likelihood ratio of the pairs; absent: landmarks that one side has where the other "
+    "looked and has none, which speak against; share: of the landmarks there, matched ones. What "
+    "waits failed the test that is named; what is undone was taken back by a later one."
+)
+DECISIONS = 200
+"""Most decisions in the table; report.json has all."""
+
+
+def decision_sheet(decisions: Sequence[m.AssociationDecision]) -> Sheet:
+    """One row per closure and merge: accepted and undone ones, newest first, then pending ones."""
+    made = [each for each in decisions if each.kind != "waits"]
+    waits = [each for each in decisions if each.kind == "waits"]
+    rows = [
+        (f"{each.kind}: {each.about}", *cells(each, _DECISION), each.why)
+        for each in [*reversed(made), *waits][:DECISIONS]
+    ]
+    return Sheet((*headings("decision", _DECISION), "why"), rows, DECISION_NOTE)

@@ -3,13 +3,13 @@
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
+from typing import Any
 
 from teamslam.central.desk.verification.measurements import RecordedMeasurements
 from teamslam.central.desk.verification.recorded import Identity, Recorded, identity
 from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.robot.ledger import OnDisposition
 from teamslam.team.robot.node import robot_node
 from teamslam.team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from teamslam.team.wire import channels as ch
@@ -50,7 +50,7 @@ class RecordedPoses(RunningPoses):
 class RecomputedRobot:
     """Robot node over recorded messages, with poses at the recorded stamps.
 
-    The configuration keeps its announced digest.
+    The configuration keeps its announced digest. options: of `RobotNode`.
     """
 
     def __init__(
@@ -59,19 +59,20 @@ class RecomputedRobot:
         digest: bytes,
         recorded: PriorsNamed,
         withdrawn: WithdrawnAt = (),
-        on_disposition: OnDisposition | None = None,
+        **options: Any,
     ) -> None:
-        self.node = robot_node(
-            config,
-            announced=digest,
-            poses=RecordedPoses(config, recorded, withdrawn),
-            on_disposition=on_disposition,
-        )
+        poses = RecordedPoses(config, recorded, withdrawn)
+        self.node = robot_node(config, announced=digest, poses=poses, **options)
         self._boundary = Boundary(ch.robot_node(config.id))
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell does, with exceptions contained."""
         return self._boundary.give(self.node, message)
+
+    def take_known_map(self, log: Recorded) -> None:
+        """Handle the log's map, if the robot localises in one."""
+        if log.known_map is not None and ch.KNOWN_MAP in self.node.listens:
+            self.given(log.known_map)
 
 
 NewRobot = Callable[[], RecomputedRobot]
@@ -84,8 +85,7 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
     def new() -> RecomputedRobot:
         robot = RecomputedRobot(config, digest, named, withdrawn)
-        if log.known_map is not None and ch.KNOWN_MAP in robot.node.listens:
-            robot.given(log.known_map)
+        robot.take_known_map(log)
         return robot
 
     lives = _in_lockstep if config.fusion in FEEDBACK else _alone
@@ -215,20 +215,16 @@ def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]
                 inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
-def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
-    """Disposition of each consumed measurement of an incarnation, as worded by the node.
+def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
+    """Run a robot's node over the measurements of an incarnation, without a centre, so that it
+    waits for no map; returns how many it consumed.
 
-    The node runs without a centre, and so waits for no map.
+    options: of `RobotNode`. Raises RerunError without its configuration.
     """
-    config, digest = log.robot_config(robot)
-    disposition_of: dict[int, str] = {}
-    node = RecomputedRobot(config, digest, {}, on_disposition=disposition_of.__setitem__)
-    if log.known_map is not None and ch.KNOWN_MAP in node.node.listens:
-        node.given(log.known_map)
+    node = RecomputedRobot(*log.robot_config(robot), {}, **options)
+    node.take_known_map(log)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
-    measurements = log.measurements.get((robot, incarnation))
-    if measurements is None:
-        return {}
+    measurements = log.measurements.get((robot, incarnation), RecordedMeasurements())
     done = max((d.measurements for d in _dones(log, robot, incarnation)), default=None)
     consumed = 0
     for each in measurements.consecutive(0, len(measurements) if done is None else done):
@@ -237,4 +233,11 @@ def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
     if consumed and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=consumed)
         node.given(m.End(stamp_ns=0, streams=(end,)))
+    return consumed
+
+
+def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
+    """Disposition of each consumed measurement of an incarnation, as worded by the node."""
+    disposition_of: dict[int, str] = {}
+    consumed = run_alone(log, robot, incarnation, on_disposition=disposition_of.__setitem__)
     return {counter: disposition_of.get(counter, "lost") for counter in range(consumed)}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from teamslam.central.desk.evaluation.evaluation import MapResult
+from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.recorded.chains import Chain
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.models import located, predicted

@@ -26,7 +26,8 @@ from teamslam.central.desk.evaluation.errors import (
     map_errors,
     pose_errors,
 )
-from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,

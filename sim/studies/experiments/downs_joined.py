@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, map_errors, pose_errors
-from teamslam.central.desk.evaluation.evaluation import Evaluation, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
 from teamslam.sim.scenarios.source import streams_of

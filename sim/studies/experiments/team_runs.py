@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.desk.evaluation.evaluation import Evaluation, RobotResult, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import Evaluation, RobotResult
 from teamslam.central.node import CentralNode, node_class
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.recorded.chains import BatchReferenceError

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import Path, interpolate_truth
-from teamslam.central.desk.evaluation.evaluation import Evaluation
+from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.studies.experiments.plain_cost import PlainCost

@@ -7,7 +7,8 @@ import msgspec
 import pytest
 
 from teamslam.central.desk.agreement import Agreement
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.central.desk.view.server import Feed
 from teamslam.central.team_config import TeamConfig

@@ -12,7 +12,8 @@ from teamslam.central.desk.evaluation.clocks import (
     lateness,
     separate_times_warning,
 )
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.log import collect_log
 from teamslam.central.desk.presence import Presence
 from teamslam.central.desk.report.tables import team_rows

@@ -16,7 +16,8 @@ from teamslam.central.desk.evaluation.errors import (
     pose_errors,
     transform_points,
 )
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.report.tables import robot_sheet, team_rows, title_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.config import FolderWorld

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.history import history
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team import translate
@@ -29,9 +30,10 @@ def run(log):
     return history(log)
 
 
-def test_every_byte_is_counted_under_its_key(run, log):
-    assert sum(int(t.sizes.sum()) for t in run.traffic.values()) == sum(len(s.payload) for s in log)
-    assert set(run.traffic) == {s.key for s in log}
+def test_every_byte_is_counted_under_its_key(log):
+    channels = evaluate(log).channels
+    assert sum(each.bytes for each in channels.values()) == sum(len(s.payload) for s in log)
+    assert set(channels) == {s.key for s in log}
 
 
 def test_nis_is_what_the_robots_said_of_their_windows(run, log):
@@ -139,4 +141,4 @@ def test_without_truth_there_is_the_cost_and_no_nees():
 
 def test_an_empty_log_has_an_empty_history():
     empty = history([])
-    assert (empty.start_ns, empty.end_ns, empty.events, empty.traffic) == (0, 0, (), {})
+    assert (empty.start_ns, empty.end_ns, empty.events, empty.latencies) == (0, 0, (), {})

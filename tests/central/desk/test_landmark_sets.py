@@ -4,8 +4,7 @@ import numpy as np
 from teamslam.central.desk.evaluation.association import AssociationResult, Pairs
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.events import EventDetector
-from teamslam.central.desk.report.identities import decision_sheet, score_sheet
-from teamslam.central.desk.report.tables import in_words
+from teamslam.central.desk.report.tables import decision_sheet, in_words, score_sheet
 from teamslam.central.desk.view.landmark_sets import sets_of
 from teamslam.team.wire import messages as m
 from tests.support import examples

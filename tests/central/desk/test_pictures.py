@@ -19,7 +19,8 @@ from teamslam.central.desk.drawing import (
     curve_through,
     ellipses,
 )
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.pictures import film
 from teamslam.central.desk.pictures.run import (

@@ -9,7 +9,8 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.ledger import Entry, Ledger
 from teamslam.central.desk.report import page as report_page
@@ -51,7 +52,7 @@ def _without_pictures(monkeypatch):
 
 
 def test_it_is_one_page_that_needs_nothing_else(log, tmp_path):
-    run = run_of(log, seed="1")
+    run = replace(run_of(log, **{"seed": "1", "version.teamslam": "0.0.7"}), command="teamslam <x>")
     paths = write_report(run, tmp_path / "new", to_json(run.evaluation, run_figures(run)))
     names = [path.name for path in paths]
     assert names == [
@@ -63,8 +64,13 @@ def test_it_is_one_page_that_needs_nothing_else(log, tmp_path):
         "trajectories",
     ]
     page = paths[0].read_text("utf-8")
-    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert page.count("data:image/svg+xml;base64,") == len(PICTURES)
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+    made = re.search(
+        r"Recorded on ([\d-]+ [\d:]+ UTC) by teamslam 0.0.7; report of (20.*); (.*)</p>", page
+    )
+    assert made is not None
+    assert (made[1], made[3]) == ("1970-01-01 00:00 UTC", "teamslam &lt;x&gt;")
     targets = set(re.findall(r'href="#(\w+)"', page))
     assert targets == set(re.findall(r'<h2 id="(\w+)"', page))
     assert {"consistency", "latency", "events", "traffic"} <= targets

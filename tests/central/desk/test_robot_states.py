@@ -8,7 +8,8 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.desk.evaluation.evaluation import evaluate, to_json
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run

@@ -6,7 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.evaluation import MapResult, evaluate
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.central.monitor import miscalibrations
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, with_options

@@ -1,0 +1,156 @@
+"""Figures of a run under their JSON names."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import msgspec
+
+from teamslam.central.desk.evaluation.association import AssociationResult
+from teamslam.central.desk.evaluation.causes import absent_robots, warning_objects
+from teamslam.central.desk.evaluation.results import Evaluation, figure
+from teamslam.central.diagnosis import to_object
+from teamslam.team.wire import messages as m
+
+_TEAM = {
+    "scenario": "scenario.name",
+    "seed": "scenario.seed",
+    "estimator": "scenario.estimator",
+    "fusion": "scenario.fusion",
+    "landmarks_with_truth": "map.errors.count",
+    "landmark_rmse_m": "map.errors.rmse_m",
+    "landmark_rmse_aligned_m": "map.errors.aligned_rmse_m",
+    "map_nees_per_dof": "map.errors.nees_per_dof",
+    "map_nees_band": "map.errors.band",
+    "map_nees_in_band": "map.errors.in_band",
+    "shape_nees_per_landmark": "map.errors.shape.nees_per_landmark",
+    "shape_coverage_95": "map.errors.shape.coverage",
+    "landmark_coverage_95": "map.errors.coverage",
+    "joint_cost_per_dof": "map.cost_per_dof",
+    "joint_cost_per_dof_by_robot": "cost_by_robot",
+    "covariance_scale": "map.covariance_scale",
+    "covariance_scale_by_robot": "scale_by_robot",
+    "final_map_digest": "map.digest",
+    "final_map_frame": "map.frame",
+    "peers_that_differ": "disagreement",
+    "frame_is_arbitrary": "arbitrary_frame",
+    "verdicts": "verdicts",
+    "gps_median_m": "gps_median_m",
+    "unsound_messages": "unsound",
+    "notes": "notes",
+    "faults": "faults",
+}
+_ROBOT = {
+    "steps": "consumption.steps",
+    "measurements_published": "consumption.published",
+    "measurements_consumed": "consumption.consumed",
+    "measurements_used": "consumption.used",
+    "measurements_rejected": "consumption.rejected",
+    "measurements_open": "consumption.open",
+    "measurements_used_once": "consumption.each_once",
+    "ledger": "consumption.ledger",
+    "submaps": "consumption.submaps",
+    "position_rmse_m": "smoothed.position_rmse_m",
+    "heading_rmse_rad": "smoothed.heading_rmse_rad",
+    "pose_nees_per_dof": "smoothed.nees_per_dof",
+    "pose_coverage_95": "smoothed.coverage",
+    "final_pose_nees_per_dof": "final_pose_nees_per_dof",
+    "position_rmse_aligned_m": "aligned_rmse_m",
+    "aligned_by": "alignment",
+    "online_position_rmse_m": "online.position_rmse_m",
+    "online_heading_rmse_rad": "online.heading_rmse_rad",
+    "online_pose_nees_per_dof": "online.nees_per_dof",
+    "online_pose_coverage_95": "online.coverage",
+    "online_position_rmse_aligned_m": "online_aligned_rmse_m",
+    "online_channel": "online_channel",
+    "own_map_landmarks": "own_map.count",
+    "own_map_rmse_m": "own_map.rmse_m",
+    "own_map_rmse_aligned_m": "own_map.aligned_rmse_m",
+    "own_map_nees_per_dof": "own_map.nees_per_dof",
+    "own_map_nees_in_band": "own_map.in_band",
+    "uplink_bytes": "uplink_bytes",
+    "uplink_bytes_per_step": "uplink_bytes_per_step",
+}
+_SCORES = {each: each for each in ("precision", "recall", "f1", "wrong_percent")}
+_ASSOCIATION = {
+    each: each
+    for each in (
+        "landmarks", "duplicates", "duplicates_confirmed", "duplicates_shown", "merges_right",
+        "merges_wrong", "merges_refused",
+    )
+} | {
+    "labelled_detections": "pairs.detections",
+    "labelled_detections_left_out": "left_out",
+    "unlabelled_detections_in_the_map": "clutter_in_map",
+}  # fmt: skip
+
+
+def _named(of: object, paths: Mapping[str, str]) -> dict[str, Any]:
+    """Figures by name; tuples as lists, as JSON has them."""
+    found = {name: figure(of, path) for name, path in paths.items()}
+    return {name: list(of) if isinstance(of, tuple) else of for name, of in found.items()}
+
+
+def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Figures under their JSON names; `extra` replaces or adds figures."""
+    fused, association = evaluation.map, evaluation.association
+    states = evaluation.states
+    of_map: dict[str, Any] = {
+        "landmarks": None,
+        "landmark_matching": None,
+        "map_covariance": None,
+        "final_map_sha256": None,
+        "gospa": None,
+        "diagnosis": [],
+        "joined": [],
+        "changes": [],
+    }
+    if fused is not None:
+        of_map = {
+            "landmarks": len(fused.ids),
+            "landmark_matching": fused.matching and asdict(fused.matching),
+            "map_covariance": "joint" if fused.joint else "blocks",
+            "final_map_sha256": None if evaluation.disagreement else fused.payload_sha256,
+            "gospa": fused.gospa and asdict(fused.gospa),
+            "diagnosis": [to_object(each) for each in fused.diagnosis],
+            "joined": list(fused.joined),
+            "changes": [change_json(each) for each in fused.changes],
+        }
+    return {
+        **_named(evaluation, _TEAM),
+        **of_map,
+        "data_set": evaluation.data_set or None,
+        "not_joined": absent_robots(states, "not joined"),
+        "withdrawn": absent_robots(states, "withdrawn"),
+        "warnings": warning_objects(evaluation.other_warnings),
+        "robot_states": {name: of._asdict() for name, of in states.items()},
+        "robots": {
+            name: _named(robot, _ROBOT) | {"online_in_team_frame": not robot.outside}
+            for name, robot in evaluation.robots.items()
+        },
+        "peers": {name: asdict(peer) for name, peer in evaluation.peers.items()},
+        "channels": {key: asdict(traffic) for key, traffic in evaluation.channels.items()},
+        "association": association and association_json(association),
+        "association_decisions": [msgspec.structs.asdict(each) for each in evaluation.decisions],
+        "reference_rmse_m": association and figure(fused, "errors.aligned_rmse_m"),
+        **(extra or {}),
+    }
+
+
+def association_json(result: AssociationResult) -> dict[str, Any]:
+    """Scores under their JSON names."""
+    windows = {"windows": _named(result.inside, _SCORES)}
+    return _named(result.pairs, _SCORES) | windows | _named(result, _ASSOCIATION)
+
+
+def change_json(change: m.LandmarkChange) -> dict[str, Any]:
+    """A landmark's state against the saved maps; `expected`: observations of one that is gone."""
+    return {
+        "landmark": change.landmark,
+        "state": change.state,
+        "dx_m": change.dx,
+        "dy_m": change.dy,
+        "sigma_m": change.sigma,
+        "chi2": change.chi2,
+        "expected": change.expected,
+    }
