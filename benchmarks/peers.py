@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from teamslam.sim.in_memory.air import Air, Reach, always
 from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.wire import channels as ch
@@ -23,6 +22,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
+from tests.air import Air, Reach, always
 
 BASELINE = Path(__file__).with_suffix(".json")
 DRIVE_S = 300

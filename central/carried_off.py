@@ -47,7 +47,6 @@ MOST_SUBMAPS = 2000
 """Longer streams are not examined: it would take seconds."""
 
 Pose = Float[np.ndarray, "3"]
-Covariance = Float[np.ndarray, "3 3"]
 Matrix = Float[np.ndarray, "m m"]
 
 

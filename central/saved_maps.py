@@ -19,8 +19,6 @@ from teamslam.team.estimation.map_joining.saved_maps import FALSE_ALARM, displac
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
 
-NO_ROBOT = "no robot has observed a landmark"
-
 
 class NothingToSaveError(ValueError):
     """A map that cannot be saved; the text gives the reason and the remedy."""

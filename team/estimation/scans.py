@@ -95,15 +95,6 @@ def together(parts: list[tuple[int, Own]]) -> Own:
     )
 
 
-def of_each(parts: list[tuple[int, Own]]) -> Float[np.ndarray, "_ 4"]:
-    """Join the rows of several scans, given by count and rows; form SENSOR where there is no
-    covariance.
-    """
-    found = together(parts)
-    sensors = np.array([0.0, 0.0, 0.0, SENSOR])
-    return found if found.shape[1] else np.tile(sensors, (len(found), 1))
-
-
 def sensible(own: Own, ranges: Float[np.ndarray, " n"], bounds: Bounds) -> Bool[np.ndarray, " n"]:
     """Mark measurements whose own standard deviations, if any, are within the bounds."""
     if not own.size:

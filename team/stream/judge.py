@@ -10,9 +10,6 @@ from teamslam.team.estimation.plausible import is_motion_spread as _spread
 from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Bool, Float
 
-LONGEST_NS = 2**62
-"""Bound on the distance of two stamps."""
-
 
 class StreamJudge:
     """Checks one incarnation of a sensor stream against the time of its last odometry.

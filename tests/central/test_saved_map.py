@@ -13,8 +13,6 @@ from teamslam.central.desk.verification.centre import recomputed_centre, recorde
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.sim.cli.main import app
-from teamslam.sim.in_memory.air import Air
-from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -28,7 +26,9 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, ids
 from teamslam.team.wire.codec import WireError, decoded, encoded
+from tests.air import Air
 from tests.bits import SETS
+from tests.peer_team import PeerTeam, peer_world
 from tests.support import example
 
 ALL = ("*",)

@@ -26,8 +26,6 @@ from teamslam.central.node import CentralNode
 from teamslam.central.peers.fold import FoldWhen
 from teamslam.central.peers.peer import CENTRE
 from teamslam.central.peers.robot import PeerRobot
-from teamslam.sim.in_memory.air import Air
-from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -38,6 +36,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import build
+from tests.air import Air
+from tests.peer_team import PeerTeam, peer_world
 
 SECOND = 10**9
 DEATHS = 30

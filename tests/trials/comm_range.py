@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from teamslam.sim.in_memory.air import air_of
-from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import SimulatedWorld
@@ -31,6 +29,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.codec import decoded
+from tests.air import air_of
+from tests.peer_team import PeerTeam, peer_world
 
 EVERY_S = 5.0
 Rows = dict[str, list[float]]

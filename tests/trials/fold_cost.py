@@ -18,8 +18,6 @@ import msgspec
 
 from teamslam.central.peers.fold import FoldWhen, PeerFold
 from teamslam.central.peers.robot import PeerRobot
-from teamslam.sim.in_memory.air import Air
-from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import SimulatedWorld
@@ -27,6 +25,8 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
+from tests.air import Air
+from tests.peer_team import PeerTeam, peer_world
 
 T = TypeVar("T")
 

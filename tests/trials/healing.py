@@ -14,8 +14,8 @@ from itertools import product
 from typing import Any
 
 from benchmarks.peers import CUT_S, SECOND_NS, TEAMS, TOPOLOGIES, WINDOW_S, Team, submap
-from teamslam.sim.in_memory.air import Air
 from teamslam.team.wire.codec import encoded
+from tests.air import Air
 
 FINE_NS = 50_000_000
 WITHIN_S = 600

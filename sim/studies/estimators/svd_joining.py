@@ -100,13 +100,6 @@ def variance_factor(state: SubmapJoining) -> float:
     return island.cost / redundancy
 
 
-def pose_gaussian(state: SubmapJoining, robot: str) -> PoseGaussian:
-    """End of a robot's last submap; raises KeyError without submaps."""
-    graph = state.fold.main.graph
-    mean, covariance = joint_marginal(state.fold.main, [graph.streams[robot, 0][-1]])
-    return PoseGaussian(mean, variance_factor(state) * covariance)
-
-
 def landmark_gaussian(state: SubmapJoining) -> LandmarkGaussian:
     """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹; raises KeyError before the first submap."""
     landmarks = state.fold.main.graph.landmarks

@@ -28,7 +28,6 @@ ADVANCED = "/@adv/pub/"
 _BEAT = struct.Struct("<I")  # payload of a heartbeat: the number of the last publication
 _LOOK_S = 0.1  # interval of the checks for missing samples
 _ANSWER_S = 10.0
-_NEVER = 2**63
 _SEVERAL = ""  # replaces a publisher's key: its samples arrived on several
 MOST_OF_A_NODE = 4_096
 """Most tracked publishers, each on one key, on the keys of one node."""

@@ -4,8 +4,6 @@ import msgspec
 import pytest
 
 from teamslam.central.peers.robot import PeerRobot
-from teamslam.sim.in_memory.air import Air, Meeting, meetings
-from teamslam.sim.in_memory.peers import PeerTeam, peer_world
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -14,6 +12,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
+from tests.air import Air, Meeting, meetings
+from tests.peer_team import PeerTeam, peer_world
 
 SECOND = 1_000_000_000
 

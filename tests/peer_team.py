@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from teamslam.central.peers.centre import PeerCentre
 from teamslam.central.peers.peer import CENTRE
 from teamslam.central.peers.robot import PeerRobot
-from teamslam.sim.in_memory.air import Air
 from teamslam.sim.in_memory.team import ROUND_S, World
 from teamslam.sim.publisher.node import WorldNode, expected_nodes
 from teamslam.sim.scenarios.scenario import Scenario
@@ -24,6 +23,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import configured
+from tests.air import Air
 
 AFTER_S = 3600.0
 """Team time [s] after the streams' end at which incomplete peers give up."""

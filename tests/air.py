@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.radio import Reach as WorldReach
 from teamslam.sim.world.radio import reach_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.estimation.randomness import generator
@@ -27,21 +26,12 @@ class Meeting:
     end_ns: int
 
 
-def reach_in(reach: WorldReach) -> Reach:
-    """The reach of a scenario's world."""
-
-    def between(one: str, other: str, now_ns: int) -> bool:
-        return reach.between(one, other, now_ns)
-
-    return between
-
-
 def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
     """The radio of a scenario, in memory."""
     radio = scenario.radio
     delay_ns = round(radio.delay_s * 1e9)
     return Air(
-        reach=reach_in(reach_of(radio, streams.streams)),
+        reach=reach_of(radio, streams.streams).between,
         loss=radio.loss,
         delay_ns=(delay_ns, delay_ns),
         bytes_per_s=radio.bytes_per_s,
