@@ -6,7 +6,7 @@ import msgspec
 
 from teamslam.sim.datasets.kinds import UTIAS_MARKER
 from teamslam.sim.datasets.tables import open_data_set as opened_set
-from teamslam.sim.datasets.utias_log import present_robots
+from teamslam.sim.datasets.utias import present_robots
 from teamslam.sim.recorded.streams import measurements_in
 from teamslam.sim.scenarios.scenario import Scenario, builtin_names, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots

@@ -12,7 +12,13 @@ import numpy as np
 
 from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
+from teamslam.sim.world.streams import (
+    RobotStream,
+    StartPose,
+    WorldStreams,
+    moved,
+    no_detections,
+)
 from teamslam.team.shapes import Float
 
 STEP_NS = 1_000_000_000
@@ -184,7 +190,7 @@ def _stream(graph: FactorGraph, robot: str, name: str, names: tuple[str, ...]) -
         start=None if start is None else StartPose(*start),
         intervals=moved(stamps[1:], np.diff(stamps), motions, covariances),
         landmark_detections=scans.grouped(),
-        teammate_detections=_scans([], at)[0].grouped(),
+        teammate_detections=no_detections(),
         teammates=names,
         truth_ns=stamps if has_truth else None,
         truth=np.array(true) if has_truth else None,

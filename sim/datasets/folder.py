@@ -15,7 +15,7 @@ scenario.toml         the models and options of the team                  (optio
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,32 +25,24 @@ from teamslam.sim.datasets.csv_table import CsvTable, read_table
 from teamslam.sim.datasets.detections_table import detections_of, together
 from teamslam.sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
 from teamslam.sim.datasets.folder_odometry import intervals_of
-from teamslam.sim.datasets.scans import Scans
 from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
 from teamslam.sim.datasets.tables import DatasetError, File
 from teamslam.sim.world.config import FolderWorld, starts_unknown
-from teamslam.sim.world.streams import (
-    Detections,
-    Intervals,
-    RobotStream,
-    StartPose,
-    WorldStreams,
-)
+from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
-from teamslam.team.shapes import Float, Int64
+from teamslam.team.shapes import Int64
 
-COVARIANCE = POSE_COVARIANCE
 TABLES = {
     "odometry": (
         "t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *rows.STEERED,
-        *COVARIANCE,
+        *POSE_COVARIANCE,
     ),
     "observations": (
         "t_s", "landmark", *rows.POLAR, *rows.POINTS, *rows.POLAR_COVARIANCE,
         *rows.POINT_COVARIANCE,
     ),
     "sightings": ("t_s", "teammate", *rows.POLAR, *rows.POINTS),
-    "start": ("t_s", *rows.POSES, *COVARIANCE),
+    "start": ("t_s", *rows.POSES, *POSE_COVARIANCE),
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
 }  # fmt: skip
@@ -79,18 +71,18 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
                 f"{world.path}: no robot {', '.join(missing)} in it, but {', '.join(folders)}: "
                 "give --robots, or a scenario with its names"
             )
-        read = [_robot_rows(name, folders[name], clocks) for name in clocks]
+        streams = [_stream(name, folders[name], world, clocks) for name in clocks]
         surveyed = _table(root, "landmarks", "")
         unused = left_out(root, folders, TABLES)
     if world.duration_s is not None:
-        end_ns = min(each.start_ns for each in read) + round(world.duration_s * 1e9)
-        read = [each.until(end_ns) for each in read]
+        end_ns = min(each.start_ns for each in streams) + round(world.duration_s * 1e9)
+        streams = [each.until(end_ns) for each in streams]
     ids, positions = (
         (np.empty(0, np.uint32), None) if surveyed is None else rows.landmarks_of(surveyed)
     )
     notes = [] if len(ids) else ["no landmarks.csv: the map's error can not be computed"]
     cars = {robot.id for robot in robots if robot.motion.kind == "ackermann"}
-    steered = [each.robot for each in read if each.intervals.steered and each.robot not in cars]
+    steered = [s.robot for s in streams if s.intervals.steered and s.robot not in cars]
     if steered:
         notes.append(
             f"{', '.join(steered)}: wheel speed and steering can not be used: give "
@@ -98,7 +90,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
         )
     notes += unused
     return WorldStreams(
-        streams=tuple(_stream(each, world, clocks) for each in read),
+        streams=tuple(streams),
         landmark_ids=ids,
         landmarks=positions if len(ids) else None,
         source=f"data set {Path(world.path).resolve().name}",
@@ -106,55 +98,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     )
 
 
-@dataclass(frozen=True)
-class RobotRows:
-    """One robot's tables by time.
-
-    empty_ns: times of empty scans. unnamed: detections without identities.
-    """
-
-    robot: str
-    start: StartPose | None
-    intervals: Intervals
-    seen: Scans
-    empty_ns: Int64[np.ndarray, " E"]
-    teammates: Scans
-    truth_ns: Int64[np.ndarray, " T"]
-    truth: Float[np.ndarray, "T 3"]
-    notes: tuple[str, ...]
-    unnamed: Detections | None = None
-
-    @property
-    def start_ns(self) -> int:
-        """Start of the first measurement."""
-        intervals = self.intervals
-        first = (
-            intervals.end_ns[:1] - intervals.duration_ns[:1],
-            self.seen.stamps_ns[:1],
-            self.empty_ns[:1],
-            self.teammates.stamps_ns[:1],
-            np.empty(0, np.int64) if self.unnamed is None else self.unnamed.stamps_ns[:1],
-        )
-        return int(np.concatenate(first).min())
-
-    def until(self, end_ns: int) -> "RobotRows":
-        """Tables up to the last odometry interval that ends by end_ns."""
-        intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
-        last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
-        samples = int(np.searchsorted(self.truth_ns, end_ns)) + 1
-        return replace(
-            self,
-            intervals=intervals,
-            seen=self.seen.where(self.seen.stamps_ns <= last_ns),
-            empty_ns=self.empty_ns[self.empty_ns <= last_ns],
-            teammates=self.teammates.where(self.teammates.stamps_ns <= last_ns),
-            unnamed=_within(self.unnamed, (0, last_ns)),
-            truth_ns=self.truth_ns[:samples],
-            truth=self.truth[:samples],
-        )
-
-
-def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows:
+def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
     odometry, observed, sighted, truth, start = (
         _table(place, kind, robot)
         for kind in ("odometry", "observations", "sightings", "truth", "start")
@@ -167,7 +111,9 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
         notes.append("no odometry: only its observations are used")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
-    unnamed = _within(detections_of(place, robot), driven)
+    unnamed = detections_of(place, robot)
+    if unnamed is not None and driven is not None:
+        unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
     teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
@@ -177,25 +123,22 @@ def _robot_rows(robot: str, place: File, clocks: Mapping[str, int]) -> RobotRows
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
     truth_ns, poses, more = rows.truth_of(truth, driven)
     notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
-    return RobotRows(
+    pose = None if start is None else rows.start_of(start)
+    landmarks, mates = together(_with_empty(seen.grouped(), empty_ns), unnamed), teammates.grouped()
+    begins = (np.array(driven or (), np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
+    return RobotStream(
         robot=robot,
-        start=None if start is None else rows.start_of(start),
+        start_ns=int(np.concatenate(begins).min()),
+        start=None if starts_unknown(world, robot) else pose,
         intervals=intervals,
-        seen=seen,
-        empty_ns=empty_ns,
-        teammates=teammates,
-        truth_ns=truth_ns,
-        truth=poses,
+        landmark_detections=landmarks,
+        teammate_detections=mates,
+        teammates=tuple(clocks),
+        truth_ns=truth_ns if len(poses) else None,
+        truth=poses if len(poses) else None,
         notes=tuple(notes),
-        unnamed=unnamed,
+        clock_offset_ns=clocks[robot],
     )
-
-
-def _within(seen: Detections | None, driven: tuple[int, int] | None) -> Detections | None:
-    if seen is None or driven is None:
-        return seen
-    first, last = np.searchsorted(seen.stamps_ns, [driven[0], driven[1] + 1])
-    return seen.only(int(first), int(last))
 
 
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:
@@ -208,23 +151,6 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")
     return table.filled(REQUIRED[kind]) if len(table) else None
-
-
-def _stream(read: RobotRows, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
-    known = len(read.truth) > 0
-    return RobotStream(
-        robot=read.robot,
-        start_ns=read.start_ns,
-        start=None if starts_unknown(world, read.robot) else read.start,
-        intervals=read.intervals,
-        landmark_detections=together(_with_empty(read.seen.grouped(), read.empty_ns), read.unnamed),
-        teammate_detections=read.teammates.grouped(),
-        teammates=tuple(clocks),
-        truth_ns=read.truth_ns if known else None,
-        truth=read.truth if known else None,
-        notes=read.notes,
-        clock_offset_ns=clocks[read.robot],
-    )
 
 
 def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:

@@ -9,7 +9,7 @@ from teamslam.sim.datasets.pyfg import is_pyfg, read_pyfg
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.unlabelled import pieces
 from teamslam.sim.world.config import GraphWorld, starts_unknown
-from teamslam.sim.world.streams import RobotStream, WorldStreams
+from teamslam.sim.world.streams import WorldStreams
 
 EXPECTED = "expected a landmark graph of isam, g2o or pyfg"
 
@@ -31,7 +31,8 @@ def graph_world(world: GraphWorld, robots: int) -> WorldStreams:
     found = streams_of_graph(_read(world.path))
     streams = found.streams
     if world.duration_s is not None:
-        streams = tuple(_until(each, round(world.duration_s * 1e9)) for each in streams)
+        length_ns = round(world.duration_s * 1e9)
+        streams = tuple(each.until(each.start_ns + length_ns) for each in streams)
     if len(streams) == 1 < robots:
         if robots > len(streams[0].intervals.end_ns):
             raise DatasetError(
@@ -55,20 +56,3 @@ def _read(path: str) -> FactorGraph:
     if first is None:
         raise DatasetError(f"{path}: no such file, or not a graph; {EXPECTED}")
     return read_pyfg(Path(path)) if is_pyfg(first) else read_graph(Path(path))
-
-
-def _until(stream: RobotStream, length_ns: int) -> RobotStream:
-    """The beginning of a stream."""
-    end_ns = stream.start_ns + length_ns
-    seen = stream.landmark_detections
-    last = int((seen.stamps_ns <= end_ns).sum())
-    truth_ns, truth = stream.truth_ns, stream.truth
-    if truth_ns is not None and truth is not None:
-        truth_ns, truth = truth_ns[truth_ns <= end_ns], truth[: int((truth_ns <= end_ns).sum())]
-    return replace(
-        stream,
-        intervals=stream.intervals.where(stream.intervals.end_ns <= end_ns),
-        landmark_detections=seen.only(0, last),
-        truth_ns=truth_ns,
-        truth=truth,
-    )

@@ -193,8 +193,12 @@ def inverse_of(line: Line, information: Matrix) -> Matrix:
     return np.asarray(0.5 * (inverse + inverse.T))
 
 
-def turned(covariance: Matrix, theta: float) -> Matrix:
+def turned(
+    covariance: Float[np.ndarray, "*N 3 3"], theta: Float[np.ndarray, "*N"] | float
+) -> Float[np.ndarray, "*N 3 3"]:
     """Covariance of a motion, from the axes of its start to those of its end, turned by theta."""
     c, s = np.cos(theta), np.sin(theta)
-    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R @ covariance @ R.T)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    rows = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=-1)
+    R = rows.reshape(*np.shape(theta), 3, 3)
+    return np.asarray(R @ covariance @ np.swapaxes(R, -1, -2))

@@ -17,6 +17,8 @@ import numpy as np
 from teamslam.sim.datasets.csv_table import CsvTable, read_table
 from teamslam.sim.datasets.detections_table import labels_of, scans_of
 from teamslam.sim.datasets.folder_odometry import pace_notes
+from teamslam.sim.datasets.graph_lines import turned
+from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, matrices, polar_covariances
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import (
@@ -26,11 +28,12 @@ from teamslam.sim.world.streams import (
     RobotStream,
     StartPose,
     WorldStreams,
+    moved,
+    no_detections,
 )
 from teamslam.team.shapes import Float, Int64, UInt32
 
 FILES = ("odometry.csv", "detections.csv")
-COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 CAR = ("t_s", "rear_wheel_speed_m_s", "steering_rad")
 STEPS = ("step", "dx_m", "dy_m", "dtheta_rad")
 STEP_NS = 1_000_000_000
@@ -95,12 +98,11 @@ def _table(root: Path, name: str, *needed: str) -> CsvTable:
 
 def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Columns of odometry.csv and detections.csv, determined by the former."""
-    own = {CAR: CAR[1:], STEPS + COVARIANCE: STEPS}
+    own = {CAR: CAR[1:], STEPS + POSE_COVARIANCE: STEPS}
     form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
     if not any(odometry.has(column) for column in own[form]):
-        raise odometry.fault(
-            f"columns of neither kind; it needs {','.join(CAR)} or {','.join(STEPS + COVARIANCE)}"
-        )
+        needed = " or ".join(",".join(columns) for columns in own)
+        raise odometry.fault(f"columns of neither kind; it needs {needed}")
     return form, POLAR if form == CAR else POINTS
 
 
@@ -119,30 +121,28 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     start_ns = int(intervals.end_ns[0] - intervals.duration_ns[0])
     end_ns = int(intervals.end_ns[-1])
     outside = int(np.sum((seen.stamps_ns < start_ns) | (seen.stamps_ns > end_ns)))
-    if world.duration_s is not None:
-        end_ns = min(end_ns, start_ns + round(world.duration_s * 1e9))
-        intervals = intervals.where(intervals.end_ns <= end_ns)
-        end_ns = int(intervals.end_ns[-1])
-    first, last = np.searchsorted(seen.stamps_ns, [start_ns, end_ns + 1])
-    seen = seen.only(int(first), int(last))
+    seen = seen.within(start_ns, end_ns)
     if world.identities == "known":
         seen = _named(seen)
     gps_ns, gps = _positions(root)
     notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
     if form == CAR:
         notes += pace_notes(intervals.duration_ns)
-    return RobotStream(
+    whole = RobotStream(
         robot="r1",
         start_ns=start_ns,
         start=StartPose(np.zeros(3), None),
         intervals=intervals,
         landmark_detections=seen,
-        teammate_detections=_nothing(),
+        teammate_detections=no_detections(),
         teammates=("r1",),
         notes=tuple(notes),
         positions_ns=gps_ns,
         positions=gps,
     )
+    if world.duration_s is None:
+        return whole
+    return whole.until(start_ns + round(world.duration_s * 1e9))
 
 
 def _of_car(
@@ -175,17 +175,13 @@ def _of_steps(
     if not np.array_equal(steps, np.arange(len(steps))):
         raise odometry.fault("step does not count from 0 by ones")
     ends = (steps + 1) * STEP_NS
-    xx, xy, yy, xt, yt, tt = odometry.numbers(*COVARIANCE).T
-    covariances = np.stack((xx, xy, xt, xy, yy, yt, xt, yt, tt), axis=1).reshape(-1, 3, 3)
-    untold = np.zeros(len(ends))
     increments = odometry.numbers(*STEPS[1:])
-    covariances = _in_the_end(increments, covariances)
-    intervals = Intervals(
-        ends, np.full(len(ends), STEP_NS), untold, untold, False, increments, covariances
-    )
-    points = detections.numbers("x_m", "y_m")
-    own = detections.numbers("c_xx", "c_xy", "c_yy")
-    polar, claimed = _polar(points, own)
+    covariances = turned(matrices(odometry.numbers(*POSE_COVARIANCE)), increments[:, 2])
+    intervals = moved(ends, np.full(len(ends), STEP_NS), increments, covariances)
+    x, y = detections.numbers("x_m", "y_m").T
+    ranges = np.maximum(np.hypot(x, y), 1e-3)
+    polar = np.column_stack((ranges, np.arctan2(y, x)))
+    claimed = polar_covariances(x, y, ranges, detections.numbers("c_xx", "c_xy", "c_yy"))
     stamps = (_steps(detections) + 1) * STEP_NS
     return intervals, scans_of(detections, stamps, *_columns(polar), labels, claimed, None)
 
@@ -196,35 +192,8 @@ def _columns(
     return polar[:, 0].copy(), np.pi - np.remainder(np.pi - polar[:, 1], 2.0 * np.pi)
 
 
-def _in_the_end(
-    increments: Float[np.ndarray, "I 3"], covariances: Float[np.ndarray, "I 3 3"]
-) -> Float[np.ndarray, "I 3 3"]:
-    """Convert covariances of (x, y, theta) in the previous pose's frame to (forward, left, turn) at
-    the end.
-    """
-    c, s = np.cos(increments[:, 2]), np.sin(increments[:, 2])
-    turned = np.zeros((len(increments), 3, 3))
-    turned[:, 0, 0], turned[:, 0, 1], turned[:, 1, 0], turned[:, 1, 1] = c, s, -s, c
-    turned[:, 2, 2] = 1.0
-    return np.asarray(turned @ covariances @ turned.transpose(0, 2, 1))
-
-
 def _steps(table: CsvTable) -> Int64[np.ndarray, " rows"]:
     return table.numbers("step")[:, 0].astype(np.int64)
-
-
-def _polar(
-    points: Float[np.ndarray, "R 2"], covariances: Float[np.ndarray, "R 3"]
-) -> tuple[Float[np.ndarray, "R 2"], Float[np.ndarray, "R 3"]]:
-    """(r, b) of points and J S Jᵀ, J = ∂(r, b)/∂(x, y), as (rr, rb, bb)."""
-    x, y = points.T
-    ranges = np.maximum(np.hypot(x, y), 1e-3)
-    c, s = x / ranges, y / ranges
-    xx, xy, yy = covariances.T
-    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
-    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
-    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (ranges * ranges)
-    return np.column_stack((ranges, np.arctan2(y, x))), np.column_stack((rr, rb, bb))
 
 
 def _named(seen: Detections) -> Detections:
@@ -245,13 +214,6 @@ def _named(seen: Detections) -> Detections:
         covariances=None if seen.covariances is None else seen.covariances[chosen],
         hidden=None,
         signatures=None,
-    )
-
-
-def _nothing() -> Detections:
-    none = np.empty(0)
-    return Detections(
-        none.astype(np.int64), np.zeros(1, np.int64), none.astype(np.uint32), none, none
     )
 
 
@@ -295,8 +257,7 @@ def _piece(
     back = begin_ns - zero_ns
     seen = whole.landmark_detections
     # A scan at an interval's end belongs to it; one at the first start to the first.
-    first, last = np.searchsorted(seen.stamps_ns, [begin_ns + (index > 0), end_ns + 1])
-    mine = seen.only(int(first), int(last))
+    mine = seen.within(begin_ns + (index > 0), end_ns)
     truth_ns, truth = _within(whole.truth_ns, whole.truth, begin_ns, end_ns, back)
     gps_ns, gps = _within(whole.positions_ns, whole.positions, begin_ns, end_ns, back)
     return RobotStream(
@@ -305,7 +266,7 @@ def _piece(
         start=None,
         intervals=replace(own, end_ns=own.end_ns - back),
         landmark_detections=replace(mine, stamps_ns=mine.stamps_ns - back),
-        teammate_detections=_nothing(),
+        teammate_detections=no_detections(),
         teammates=names,
         truth_ns=truth_ns,
         truth=truth,

@@ -6,13 +6,16 @@ Measurements name a *barcode*; `Barcodes.dat` gives its subject: a robot (its nu
 Dropped rows are counted in notes.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.sim.datasets.errata import erratum_of
+from teamslam.sim.datasets.scans import Scans, count_note
 from teamslam.sim.datasets.tables import (
     EXPECTED,
     DatasetError,
@@ -21,18 +24,20 @@ from teamslam.sim.datasets.tables import (
     optional_table,
     table,
 )
-from teamslam.sim.datasets.utias_log import Log, log_of, present_robots
-from teamslam.sim.datasets.utias_rows import start_pose
+from teamslam.sim.datasets.utias_rows import intervals_of, measurements_of, start_pose, truth_of
 from teamslam.sim.world.config import UtiasWorld, starts_unknown
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
-from teamslam.team.shapes import Float, UInt32
+from teamslam.team.shapes import Bool, Float, UInt32
 
 ROBOTS = 5
 """Subjects 1 … 5 are robots, even without files; landmarks follow."""
 
 BARCODES = ("subject", "barcode")
 SURVEY = ("subject", "x [m]", "y [m]", "x std-dev [m]", "y std-dev [m]")
+TRUTH = ("time [s]", "x [m]", "y [m]", "orientation [rad]")
+ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")
+MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 
 
 def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
@@ -69,15 +74,13 @@ def _streams(
     if not len(ids):
         notes.append("no landmark ground truth: the map's error can not be computed")
     delay_ns = round(world.odometry_delay_s * 1e9)
-    logs = [
-        log_of(robot, files, subject_of, delay_ns + offset_ns)
-        for robot, offset_ns in clocks.items()
-    ]
+    read = _Reading(world, files, subject_of, clocks, delay_ns, last_robot)
+    streams = [_stream(robot, read) for robot in clocks]
     if world.duration_s is not None:
-        end_ns = min(log.start_ns for log in logs) + round(world.duration_s * 1e9)
-        logs = [log.until(end_ns) for log in logs]
+        end_ns = min(each.start_ns for each in streams) + round(world.duration_s * 1e9)
+        streams = [each.until(end_ns) for each in streams]
     return WorldStreams(
-        streams=tuple(_stream(log, world, clocks, last_robot) for log in logs),
+        streams=tuple(streams),
         landmark_ids=ids,
         landmarks=positions if len(ids) else None,
         source=f"UTIAS data set {Path(world.path).name}",
@@ -104,48 +107,103 @@ def _landmarks(
     return survey[:, 0].astype(np.uint32), survey[:, 1:3].copy()
 
 
-def _stream(log: Log, world: UtiasWorld, clocks: Mapping[str, int], last_robot: int) -> RobotStream:
-    robots = list(clocks)
-    numbers = np.array([int(robot[1:]) for robot in robots], dtype=np.uint32)
-    log = log.without(log.measurements.ids == log.subject, "of itself")
-    subjects = log.measurements.ids
-    stranger = (subjects <= last_robot) & ~np.isin(subjects, numbers)
-    log = log.without(stranger, "of a robot that is not in the team")
-    seen = log.measurements.where(log.measurements.ids > last_robot)
-    teammates = log.measurements.where(log.measurements.ids <= last_robot)
+class _Reading(NamedTuple):
+    """A data set's files, and the values that all its robots share.
+
+    subject_of: barcode → subject. clocks: offset [ns] of each robot of the team. last_robot: the
+    largest subject of a robot.
+    """
+
+    world: UtiasWorld
+    files: Mapping[str, File]
+    subject_of: Mapping[int, int]
+    clocks: Mapping[str, int]
+    delay_ns: int
+    last_robot: int
+
+
+def present_robots(files: Mapping[str, File]) -> list[int]:
+    """Numbers of the robots with an odometry or measurement file."""
+    matches = (re.fullmatch(r"Robot([1-9]\d*)_(Odometry|Measurement)\.dat", name) for name in files)
+    return sorted({int(match[1]) for match in matches if match})
+
+
+def _subject(robot: str, files: Mapping[str, File]) -> int:
+    """Subject of a robot r1, r2, …; raises DatasetError for one without files."""
+    present = present_robots(files)
+    subject = int(robot[1:]) if re.fullmatch(r"r[1-9]\d*", robot) else 0
+    if subject not in present:
+        known = ", ".join(f"r{number}" for number in present)
+        raise DatasetError(
+            f"the data set has no measurements of a robot {robot}; it has {known}: give "
+            "--robots, or a scenario of its own, such as `teamslam simulate` writes beside it"
+        )
+    return subject
+
+
+def _stream(robot: str, read: _Reading) -> RobotStream:
+    subject = _subject(robot, read.files)
+    odometry, measured, true_rows = (
+        optional_table(read.files, f"Robot{subject}_{name}.dat", columns)
+        for name, columns in (
+            ("Odometry", ODOMETRY), ("Measurement", MEASUREMENT), ("Groundtruth", TRUTH),
+        )
+    )  # fmt: skip
+    intervals, odometry_notes = intervals_of(odometry, read.delay_ns + read.clocks[robot])
+    seen, measurement_notes = measurements_of(measured, read.subject_of)
+    truth_ns, truth, truth_notes = truth_of(true_rows)
+    missing = (
+        "no odometry: only its observations are used" if not len(intervals.end_ns) else "",
+        "no measurements: only its odometry is given" if not len(seen.stamps_ns) else "",
+        "no ground truth: its trajectory's error can not be computed" if not len(truth) else "",
+    )
+    if missing[0] and missing[1]:
+        raise DatasetError(f"robot {robot}: neither odometry nor measurements in its files")
+    notes = [*filter(None, missing), *odometry_notes, *measurement_notes, *truth_notes]
+    start_ns = int(
+        np.concatenate((intervals.end_ns[:1] - intervals.duration_ns[:1], seen.stamps_ns[:1])).min()
+    )
+
+    def keep(chosen: Bool[np.ndarray, " R"], otherwise: str) -> Scans:
+        note = count_note(int(np.count_nonzero(~chosen)), "measurement", f"dropped: {otherwise}")
+        notes.extend([note] if note else [])
+        return seen.where(chosen)
+
+    if len(intervals.end_ns):
+        in_time = seen.stamps_ns <= intervals.end_ns[-1]
+        seen = keep(in_time, "after its last odometry, where its motion is not known")
+    numbers = np.array([int(each[1:]) for each in read.clocks], dtype=np.uint32)
+    seen = keep(seen.ids != subject, "of itself")
+    of_team = (seen.ids > read.last_robot) | np.isin(seen.ids, numbers)
+    seen = keep(of_team, "of a robot that is not in the team")
+    teammates = seen.where(seen.ids <= read.last_robot)
     index = (teammates.ids[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
+    start = start_pose(truth_ns, truth, start_ns)
+    if start is None:
+        notes.append("no ground truth at its first measurement: its start pose is not known")
+    ends = intervals.end_ns[-1:]
+    if len(truth) and len(ends) and ends[0] - truth_ns[-1] > 10**9:
+        seconds = (ends[0] - truth_ns[-1]) * 1e-9
+        notes.append(f"ground truth ends {seconds:.0f} s before the odometry")
     return RobotStream(
-        robot=log.robot,
-        start_ns=log.start_ns,
-        start=_start(world, log),
-        intervals=log.intervals,
-        landmark_detections=seen.grouped(),
+        robot=robot,
+        start_ns=start_ns,
+        start=_start(read.world, robot, start),
+        intervals=intervals,
+        landmark_detections=seen.where(seen.ids > read.last_robot).grouped(),
         teammate_detections=replace(teammates, ids=index).grouped(),
-        teammates=tuple(robots),
-        truth_ns=log.truth_ns if len(log.truth) else None,
-        truth=log.truth if len(log.truth) else None,
-        notes=(*log.notes, *_truth_notes(log)),
-        clock_offset_ns=clocks[log.robot],
+        teammates=tuple(read.clocks),
+        truth_ns=truth_ns if len(truth) else None,
+        truth=truth if len(truth) else None,
+        notes=tuple(notes),
+        clock_offset_ns=read.clocks[robot],
     )
 
 
-def _start(world: UtiasWorld, log: Log) -> StartPose | None:
-    pose = start_pose(log.truth_ns, log.truth, log.start_ns)
-    if pose is None or starts_unknown(world, log.robot):
+def _start(world: UtiasWorld, robot: str, pose: Float[np.ndarray, "3"] | None) -> StartPose | None:
+    if pose is None or starts_unknown(world, robot):
         return None
     if world.start_sigma_m == 0.0:
         return StartPose(pose, None)
     sigmas = np.array([world.start_sigma_m, world.start_sigma_m, world.start_sigma_rad])
     return StartPose(pose, np.diag(sigmas**2))
-
-
-def _truth_notes(log: Log) -> list[str]:
-    """Notes on figures without timely ground truth."""
-    notes = []
-    if start_pose(log.truth_ns, log.truth, log.start_ns) is None:
-        notes.append("no ground truth at its first measurement: its start pose is not known")
-    ends = log.intervals.end_ns[-1:]
-    if len(log.truth) and len(ends) and ends[0] - log.truth_ns[-1] > 10**9:
-        seconds = (ends[0] - log.truth_ns[-1]) * 1e-9
-        notes.append(f"ground truth ends {seconds:.0f} s before the odometry")
-    return notes

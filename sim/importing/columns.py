@@ -11,7 +11,7 @@ import msgspec
 
 from teamslam.sim.datasets import detections_table, folder
 from teamslam.sim.datasets.csv_table import CsvTable
-from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POLAR, POSES
+from teamslam.sim.datasets.folder_tables import DEGREE, POINT_COVARIANCE, POINTS, POLAR, POSES
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 
@@ -74,7 +74,6 @@ SYNONYMS: Mapping[str, str] = {
     "bearing_rad": "bearing bearings beta angle azimuth brg",
 }
 """Column names as words, separated by nothing, a mark or a capital letter."""
-DEGREE = "0.017453292519943295"
 UNITS = {
     "s": "1", "sec": "1", "ms": "1e-3", "msec": "1e-3", "us": "1e-6", "usec": "1e-6", "ns": "1e-9",
     "nsec": "1e-9", "nanos": "1e-9", "m": "1", "mm": "1e-3", "cm": "1e-2", "km": "1e3",

@@ -14,6 +14,7 @@ from teamslam.sim.datasets.folder_tables import (
     POLAR_COVARIANCE,
     POSES,
 )
+from teamslam.sim.datasets.some_rows import polar_covariances
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
 from teamslam.sim.importing.tables import RobotTables
@@ -107,24 +108,18 @@ def _take(
 
 
 def _polar(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
-    """Convert detections from points (ahead, left): r = |p|, β = atan2.
-
-    The covariance is J C Jᵀ with the Jacobian J of (r, β) with respect to the point.
-    """
+    """Convert detections from points (ahead, left) to range and bearing."""
     if not all(name in columns for name in POINTS):
         return columns
     x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)
     r, beta = np.hypot(x, y), np.arctan2(y, x)
     columns |= dict(zip(POLAR, (_texts(r), _texts(beta)), strict=True))
     if all(name in columns for name in POINT_COVARIANCE):
-        xx, xy, yy = (_numbers(columns.pop(name), name, table) for name in POINT_COVARIANCE)
+        packed = [_numbers(columns.pop(name), name, table) for name in POINT_COVARIANCE]
         if (r == 0.0).any():
             raise table.error(int(np.argmax(r == 0.0)), POINTS[0], "a point at the sensor")
-        c, s = x / r, y / r
-        rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
-        rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / r
-        bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (r * r)
-        columns |= dict(zip(POLAR_COVARIANCE, map(_texts, (rr, rb, bb)), strict=True))
+        own = polar_covariances(x, y, r, np.column_stack(packed))
+        columns |= dict(zip(POLAR_COVARIANCE, map(_texts, own.T), strict=True))
     return columns
 
 

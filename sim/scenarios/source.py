@@ -12,8 +12,7 @@ from teamslam.sim.datasets.graph import graph_world
 from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
 from teamslam.sim.datasets.tables import open_data_set
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
-from teamslam.sim.datasets.utias import utias
-from teamslam.sim.datasets.utias_log import present_robots
+from teamslam.sim.datasets.utias import present_robots, utias
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.config import (

@@ -6,7 +6,7 @@ contiguous. So at equal stamps the measurements at the end of an interval come b
 radians, bearings in (−π, π].
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +102,11 @@ class Detections:
     def rows(self, message: int) -> slice:
         """Rows of one message."""
         return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
+
+    def within(self, first_ns: int, last_ns: int) -> "Detections":
+        """Messages stamped first_ns … last_ns."""
+        first, last = np.searchsorted(self.stamps_ns, [first_ns, last_ns + 1])
+        return self.only(int(first), int(last))
 
     def only(self, first: int, last: int) -> "Detections":
         """Messages first … last − 1."""
@@ -218,6 +223,23 @@ class RobotStream:
     def __len__(self) -> int:
         """Number of measurements, including the initial pose."""
         return len(self.kinds)
+
+    def until(self, end_ns: int) -> "RobotStream":
+        """Stream up to the last odometry interval that ends by end_ns, with the truth of it."""
+        intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
+        last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
+        truth_ns, truth = self.truth_ns, self.truth
+        if truth_ns is not None and truth is not None:
+            poses = int(np.searchsorted(truth_ns, end_ns)) + 1
+            truth_ns, truth = truth_ns[:poses], truth[:poses]
+        return replace(
+            self,
+            intervals=intervals,
+            landmark_detections=self.landmark_detections.within(self.start_ns, last_ns),
+            teammate_detections=self.teammate_detections.within(self.start_ns, last_ns),
+            truth_ns=truth_ns,
+            truth=truth,
+        )
 
     def odometry(self, counter: int) -> OdometryMeasurement:
         """Odometry interval of this counter."""
@@ -337,6 +359,12 @@ def grouped(
     first = np.flatnonzero(changes)
     offsets = np.append(first, len(stamps_ns)).astype(np.int64)
     return Detections(stamps_ns[first], offsets, ids, ranges, bearings, points, covariances)
+
+
+def no_detections() -> Detections:
+    """No message."""
+    none = np.empty(0)
+    return grouped(none.astype(np.int64), none.astype(np.uint32), none, none)
 
 
 def moved(
