@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
+from teamslam.sim.calibration.data import Reference, poses_at, seen_landmarks
 from teamslam.sim.calibration.figures import huber
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_quantile
@@ -93,16 +93,12 @@ class _Rows(NamedTuple):
 
 
 def _rows(data: Reference, sensor: Sensor) -> _Rows:
-    seen = data.seen
-    stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-    poses, known = sensor_poses(data, stamps)
-    ranges, bearings = corrected(sensor, seen.ranges, seen.bearings)
-    taken = known & np.isin(seen.ids, np.array(sorted(data.landmarks), dtype=np.int64))
-    taken &= np.isfinite(ranges)  # a depth far from the optical axis has no distance
+    ranges, bearings = corrected(sensor, data.seen.ranges, data.seen.bearings)
+    # A depth far from the optical axis has no distance.
+    taken, _, poses, places = seen_landmarks(data, np.isfinite(ranges))
     ranges, bearings = ranges[taken], bearings[taken]
-    places = np.array([data.landmarks[i] for i in seen.ids[taken].tolist()]).reshape(-1, 2)
-    c, s = np.cos(poses[taken, 2]), np.sin(poses[taken, 2])
-    dx, dy = (places - poses[taken, :2]).T
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy = (places - poses[:, :2]).T
     true = np.column_stack([c * dx + s * dy, c * dy - s * dx])
     points = ranges[:, np.newaxis] * np.column_stack([np.cos(bearings), np.sin(bearings)])
     off = bearings - np.arctan2(true[:, 1], true[:, 0])

@@ -20,7 +20,7 @@ import numpy as np
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.claims import measured_and_true
-from teamslam.sim.calibration.data import Reference, poses_at
+from teamslam.sim.calibration.data import Reference, by_robot, poses_at
 from teamslam.sim.calibration.figures import Figure, huber, jackknife
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team.config import Sensor
@@ -71,12 +71,8 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
 
     A robot that turns on the spot before driving has no speeds to observe τ from.
     """
-    robots: dict[str, list[Reference]] = {}
-    for each in data:
-        if not each.turns_first:
-            robots.setdefault(each.robot, []).append(each)
     found = {}
-    for robot, own in sorted(robots.items()):
+    for robot, own in sorted(by_robot([each for each in data if not each.turns_first]).items()):
         figures = {each.name: each for each in jackknife(_fit_of(sensor), own, UNITS)}
         if len(figures) == len(UNITS):
             found[robot] = Clock(**figures)

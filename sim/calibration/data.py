@@ -1,23 +1,18 @@
 """Calibration data: a robot's measurements, with reference poses and landmarks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
-from teamslam.sim.world.streams import (
-    Detections,
-    Intervals,
-    ObservationMeasurement,
-    OdometryMeasurement,
-    RobotStream,
-    WorldStreams,
-)
-from teamslam.team.config import UNNAMED, MotionModel, RobotConfig
-from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
-from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
+from teamslam.sim.publisher.source import Source
+from teamslam.sim.world.streams import Detections, Intervals, RobotStream, WorldStreams
+from teamslam.team.config import MotionModel, RobotConfig
+from teamslam.team.estimation.odometry import moved, steered
 from teamslam.team.shapes import Bool, Float, Int64
+from teamslam.team.wire import messages as m
 
 LARGEST_TURN_RAD = 0.35
 FASTEST_TURN_RAD_S = 3.0
@@ -53,13 +48,16 @@ class Reference:
     def between(self, begin_ns: int, end_ns: int) -> "Reference":
         """Restrict odometry and measurements to [begin_ns, end_ns)."""
         chosen = (self.intervals.end_ns >= begin_ns) & (self.intervals.end_ns < end_ns)
-        seen, sighted = (_between(each, begin_ns, end_ns) for each in (self.seen, self.sighted))
+        seen, sighted = (each.within(begin_ns, end_ns - 1) for each in (self.seen, self.sighted))
         return replace(self, intervals=self.intervals.where(chosen), seen=seen, sighted=sighted)
 
 
-def _between(seen: Detections, begin_ns: int, end_ns: int) -> Detections:
-    first, last = (int(at) for at in np.searchsorted(seen.stamps_ns, [begin_ns, end_ns]))
-    return seen.only(first, last)
+def by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
+    """References of each robot, robots in the order of their first one."""
+    robots: dict[str, list[Reference]] = {}
+    for each in data:
+        robots.setdefault(each.robot, []).append(each)
+    return robots
 
 
 def sensor_poses(
@@ -75,6 +73,26 @@ def sensor_poses(
     return poses + moved_on, known
 
 
+class SeenLandmarks(NamedTuple):
+    """Detections of known landmarks from known sensor poses; chosen: which detections they are."""
+
+    chosen: Bool[np.ndarray, " N"]
+    stamps_ns: Int64[np.ndarray, " n"]
+    poses: Float[np.ndarray, "n 3"]
+    landmarks: Float[np.ndarray, "n 2"]
+
+
+def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None) -> SeenLandmarks:
+    """Known landmarks among the detections; usable: further condition on a detection."""
+    seen = data.seen
+    stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
+    poses, chosen = sensor_poses(data, stamps)
+    chosen &= np.isin(seen.ids, np.array(sorted(data.landmarks), dtype=np.int64))
+    chosen &= True if usable is None else usable
+    landmarks = np.array([data.landmarks[i] for i in seen.ids[chosen].tolist()]).reshape(-1, 2)
+    return SeenLandmarks(chosen, stamps[chosen], poses[chosen], landmarks)
+
+
 def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
     """Convert odometry of any form to mean speeds; increments as arcs."""
     speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
@@ -88,29 +106,10 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
     return replace(intervals, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)
 
 
-def scan_of(seen: ObservationMeasurement) -> Scan:
-    """Scan as received by the front end: detections without identities carry row numbers, not
-    labels.
-    """
-    ids = seen.ids
-    if seen.hidden:
-        ids = np.arange(UNNAMED, UNNAMED + len(seen.ranges), dtype=np.uint32)
-    if seen.points is not None:
-        return point_scan(ids, seen.points, seen.covariances)
-    return polar_scan(ids, seen.ranges, seen.bearings, seen.covariances)
-
-
-def interval_of(measurement: OdometryMeasurement, motion: MotionModel) -> OdometryInterval:
-    """Odometry interval as received by the front end."""
-    if measurement.increment is not None:
-        motions = moved(measurement.increment, measurement.covariance)
-        rates = motions.twist / (measurement.duration_ns * 1e-9)
-        speeds = float(rates[0]), float(rates[2])
-        return OdometryInterval(measurement.stamp_ns, measurement.duration_ns, *speeds, motions)
-    speeds = measurement.forward, measurement.yaw_rate
-    if measurement.steered:
-        speeds = steered(motion, *speeds)
-    return OdometryInterval(measurement.stamp_ns, measurement.duration_ns, *speeds)
+def messages_of(stream: RobotStream) -> Iterator[m.Measurement]:
+    """Measurements as a robot receives them, without the initial pose; stamps are team time."""
+    source = Source(replace(stream, clock_offset_ns=0))
+    return (source.message(counter) for counter in range(1, len(stream)))
 
 
 def poses_at(

@@ -17,9 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.calibration.figures import Figure, left_out
-from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream
+from teamslam.sim.world.streams import RobotStream
+from teamslam.team import translate
 from teamslam.team.config import AssociationSettings, RobotConfig
 from teamslam.team.estimation.association.certainty import estimate_view
 from teamslam.team.estimation.association.clustering import Clusters, cluster_window
@@ -27,6 +28,7 @@ from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relati
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 from teamslam.team.shapes import Float, Int64
+from teamslam.team.wire import messages as m
 
 LEAST_TRIALS = 50
 LEAST_SEEN = 3
@@ -74,12 +76,11 @@ def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
     segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s)
     window_ns, start_ns = round(front.window_s * 1e9), None
     keyframes, found = [], []
-    for counter in range(1, len(stream)):
-        if stream.kinds[counter] == OBSERVATIONS:
-            measurement = stream.observations(counter)
-            segmenter.observe(measurement.stamp_ns, *scan_of(measurement))
-        elif stream.kinds[counter] == ODOMETRY:
-            interval = interval_of(stream.odometry(counter), config.motion)
+    for message in messages_of(stream):
+        if isinstance(message, m.AnyScan | m.Detections):
+            segmenter.observe(message.stamp_ns, *translate.scan_of(message))
+        elif isinstance(message, m.AnyOdometry):
+            interval = translate.interval_of(message, config)
             if start_ns is None:
                 start_ns = interval.end_ns - interval.duration_ns
                 segmenter.begin(start_ns)

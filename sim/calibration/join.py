@@ -9,17 +9,11 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.central.tick_fold import join_settings
-from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.calibration.figures import CalibrationError
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.streams import (
-    OBSERVATIONS,
-    ODOMETRY,
-    ObservationMeasurement,
-    OdometryMeasurement,
-    RobotStream,
-    WorldStreams,
-)
+from teamslam.sim.world.streams import RobotStream, WorldStreams
+from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
@@ -37,6 +31,7 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float, Int64
+from teamslam.team.wire import messages as m
 
 LONGEST_NS = 250_000_000
 """Longest merged arc interval, since windows close at interval ends."""
@@ -126,9 +121,13 @@ def fold_of(
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:
-    """Configuration of the robot, or the first robot's models for an unknown one."""
+    """Configuration of the robot, or the first robot's models for an unknown one.
+
+    Without its clock's offset: the stamps of streams are team time.
+    """
     configs = {each.id: each for each in scenario.robots}
-    return configs.get(robot) or msgspec.structs.replace(scenario.robots[0], id=robot)
+    own = configs.get(robot, scenario.robots[0])
+    return msgspec.structs.replace(own, id=robot, clock_offset_s=0.0)
 
 
 def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
@@ -136,13 +135,12 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     tracks: list[_Track] = []
     stamps: list[int] = []
     window = slam.window
-    for measurement in _merged(
-        stream, LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
-    ):
-        if isinstance(measurement, ObservationMeasurement):
-            slam.observe(measurement.stamp_ns, scan_of(measurement))
+    longest_ns = LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
+    for message in _merged(stream, longest_ns):
+        if not isinstance(message, m.AnyOdometry):
+            slam.observe(message.stamp_ns, translate.scan_of(message))
             continue
-        closed = slam.drive(interval_of(measurement, config.motion))
+        closed = slam.drive(translate.interval_of(message, config))
         if closed is not None:
             tracks.append(_track(closed, stamps, window))
             stamps = []
@@ -155,40 +153,42 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
 
 def _merged(
     stream: RobotStream, longest_ns: int
-) -> Iterator[ObservationMeasurement | OdometryMeasurement]:
+) -> Iterator[m.AnyScan | m.Detections | m.AnyOdometry]:
     """A stream's scans and odometry, with intervals of one command between scans merged.
 
     Merged intervals are at most longest_ns. A command logged ten times is one arc, and motion noise
     is a density: the estimate is unchanged, up to noise correlation within an interval and window
     closing times.
     """
-    pending: OdometryMeasurement | None = None
-    for counter in range(1, len(stream)):
-        kind = stream.kinds[counter]
-        if kind == ODOMETRY:
-            interval = stream.odometry(counter)
-            if pending is not None and _goes_on(pending, interval, longest_ns):
-                interval = interval._replace(duration_ns=pending.duration_ns + interval.duration_ns)
+    pending: m.AnyOdometry | None = None
+    for message in messages_of(stream):
+        if isinstance(message, m.AnyOdometry):
+            if pending is not None and _goes_on(pending, message, longest_ns):
+                length_ns = pending.duration_ns + message.duration_ns
+                message = msgspec.structs.replace(message, duration_ns=length_ns)
             elif pending is not None:
                 yield pending
-            pending = interval
-        elif kind == OBSERVATIONS:
+            pending = message
+        elif isinstance(message, m.AnyScan | m.Detections):
             if pending is not None:
                 yield pending
             pending = None
-            yield stream.observations(counter)
+            yield message
     if pending is not None:
         yield pending
 
 
-def _goes_on(one: OdometryMeasurement, then: OdometryMeasurement, longest_ns: int) -> bool:
+def _goes_on(one: m.AnyOdometry, then: m.AnyOdometry, longest_ns: int) -> bool:
     """Whether the second interval continues the first by the same command, both being short."""
-    return (
-        then.stamp_ns - then.duration_ns == one.stamp_ns
-        and one.increment is None
-        and (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
-        and one.duration_ns + then.duration_ns <= longest_ns
-    )
+    match one, then:
+        case m.Odometry(), m.Odometry():
+            same = (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
+        case m.Steering(), m.Steering():
+            same = (then.wheel_speed, then.steering) == (one.wheel_speed, one.steering)
+        case _:
+            return False
+    is_next = then.stamp_ns - then.duration_ns == one.stamp_ns
+    return same and is_next and one.duration_ns + then.duration_ns <= longest_ns
 
 
 def _track(closed: ClosedWindow, stamps: Sequence[int], window: Window) -> _Track:

@@ -69,25 +69,20 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
         below |= learnt
         if inner:
             robots = [_without(robot, inner, learnt) for robot in robots]
-    for robot_id, figures in calibration.robots.items():
-        new: Fields = {"id": robot_id}
-        robot = next((each for each in robots if each.get("id") == robot_id), new)
+    own_figures = (*calibration.robots, *calibration.clocks)
+    named = own_figures if "robots" in document else (*own_figures, *calibration.team)
+    if own_figures:
+        known = {robot.get("id") for robot in robots}
+        robots += [{"id": name} for name in dict.fromkeys(named) if name not in known]
+    by_id = {robot.get("id"): robot for robot in robots}
+    for name, figures in calibration.robots.items():
         of_robot = [_rounded(figure) for figure in figures]
-        robot["sensor"] = nest_figures(robot.get("sensor", {}), of_robot, Sensor)
-        if robot is new:
-            robots.append(robot)
-    for robot_id, clock in calibration.clocks.items():
-        comments.append(f"# {robot_id} clock_offset_s: {clock.value:.5g} {_uncertainty(clock)}")
-        entry: Fields = {"id": robot_id}
-        robot = next((each for each in robots if each.get("id") == robot_id), entry)
-        robot["clock_offset_s"] = _rounded(clock).value
-        if robot is entry:
-            robots.append(robot)
-    if robots and "robots" not in document:
-        document.pop("robot_count", None)
-        named = {robot.get("id") for robot in robots}
-        robots += [{"id": robot} for robot in calibration.team if robot not in named]
+        by_id[name]["sensor"] = nest_figures(by_id[name].get("sensor", {}), of_robot, Sensor)
+    for name, clock in calibration.clocks.items():
+        comments.append(f"# {name} clock_offset_s: {clock.value:.5g} {_uncertainty(clock)}")
+        by_id[name]["clock_offset_s"] = _rounded(clock).value
     if robots:
+        document.pop("robot_count", None)
         document["robots"] = robots
     return "\n".join([*_head(calibration, sources), *comments, "", tomli_w.dumps(document)])
 

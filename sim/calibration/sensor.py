@@ -14,7 +14,13 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares, minimize
 
 from teamslam.central.desk.evaluation.errors import on_circle
-from teamslam.sim.calibration.data import Reference, poses_at, sensor_poses
+from teamslam.sim.calibration.data import (
+    Reference,
+    by_robot,
+    poses_at,
+    seen_landmarks,
+    sensor_poses,
+)
 from teamslam.sim.calibration.figures import HUBER, CalibrationError, huber
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import corrected
@@ -68,19 +74,14 @@ class _Rows:
 def _rows(data: Sequence[Reference]) -> _Rows:
     parts = [np.zeros((0, 6))]
     for k, each in enumerate(data):
-        seen = each.seen
-        ids = np.array(sorted(each.landmarks), dtype=np.int64)
-        stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
-        poses, known = sensor_poses(each, stamps)
-        known &= np.isin(seen.ids, ids)
+        seen, (known, stamps, poses, positions) = each.seen, seen_landmarks(each)
         if not known.any():
             continue
-        positions = np.array([each.landmarks[i] for i in seen.ids[known].tolist()])
-        ahead = positions - poses[known, :2]
-        expected = np.arctan2(ahead[:, 1], ahead[:, 0]) - poses[known, 2]
+        ahead = positions - poses[:, :2]
+        expected = np.arctan2(ahead[:, 1], ahead[:, 0]) - poses[:, 2]
         columns = (
             k * 1_000_000.0 + seen.ids[known],
-            (stamps[known] - each.path.stamps_ns[0]) * 1e-9,
+            (stamps - each.path.stamps_ns[0]) * 1e-9,
             seen.ranges[known],
             seen.bearings[known],
             np.hypot(ahead[:, 0], ahead[:, 1]),
@@ -232,7 +233,7 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
     common = constants(data, depth=depth)
     parts = []
     owns: dict[str, Constants] = {}
-    for k, each in enumerate(_by_robot(data).values()):
+    for k, each in enumerate(by_robot(data).values()):
         rows = _rows(each)
         if len(rows.series) < LEAST_MEASUREMENTS:
             continue
@@ -281,13 +282,6 @@ def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
             found[landmark] = float(np.median(share[chosen]))
     mean = float(np.mean(list(found.values()))) if found else 0.0
     return {landmark: value - mean for landmark, value in found.items()}
-
-
-def _by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
-    by_robot: dict[str, list[Reference]] = {}
-    for each in data:
-        by_robot.setdefault(each.robot, []).append(each)
-    return by_robot
 
 
 def _range_noise(

@@ -20,15 +20,17 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.simulator import simulated
-from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, RobotStream, WorldStreams
+from teamslam.sim.world.streams import RobotStream, WorldStreams
+from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.se2 import between, inverse, transformed
+from teamslam.team.wire import messages as m
 
 PROBABILITY = 0.999
 WINDOW_S = 8.0
@@ -142,12 +144,11 @@ CASES: Mapping[str, Case] = {
 def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWindow]:
     """The windows that the robot makes of its stream."""
     slam = HybridSlam(robot, 1)
-    for counter in range(1, len(stream)):
-        if stream.kinds[counter] == OBSERVATIONS:
-            told = stream.observations(counter)
-            slam.observe(told.stamp_ns, scan_of(told))
-        elif stream.kinds[counter] == ODOMETRY:
-            closed = slam.drive(interval_of(stream.odometry(counter), robot.motion))
+    for message in messages_of(stream):
+        if isinstance(message, m.AnyScan | m.Detections):
+            slam.observe(message.stamp_ns, translate.scan_of(message))
+        elif isinstance(message, m.AnyOdometry):
+            closed = slam.drive(translate.interval_of(message, robot))
             if closed is not None:
                 yield closed
 

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from teamslam.sim.calibration.data import interval_of, scan_of
+from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY
-from teamslam.team import core
+from teamslam.team import core, translate
 from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
 from teamslam.team.core import landmarks_along_paths
 from teamslam.team.estimation.hybrid_slam import open_window
@@ -21,6 +20,7 @@ from teamslam.team.estimation.models import Increment, predicted
 from teamslam.team.estimation.scans import unclaimed
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.wire import messages as m
 from tests.trials.general_measurements import CASES, mean_nees
 
 WINDOWS = {1011: 34, 1022: 34, 1074: 21}
@@ -33,12 +33,13 @@ def nees_of_window(seed, sequence):
     config, stream = scenario.robots[0], streams_of(scenario).streams[0]
     slam, start_ns = HybridSlam(config, 1), 12_000_000_000 * sequence
     slam.resume(sequence - 1, 0, start_ns)
-    for counter in np.flatnonzero(stream.stamps_ns > start_ns).tolist():
-        if stream.kinds[counter] == OBSERVATIONS:
-            seen = stream.observations(counter)
-            slam.observe(seen.stamp_ns, scan_of(seen))
-        elif stream.kinds[counter] == ODOMETRY:
-            closed = slam.drive(interval_of(stream.odometry(counter), config.motion))
+    for message in messages_of(stream):
+        if message.stamp_ns <= start_ns:
+            continue
+        if isinstance(message, m.AnyScan):
+            slam.observe(message.stamp_ns, translate.scan_of(message))
+        elif isinstance(message, m.AnyOdometry):
+            closed = slam.drive(translate.interval_of(message, config))
             if closed is not None:
                 break
     at = np.searchsorted(stream.truth_ns, [closed.start_ns, closed.end_ns])

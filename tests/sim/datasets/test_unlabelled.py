@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.sim.calibration.data import scan_of
+from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.calibration.source import measurements_of
 from teamslam.sim.cli.launch import _time_warnings
 from teamslam.sim.cli.main import app
@@ -20,7 +20,9 @@ from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
+from teamslam.team import translate
 from teamslam.team.config import UNNAMED
+from teamslam.team.wire import messages as m
 
 
 def write(folder, **tables):
@@ -67,7 +69,8 @@ def test_calibration_takes_a_set_without_names_and_hears_no_label(steps):
     assert scenario.name == "dlr"
     seen = stream.observations(int(np.flatnonzero(stream.kinds == OBSERVATIONS)[0]))
     assert 3 in seen.ids
-    assert scan_of(seen).ids.tolist() == [UNNAMED, UNNAMED + 1]
+    received = next(each for each in messages_of(stream) if isinstance(each, m.Detections))
+    assert translate.scan_of(received).ids.tolist() == [UNNAMED, UNNAMED + 1]
 
 
 def test_a_set_in_steps_keeps_every_number(steps):
