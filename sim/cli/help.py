@@ -30,37 +30,51 @@ WIDEST = 100
 WIDE = {"max_content_width": WIDEST}
 
 
-class Command(TyperCommand):
-    """Command whose options have sections; its epilog is an example."""
+class _Plain:
+    """Help of a command or group in plain sections; its epilog is an example."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+    def parse_args(self: Any, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words; an unknown option is answered by the closest one."""
-        return _parsed(super().parse_args, self, ctx, args)
+        try:
+            parsed: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
+        except typer.TyperException as error:
+            option = getattr(error, "option_name", None)
+            if option is not None and hasattr(error, "possibilities"):
+                parameters = self.get_params(ctx)
+                known = [name for each in parameters for name in (*each.opts, *each.secondary_opts)]
+                error.message = f"No such option: {option}{close(option, known)}"
+                error.possibilities = None
+            raise
+        return parsed
 
-    def format_options(self, ctx: Any, formatter: Any) -> None:
+    def format_options(self: Any, ctx: Any, formatter: Any) -> None:
         """Write arguments, then the sections of options."""
         _write_parameters(self.get_params(ctx), ctx, formatter)
 
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+    def format_epilog(self: Any, ctx: Any, formatter: Any) -> None:
         """Write the example."""
-        _write_example(self.epilog, formatter)
+        if self.epilog:
+            with formatter.section("Example" if "\n" not in self.epilog else "Examples"):
+                for line in self.epilog.splitlines():
+                    formatter.write(f"{'':{formatter.current_indent}}{line}\n")
 
-    def get_short_help_str(self, limit: int = 0) -> str:
+    def get_short_help_str(self: Any, limit: int = 0) -> str:
         """First sentence of the help, whole."""
-        return _first_sentence(self.short_help or self.help)
+        first = " ".join((self.short_help or self.help or "").split("\n\n")[0].split())
+        return first.removesuffix(".")
 
 
-class Group(TyperGroup):
+class Command(_Plain, TyperCommand):
+    """Command whose options have sections."""
+
+
+class Group(_Plain, TyperGroup):
     """Group of commands, in sections if it is `teamslam` itself."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words; an unknown option is answered by the closest one."""
-        return _parsed(super().parse_args, self, ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the sections of commands, then the options of the group."""
         self.format_commands(ctx, formatter)
-        _write_parameters(self.get_params(ctx), ctx, formatter)
+        super().format_options(ctx, formatter)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write a line per command."""
@@ -73,28 +87,6 @@ class Group(TyperGroup):
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the example."""
-        _write_example(self.epilog, formatter)
-
-    def get_short_help_str(self, limit: int = 0) -> str:
-        """First sentence of the help, whole."""
-        return _first_sentence(self.short_help or self.help)
-
-
-def _parsed(parse: Any, command: Any, ctx: Any, args: list[str]) -> list[str]:
-    try:
-        parsed: list[str] = parse(ctx, args)
-    except typer.TyperException as error:
-        option = getattr(error, "option_name", None)
-        if option is not None and hasattr(error, "possibilities"):
-            known = [name for each in command.get_params(ctx) for name in each.opts]
-            known += [name for each in command.get_params(ctx) for name in each.secondary_opts]
-            error.message = f"No such option: {option}{close(option, known)}"
-            error.possibilities = None
-        raise
-    return parsed
 
 
 def _write_parameters(parameters: Iterable[Any], ctx: Any, formatter: Any) -> None:
@@ -132,15 +124,3 @@ def _named_type(found: re.Match[str]) -> str:
     """Placeholder for a value: `PATH` for `<path>`, choices as they are."""
     text = found[1]
     return text if "|" in text else _TYPES.get(text, text.upper())
-
-
-def _write_example(example: str | None, formatter: Any) -> None:
-    if example:
-        with formatter.section("Example" if "\n" not in example else "Examples"):
-            for line in example.splitlines():
-                formatter.write(f"{'':{formatter.current_indent}}{line}\n")
-
-
-def _first_sentence(text: str | None) -> str:
-    first = " ".join((text or "").split("\n\n")[0].split())
-    return first.removesuffix(".")

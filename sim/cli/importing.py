@@ -13,10 +13,6 @@ from teamslam.sim.cli.help import Command
 from teamslam.sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
 
 app = typer.Typer()
-ROS2_PROFILE = b"ros2"
-BAG_FILES = (".mcap", ".db3")
-HEAD = 64
-"""Bytes that contain an MCAP file's profile."""
 
 
 @app.command(
@@ -90,18 +86,6 @@ def import_(
     typer.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
 
 
-def is_foreign(path: Path) -> bool:
-    """Whether a data set must be imported first: a ROS 2 bag or a log."""
-    return path.suffix in BAG_FILES or _is_bag_folder(path)
-
-
-def _is_bag_folder(path: Path) -> bool:
-    if (path / "metadata.yaml").is_file():
-        return True
-    inside = {each.suffix for each in path.iterdir()} if path.is_dir() else set()
-    return bool(inside) and inside <= {*BAG_FILES}
-
-
 def imported_into(path: Path, folder: Path) -> Path:
     """Import a bag or log and print a summary; returns the folder."""
     from teamslam.sim.importing.source import Request, import_data
@@ -119,27 +103,19 @@ def readable(path: Path) -> Iterator[Path]:
     """Import a ROS 2 bag into a temporary data set; other paths are returned unchanged."""
     from tempfile import TemporaryDirectory
 
+    from teamslam.sim.importing.source import Request, import_data, is_ros2_bag
     from teamslam.team.recording.reader import log_file
 
     if log_file(path).is_file():  # a run's folder, or a file
         path = log_file(path)
-    if not (path.suffix == ".db3" or _is_bag_folder(path) or _is_ros2_mcap(path)):
+    if not is_ros2_bag(path):
         yield path
         return
-    from teamslam.sim.importing.source import Request, import_data
-
     with TemporaryDirectory() as place:
         folder = Path(place) / path.stem
         for note in import_data(Request(sources=[path]), folder).notes:
             typer.echo(note, err=True)
         yield folder
-
-
-def _is_ros2_mcap(path: Path) -> bool:
-    if path.suffix != ".mcap" or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return ROS2_PROFILE in file.read(HEAD)
 
 
 def _as_read(folder: Path) -> list[str]:

@@ -1,6 +1,5 @@
 """Command `teamslam launch`."""
 
-import json
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, replace
@@ -12,7 +11,7 @@ import typer
 
 from teamslam.central.desk.names import data_set_name
 from teamslam.sim.cli.help import NETWORK, RARE, Command
-from teamslam.sim.cli.importing import imported_into, is_foreign
+from teamslam.sim.cli.importing import imported_into
 from teamslam.sim.cli.options import (
     ANY_PORT,
     ASSUMED_NAME,
@@ -43,6 +42,7 @@ from teamslam.sim.cli.options import (
     scenario_for,
     scenario_of,
     set_aside,
+    write_json,
 )
 from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.steps import Steps
@@ -162,9 +162,12 @@ def launch(
     """
     pace = parsed_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
-    if dataset is not None and is_foreign(dataset):
-        output = output or _new_folder(dataset.stem or "bag")
-        dataset = imported_into(dataset, output / (dataset.stem or "bag"))
+    if dataset is not None:
+        from teamslam.team.ros2.bags import is_bag
+
+        if is_bag(dataset):
+            output = output or _new_folder(dataset.stem or "bag")
+            dataset = imported_into(dataset, output / (dataset.stem or "bag"))
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
@@ -326,16 +329,6 @@ def _check_writable(path: Path) -> None:
         fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
 
 
-def _write_whole(path: Path, text: str) -> None:
-    """Write a file atomically."""
-    if path.exists() and not path.is_file():  # such as /dev/stdout
-        path.write_text(text)
-        return
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    part.replace(path)
-
-
 def _new_folder(name: str) -> Path:
     stamp = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
     base = Path("runs") / f"{name}-{stamp}"
@@ -437,7 +430,6 @@ def _conclude(
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
     console.print(f"show  teamslam view {outcome.log}", highlight=False, soft_wrap=True)
-    if json_file is not None:
-        _write_whole(json_file, json.dumps(figures, indent=2) + "\n")
+    write_json(json_file, figures)
     if outcome.failures:
         fail("\n".join(outcome.failures), FAILED)

@@ -222,9 +222,14 @@ def fail(message: str, status: int) -> NoReturn:
 
 
 def write_json(path: Path | None, figures: object) -> None:
-    """Write a command's figures to its --json file, if given."""
-    if path is not None:
-        path.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+    """Write a command's figures to its --json file, if given: a regular file at once."""
+    if path is None:
+        return
+    is_device = path.exists() and not path.is_file()  # such as /dev/stdout
+    part = path if is_device else path.with_name(f".{path.name}.part")
+    part.write_text(json.dumps(figures, indent=2) + "\n", "utf-8")
+    if not is_device:
+        part.replace(path)
 
 
 def refuse_existing(path: Path) -> None:

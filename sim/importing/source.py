@@ -29,8 +29,9 @@ from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.ros2.bags import BagError, is_bag
 from teamslam.team.ros2.topics import TopicsError, load_topics
 
-TEAM_PROFILE = b"teamslam"
+TEAM_PROFILE, ROS2_PROFILE = b"teamslam", b"ros2"
 HEAD = 64
+"""Bytes that contain an MCAP file's profile."""
 MEASURED = ("odometry", "observations", "sightings", "detections")
 
 
@@ -179,10 +180,19 @@ def proposal(path: Path) -> str:
 
 def is_own_log(path: Path) -> bool:
     """Whether a file is a team's log."""
+    return _is_mcap_of(path, TEAM_PROFILE)
+
+
+def is_ros2_bag(path: Path) -> bool:
+    """Whether a path is a bag; an MCAP file is one by its profile."""
+    return is_bag(path) and (path.suffix != ".mcap" or _is_mcap_of(path, ROS2_PROFILE))
+
+
+def _is_mcap_of(path: Path, profile: bytes) -> bool:
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with path.open("rb") as file:
-        return TEAM_PROFILE in file.read(HEAD)
+        return profile in file.read(HEAD)
 
 
 def _log(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:

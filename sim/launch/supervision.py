@@ -35,8 +35,7 @@ LEAVING_S = 60.0
 """After the final map, a process is ended and reported if for this long [s] no other has ended and
 the recorder has received nothing.
 """
-_NODES = {"router": "router", "world": "world", "central": "central"}
-_WITHOUT_IT_NO_MAP = frozenset(_NODES)
+_WITHOUT_IT_NO_MAP = frozenset({"router", "world", "central"})
 
 
 def node_of(name: str) -> str:

@@ -76,20 +76,20 @@ class Child:
     @property
     def is_stopped(self) -> bool:
         """Whether the process is stopped (SIGSTOP), as far as reported."""
-        try:
-            state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
-        except (OSError, IndexError):
-            return False
-        return state in "Tt"
+        return self._state in ("T", "t")
 
     @property
     def is_computing(self) -> bool:
         """Whether the process is running or runnable, as far as reported."""
+        return self._state == "R"
+
+    @property
+    def _state(self) -> str:
+        """State letter of the process on Linux; empty where it is not reported."""
         try:
-            state = (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
+            return (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
         except (OSError, IndexError):
-            return False
-        return state == "R"
+            return ""
 
     def kill(self) -> None:
         """End it at once, even if stopped."""

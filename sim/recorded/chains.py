@@ -13,11 +13,11 @@ from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.team_config import TeamConfig
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor
-from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
+from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from teamslam.team.estimation.models import Increment, noise
-from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.mount import start_of_sensor
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
 from teamslam.team.shapes import Float, Int64, UInt32
@@ -159,7 +159,9 @@ def _chain(
     for measurement in measurements:
         match measurement:
             case m.InitialPose():
-                start = _of_sensor(*translate.pose_of(measurement), np.array(config.sensor.mount))
+                pose, covariance = translate.pose_of(measurement)
+                if pose is not None:
+                    start = start_of_sensor(pose, covariance, np.array(config.sensor.mount))
             case m.Observations() | m.Points():
                 segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
@@ -184,17 +186,6 @@ def _chain(
         scans=tuple(Scan(e.ids, e.ranges, e.bearings, e.own) for e in keyframes),
         sightings=() if grid is None else grid.sightings(),
     )
-
-
-def _of_sensor(
-    pose: Pose | None, covariance: Matrix | None, mount: Pose
-) -> tuple[Pose | None, Matrix | None]:
-    if pose is None or not mount.any():
-        return pose, covariance
-    found = moved_by(
-        PoseGaussian(pose, np.zeros((3, 3)) if covariance is None else covariance), mount
-    )
-    return found.mean, None if covariance is None else found.covariance
 
 
 def _grid(config: RobotConfig) -> PoseGrid | None:

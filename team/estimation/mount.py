@@ -10,7 +10,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.gaussian import PoseGaussian
+from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose, compose, inverse
 
@@ -23,6 +23,15 @@ def of_sensor(step: Increment, mount: Pose) -> Increment:
 def of_base(step: Increment, mount: Pose) -> Increment:
     """Convert a motion of the sensor to the base's, the inverse of `of_sensor`."""
     return of_sensor(step, inverse(mount))
+
+
+def start_of_sensor(
+    pose: Pose, covariance: Matrix | None, mount: Pose
+) -> tuple[Pose, Matrix | None]:
+    """Convert an initial pose of the base to the sensor's; covariance None: exactly known."""
+    known = np.zeros((3, 3)) if covariance is None else covariance
+    found = moved_by(PoseGaussian(pose, known), mount) if mount.any() else PoseGaussian(pose, known)
+    return found.mean, None if covariance is None else found.covariance
 
 
 def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:

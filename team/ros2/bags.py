@@ -87,8 +87,8 @@ def _parts(path: Path) -> list[Path]:
     """The files of a bag whose recorder was killed before it wrote metadata.yaml."""
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
-    files = [each for each in path.iterdir() if each.is_file()]
-    return sorted(files) if all(each.suffix in SUFFIXES for each in files) else []
+    inside = sorted(path.iterdir())
+    return inside if all(each.is_file() and each.suffix in SUFFIXES for each in inside) else []
 
 
 @contextmanager

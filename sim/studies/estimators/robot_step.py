@@ -5,8 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team.config import Sensor
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.se2 import Pose, tangent
 from teamslam.team.shapes import Float, UInt32
 
 
@@ -35,3 +38,13 @@ class RobotStep(NamedTuple):
             bearings=self.bearings[none],
             own=self.own[none],
         )
+
+
+def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
+    """A motion by nothing with the noise of an initial pose N(pose, covariance).
+
+    In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
+    """
+    G = tangent(pose[2])
+    own = dense.product(dense.product(G.T, covariance), G)
+    return Increment(np.zeros(3), 0.5 * (own + own.T))

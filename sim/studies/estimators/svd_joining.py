@@ -175,7 +175,7 @@ def exchanged(
     common = np.isin(ids, a.ids) & np.isin(ids, b.ids)
     from_b = np.where(common, 0.5, np.isin(ids, b.ids))
     in_frame_a, slopes = np.zeros((len(ids), 2)), np.zeros((2 * len(ids), 3))
-    rows = (2 * of_b[:, None] + np.arange(2)).ravel()
+    rows = columns_of(of_b)
     in_frame_a[of_b], slopes[rows] = _moved(a_from_b, b.means)
     means = from_b[:, None] * in_frame_a
     means[of_a] += (1.0 - from_b[of_a])[:, None] * a.means
@@ -218,7 +218,7 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     if len(in_a) < NEEDED:
         raise TooFewPointsError(len(in_a))
     ids = np.union1d(a.ids, b.ids)
-    columns_a, columns_b = (3 + _points(np.searchsorted(ids, each.ids)) for each in (a, b))
+    columns_a, columns_b = (3 + columns_of(np.searchsorted(ids, each.ids)) for each in (a, b))
     a_from_b = procrustes(a.means[in_a], b.means[in_b], np.ones(len(in_a)))
     state = np.zeros(3 + 2 * len(ids))
     state[:3] = a_from_b
@@ -244,7 +244,8 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     )
 
 
-def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+def columns_of(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Columns (x, y) of these landmarks in a joint covariance."""
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 

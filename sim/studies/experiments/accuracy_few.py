@@ -12,14 +12,14 @@ import msgspec
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
-from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,
-    cells_of,
     middle,
     over_seeds,
+    table_of,
     team_task,
 )
 from teamslam.sim.world.config import SimulatedWorld
@@ -58,10 +58,11 @@ def outcome(options: Options, results: Results) -> Outcome:
         figures[name] = few_figures(results.of_all(case))
     judged = [of_case for of_case in figures.values() if "silent" in of_case]
     runs = sum(of_case["seeds"] for of_case in judged)
-    table = Table(
+    table = table_of(
         f"few landmarks, one start known, {options.seed_count}",
-        ("world, landmarks", *(heading for _, heading, _ in SHOWN)),
-        tuple((name, *cells_of(of_case, SHOWN)) for name, of_case in figures.items()),
+        "world, landmarks",
+        figures,
+        SHOWN,
         "warned: maps with a warning; wrong: in another minimum than the truth; silent: wrong, and "
         "without a warning; excluded: the submaps exclude the truth (1 in 1000 by chance); beyond: "
         "the truth is outside the map's own 99.9 % ellipsoid, unwarned: and no warning; alarms: "

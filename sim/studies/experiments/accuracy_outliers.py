@@ -12,15 +12,14 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
-    Table,
     seed_count,
 )
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,
-    cells_of,
     over_seeds,
+    table_of,
     team_task,
 )
 from teamslam.sim.world.config import OutlierKind, SimulatedWorld
@@ -73,15 +72,12 @@ def outcome(options: Options, results: Results) -> Outcome:
             withdrawn = float(of_kind["withdrawn"]) if of_kind["seeds"] else None
             goals.append(Goal(f"{world}, 30 % {NAMES[kind]}: withdrawn", withdrawn, 0.0, 0.0))
         figures[world] = of_world
-    rows = tuple(
-        (f"{world}, {name}", *cells_of(of_kind, SHOWN))
-        for world, of_world in figures.items()
-        for name, of_kind in of_world.items()
-    )
-    table = Table(
+    rows = {f"{w}, {kind}": row for w, of in figures.items() for kind, row in of.items()}
+    table = table_of(
         f"30 % outliers, {seed_count(len(options.seeds[:MOST_SEEDS]))}",
-        ("world", *(heading for _, heading, _ in SHOWN)),
+        "world",
         rows,
+        SHOWN,
         "not joined, withdrawn: runs in which a robot, all of them good, is not in the final map",
     )
     return Outcome("outliers", {"outliers": figures}, (table,), goals=tuple(goals))

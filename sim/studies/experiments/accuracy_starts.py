@@ -7,13 +7,13 @@ After a right merge only the map's position is undetermined, so maps are compare
 import msgspec
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,
-    cells_of,
     over_seeds,
+    table_of,
     team_task,
 )
 from teamslam.team.estimation.consistency import chi2_limit
@@ -43,7 +43,8 @@ def tasks(options: Options) -> list[Task]:
 def outcome(options: Options, results: Results) -> Outcome:
     """Maps with and without known initial poses."""
     figures: dict[str, dict[str, Figures]] = {}
-    rows, goals = [], []
+    rows: dict[str, Figures] = {}
+    goals = []
     for world in WORLDS:
         pairs = [
             (before, after)
@@ -55,15 +56,16 @@ def outcome(options: Options, results: Results) -> Outcome:
         if pairs and known["rmse_aligned"] and unknown["rmse_aligned"]:
             unknown["ratio_known"] = unknown["rmse_aligned"] / known["rmse_aligned"]
         figures[world] = {"known": known, "unknown": unknown}
-        rows += [(f"{world}, {name}", *cells_of(f, SHOWN)) for name, f in figures[world].items()]
+        rows |= {f"{world}, {name}": of_runs for name, of_runs in figures[world].items()}
         goals += [
             Goal(f"{world}, unknown starts: ratio_known", unknown.get("ratio_known"), 0.0, 1.05),
             Goal(f"{world}, unknown starts: wrong_merges", unknown.get("wrong_merges"), 0.0, 0.0),
         ]
-    table = Table(
+    table = table_of(
         f"unknown start poses, {options.seed_count}",
-        ("starts", *(heading for _, heading, _ in SHOWN)),
-        tuple(rows),
+        "starts",
+        rows,
+        SHOWN,
         "ratio: of the aligned maps, to the same seeds with known starts",
     )
     return Outcome("unknown starts", {"starts": figures}, (table,), goals=tuple(goals))

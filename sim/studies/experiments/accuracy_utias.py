@@ -15,11 +15,10 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
-    Table,
     without_datasets,
 )
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, Shown, cells_of, team_task
+from teamslam.sim.studies.experiments.team_runs import Figures, Shown, table_of, team_task
 
 NORMAL_SCALE = (0.8, 1.25)
 """Bounds of the monitor's covariance scale without truth, in units of the profile's
@@ -63,30 +62,21 @@ def outcome(options: Options, results: Results) -> Outcome:
         return Outcome(
             "real data", {"utias": {}}, missing=(without_datasets("figures on real data"),)
         )
-    figures = {
-        dataset.name: set_figures(run)
-        for dataset in options.datasets
-        if (run := results.of(team_on(dataset))) is not None
-    }
-    unknown = {
-        dataset.name: set_figures(run)
-        for dataset in options.datasets
-        if (run := results.of(_unknown_task(dataset))) is not None
-    }
-    rows = tuple((name, *cells_of(of_set, SHOWN)) for name, of_set in figures.items())
-    rows += tuple(
-        (f"{name}, batch", *cells_of(of_set["batch"], SHOWN))
-        for name, of_set in figures.items()
-        if "batch" in of_set
+    figures, unknown = (
+        {
+            dataset.name: set_figures(run)
+            for dataset in options.datasets
+            if (run := results.of(task_on(dataset))) is not None
+        }
+        for task_on in (team_on, _unknown_task)
     )
-    rows += tuple(
-        (f"{name}, one start known", *cells_of(of_set, SHOWN)) for name, of_set in unknown.items()
-    )
-    robots = tuple(
-        (f"{name}, {robot}", *cells_of(of_robot, ROBOT))
+    batches = {f"{name}, batch": s["batch"] for name, s in figures.items() if "batch" in s}
+    rows = figures | batches | {f"{name}, one start known": s for name, s in unknown.items()}
+    robots = {
+        f"{name}, {robot}": of_robot
         for name, of_set in figures.items()
         for robot, of_robot in of_set["robots"].items()
-    )
+    }
     goals = [goal for dataset in options.datasets for goal in _goals(dataset, figures)]
     goals += [
         Goal(f"{name}, one start known: aligned [m]", of_set["aligned"], 0.0, 1.1 * known)
@@ -97,15 +87,16 @@ def outcome(options: Options, results: Results) -> Outcome:
         "real data",
         {"utias": figures, "utias_unknown_starts": unknown},
         (
-            Table(
+            table_of(
                 "UTIAS, five robots, one profile",
-                _heads("set", SHOWN),
+                "set",
                 rows,
+                SHOWN,
                 "landmarks aligned and raw, their NEES as they lie, and per landmark of the shape "
                 "(2 is right); the monitor's covariance scale, 1 is right; paths raw and aligned; "
                 "online poses",
             ),
-            Table("each robot", _heads("robot", ROBOT), robots),
+            table_of("each robot", "robot", robots, ROBOT),
         ),
         goals=tuple(goals),
     )
@@ -148,7 +139,3 @@ def _goals(dataset: Dataset, figures: Mapping[str, Figures]) -> list[Goal]:
         if number in most:
             goals.append(Goal(f"{name}: {figure} [m]", of_set.get(figure), 0.0, most[number]))
     return goals
-
-
-def _heads(first: str, shown: Shown) -> tuple[str, ...]:
-    return (first, *(heading for _, heading, _ in shown))

@@ -20,9 +20,9 @@ from teamslam.sim.studies.experiments.team_runs import (
     OURS,
     Figures,
     Shown,
-    cells_of,
     named,
     over_seeds,
+    table_of,
     team_task,
 )
 from teamslam.team.pairs import PAIRS
@@ -90,7 +90,8 @@ def outcome(options: Options, results: Results) -> Outcome:
         figures = world_figures(runs)
         worlds[world.scenario] = figures
         goals += _goals(world, figures.get(named(*OURS), {}))
-        tables.append(_table(world, figures))
+        seeds = seed_count(figures.get(named(*OURS), {}).get("seeds", 0))
+        tables.append(table_of(f"{world.scenario}, {seeds}", "rule", figures, SHOWN))
     return Outcome("simulated worlds", {"worlds": worlds}, tuple(tables), goals=tuple(goals))
 
 
@@ -146,13 +147,3 @@ def _goals(world: World, figures: Figures) -> list[Goal]:
         Goal(f"{world.scenario}: {name}", figures.get(name), least, most)
         for name, (least, most) in world.goals.items()
     ]
-
-
-def _table(world: World, figures: Mapping[str, Figures]) -> Table:
-    rows = tuple((rule, *cells_of(of_rule, SHOWN)) for rule, of_rule in figures.items())
-    ours = figures.get(named(*OURS), {})
-    return Table(
-        f"{world.scenario}, {seed_count(ours.get('seeds', 0))}",
-        ("rule", *(heading for _, heading, _ in SHOWN)),
-        rows,
-    )

@@ -7,7 +7,6 @@ only in their noise; one parameter is varied at a time.
 
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -18,8 +17,9 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.drawing import figure, ruled
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results
 from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.team_runs import Figures, mean, table_of
 from teamslam.team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
@@ -162,7 +162,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     tables = []
     for axis in AXES:
         of_axis = figures.setdefault(axis, {})
-        rows = []
+        rows: dict[str, Figures] = {}
         for value in _values(axis, options):
             named = _means(results.of_all(_tasks(axis, value, NAMED, options)))
             for system in SYSTEMS:
@@ -170,16 +170,13 @@ def outcome(options: Options, results: Results) -> Outcome:
                 rmse, beside = means.get("rmse"), named.get("rmse")
                 means["ratio"] = rmse / beside if rmse and beside and system == OURS else None
                 of_axis.setdefault(system.name, {})[f"{value:g}"] = means
-                cells = [
-                    "–" if means.get(name) is None else form.format(means[name])
-                    for name, _, form in FIGURES
-                ]
-                rows.append((f"{value:g}: {system.name}", *cells))
+                rows[f"{value:g}: {system.name}"] = means
         tables.append(
-            Table(
+            table_of(
                 f"over {axis}, {options.seed_count}",
-                (axis, *(heading for _, heading, _ in FIGURES)),
-                tuple(rows),
+                axis,
+                rows,
+                FIGURES,
                 "ours and with names: two robots, one map; the others one robot. Wrong: detections "
                 "in a landmark of another label; duplicates: landmarks beyond the first of a "
                 "label. Of shape NEES / 2 1 is right",
@@ -199,11 +196,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def _means(runs: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    means: dict[str, float | None] = {}
-    for name, _, _ in FIGURES:
-        known = [run[name] for run in runs if run.get(name) is not None]
-        means[name] = fmean(known) if known else None
-    return means
+    return {name: mean(run.get(name) for run in runs) for name, _, _ in FIGURES}
 
 
 def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> Picture:

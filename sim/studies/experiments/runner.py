@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -24,7 +24,6 @@ from teamslam.sim.studies.experiments.task import Task
 
 FAILURES = "failures.txt"
 """File with the tracebacks of the last command's failed runs."""
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -131,15 +130,9 @@ def dataset(path: Path) -> Dataset:
     for file in files:
         if file is not path:
             digest.update(f"{file.relative_to(path)}\n".encode())
-        for block in _blocks(file):
-            digest.update(block)
+        with file.open("rb") as opened:
+            hashlib.file_digest(opened, lambda: digest)
     return Dataset(path.stem if path.is_file() else path.name, path.resolve(), digest.hexdigest())
-
-
-def _blocks(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            yield block
 
 
 def cores() -> int:

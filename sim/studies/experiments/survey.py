@@ -16,6 +16,7 @@ from teamslam.sim.studies.experiments.team_runs import (
     cells_of,
     named,
     over_seeds,
+    table_of,
     team_task,
 )
 from teamslam.sim.studies.experiments.xu import with_particles
@@ -87,10 +88,11 @@ def outcome(options: Options, results: Results) -> Outcome:
     figures = {world: _world(world, options, results) for world in WORLDS}
     seeds = seed_count(len(options.seeds[:MOST_SEEDS]))
     tables = [
-        Table(
+        table_of(
             f"{world}, two robots, {seeds}",
-            ("estimator + rule", *(heading for _, heading, _ in SHOWN)),
-            tuple((name, *cells_of(of_pair, SHOWN)) for name, of_pair in of_world.items()),
+            "estimator + rule",
+            of_world,
+            SHOWN,
             "without a fused map the robots' own; pose: online; bytes: from a robot to the centre; "
             "times: of a processor",
         )

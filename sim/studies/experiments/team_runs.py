@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from statistics import fmean, median
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -16,7 +16,7 @@ from teamslam.sim.recorded.chains import BatchReferenceError
 from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
-from teamslam.sim.studies.experiments.experiment import Dataset
+from teamslam.sim.studies.experiments.experiment import Dataset, Table
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.true_minimum import true_minimum
 from teamslam.sim.world.config import SimulatedWorld
@@ -253,14 +253,6 @@ def reference_figures(reference: BatchReference) -> Figures:
     }
 
 
-class Figure(NamedTuple):
-    """A figure over seeds: its name, the run's figure, and the function."""
-
-    name: str
-    source: str
-    over_seeds: Callable[[Iterable[float | None]], float | None]
-
-
 def mean(values: Iterable[float | None]) -> float | None:
     """Mean of the known values."""
     known = [value for value in values if value is not None]
@@ -280,39 +272,34 @@ def rms(values: Iterable[float | None]) -> float | None:
 
 
 OVER_SEEDS = (
-    Figure("rmse", "rmse", rms),
-    Figure("rmse_aligned", "rmse_aligned", rms),
-    Figure("nees", "nees", mean),
-    Figure("nees_median", "nees", middle),
-    Figure("in_band", "in_band", mean),
-    Figure("shape_nees", "shape_nees", mean),
-    Figure("coverage", "coverage", mean),
-    Figure("coverage_raw", "coverage_raw", mean),
-    Figure("cost_per_dof", "cost_per_dof", mean),
-    Figure("covariance_scale", "covariance_scale", mean),
-    Figure("position_rmse", "position_rmse", rms),
-    Figure("position_rmse_aligned", "position_rmse_aligned", rms),
-    Figure("final_pose_nees", "final_pose_nees", mean),
-    Figure("online_position_rmse", "online_position_rmse", rms),
-    Figure("online_position_rmse_aligned", "online_position_rmse_aligned", rms),
-    Figure("online_pose_nees", "online_pose_nees", mean),
-    Figure("bytes_per_step", "bytes_per_step", mean),
-    Figure("each_once", "each_once", mean),
-    Figure("robot_seconds", "robot_seconds", mean),
-    Figure("centre_seconds", "centre_seconds", mean),
-    Figure("seconds_per_step", "seconds_per_step", mean),
-    Figure("seconds_per_fusion", "seconds_per_fusion", mean),
-)
-"""Errors as the root mean square over the seeds, all else as the mean."""
+    "rmse", "rmse_aligned", "nees", "in_band", "shape_nees", "coverage", "coverage_raw",
+    "cost_per_dof", "covariance_scale", "position_rmse", "position_rmse_aligned",
+    "final_pose_nees", "online_position_rmse", "online_position_rmse_aligned", "online_pose_nees",
+    "bytes_per_step", "each_once", "robot_seconds", "centre_seconds", "seconds_per_step",
+    "seconds_per_fusion",
+)  # fmt: skip
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """Figures over several runs, with their number."""
-    return {"seeds": len(runs)} | {
-        figure.name: figure.over_seeds(run.get(figure.source) for run in runs)
-        for figure in OVER_SEEDS
-        if any(figure.source in run for run in runs)
-    }
+    """Figures over several runs, with their number: errors as the root mean square, all else as
+    the mean, NEES as the median, too.
+    """
+    figures: Figures = {"seeds": len(runs)}
+    for name in OVER_SEEDS:
+        if any(name in run for run in runs):
+            average = rms if "rmse" in name else mean
+            figures[name] = average(run.get(name) for run in runs)
+            if name == "nees":
+                figures["nees_median"] = middle(run.get(name) for run in runs)
+    return figures
+
+
+def table_of(
+    title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
+) -> Table:
+    """Table with a row for each named set of figures; first: heading of the names."""
+    rows = tuple((name, *cells_of(of_row, shown)) for name, of_row in figures.items())
+    return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
 
 
 def cells_of(figures: Figures, shown: Shown) -> list[str]:

@@ -18,6 +18,7 @@ from teamslam.sim.studies.estimators import (
 from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
 from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
+from teamslam.sim.studies.estimators.robot_step import uncertain_start
 from teamslam.sim.studies.robots.estimator import KnownMap
 from teamslam.sim.studies.robots.filter import (
     IN_POSE,
@@ -30,12 +31,9 @@ from teamslam.sim.studies.robots.filter import (
 from teamslam.sim.studies.robots.likelihood import with_association
 from teamslam.team import translate
 from teamslam.team.config import Estimator, RobotConfig, Sensor
-from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.se2 import tangent
 from teamslam.team.robot.own_map import InitialPose
 
 
@@ -76,16 +74,9 @@ def _thesis_step(
     generator: np.random.Generator,
 ) -> hybrid_thesis.ThesisState:
     increment, ids, ranges, bearings, _ = step
-    particles = config.front_end.particles
+    count = config.front_end.particles
     return hybrid_thesis.filter_step(
-        state=state,
-        increment=increment,
-        sensor=config.sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        particles=particles,
-        generator=generator,
+        state, increment, config.sensor, ids, ranges, bearings, count, generator
     )
 
 
@@ -133,18 +124,12 @@ def _with_start(
     initial: InitialPose,
     *generator: np.random.Generator,
 ) -> S:
-    """The state at a start N(pose, covariance): a first motion by nothing, with that noise.
-
-    In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
-    """
+    """The state at a start N(pose, covariance)."""
     at = np.zeros(3) if initial.pose is None else initial.pose
     state = initial_state(at)
     if initial.covariance is None:
         return state
-    G = tangent(at[2])
-    own = dense.product(dense.product(G.T, initial.covariance), G)
-    nothing = np.empty(0)
-    still = Increment(np.zeros(3), 0.5 * (own + own.T))
+    still, nothing = uncertain_start(at, initial.covariance), np.empty(0)
     return filter_step(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
 
 
@@ -153,14 +138,7 @@ def _plain_step(
 ) -> PlainFastSlam:
     increment, ids, ranges, bearings, own = step
     return plain_fastslam.filter_step(
-        state=state,
-        increment=increment,
-        sensor=config.sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        generator=generator,
-        own=own,
+        state, increment, config.sensor, ids, ranges, bearings, generator, own
     )
 
 

@@ -21,11 +21,11 @@ from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.scans import Scan, unclaimed
-from teamslam.team.estimation.se2 import Pose, inverse
+from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.rejection import Rejection
@@ -61,7 +61,9 @@ class RunningEstimator:
         self._innovation = NOTHING
         self._unsaid = NOTHING
         self._mount = np.array(config.sensor.mount)
-        start = _of_sensor(initial, self._mount) if config.sensor.is_mounted else initial
+        start = initial
+        if initial.pose is not None:
+            start = InitialPose(*start_of_sensor(initial.pose, initial.covariance, self._mount))
         self._state: Any = self._filter.initial_state(config, start, known, self._generator)
         self.sequence = 0
         self.unsolved = 0
@@ -218,14 +220,6 @@ class RunningEstimator:
     def own_map(self) -> LandmarkGaussian:
         """Landmarks so far."""
         return self._filter.landmarks(self._state)
-
-
-def _of_sensor(initial: InitialPose, mount: Pose) -> InitialPose:
-    covariance = np.zeros((3, 3)) if initial.covariance is None else initial.covariance
-    if initial.pose is None:
-        return initial
-    found = moved_by(PoseGaussian(initial.pose, covariance), mount)
-    return InitialPose(found.mean, None if initial.covariance is None else found.covariance)
 
 
 class AbsorbingEstimator(RunningEstimator):

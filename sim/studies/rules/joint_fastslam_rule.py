@@ -8,21 +8,19 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.sim.studies.estimators import joint_fastslam
 from teamslam.sim.studies.estimators.joint_fastslam import JointFastSlam
-from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.estimators.robot_step import RobotStep, uncertain_start
+from teamslam.sim.studies.robots.running import POSE_FLOOR
 from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
-from teamslam.team.config import RobotConfig
-from teamslam.team.estimation import dense
+from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.randomness import generator
-from teamslam.team.estimation.se2 import Pose, tangent
+from teamslam.team.estimation.se2 import Pose
 from teamslam.team.wire.bus import Outgoing
 
 RESAMPLE_BELOW = 1.0
 """Resamples at every step, as algorithm 1 does."""
-POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a pose's covariance [m², m², rad²], singular for fewer than four different particles."""
 
 
 class JointFastSlamCentre(MeasurementCentre):
@@ -51,7 +49,7 @@ class JointFastSlamCentre(MeasurementCentre):
         particles = self.config.particles
         self._state = joint_fastslam.initial_state(poses, particles, "fastslam1", RESAMPLE_BELOW)
         turns = [
-            _uncertain(name, pose, covariance, self.models[name])
+            _started(name, uncertain_start(pose, covariance), self.models[name].sensor)
             for name, (pose, covariance) in starts.items()
             if covariance is not None
         ]
@@ -81,10 +79,6 @@ class JointFastSlamCentre(MeasurementCentre):
         return MapContent(joint_fastslam.landmark_gaussian(self._state))
 
 
-def _uncertain(robot: str, pose: Pose, covariance: Matrix, config: RobotConfig) -> RobotStep:
-    """An initial pose with this covariance in (x, y, θ): a motion by nothing with its noise."""
-    G = tangent(pose[2])
-    own = dense.product(dense.product(G.T, covariance), G)
+def _started(robot: str, start: Increment, sensor: Sensor) -> RobotStep:
     nothing = np.empty(0)
-    start = Increment(np.zeros(3), 0.5 * (own + own.T))
-    return RobotStep(robot, start, config.sensor, np.empty(0, np.uint32), nothing, nothing)
+    return RobotStep(robot, start, sensor, np.empty(0, np.uint32), nothing, nothing)

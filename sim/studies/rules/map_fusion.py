@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.svd_joining import columns_of
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import (
@@ -123,11 +124,7 @@ def _tried(
 
 def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
-    return _points(in_a), _points(in_b)
-
-
-def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    return (2 * index[:, None] + np.arange(2)).ravel()
+    return columns_of(in_a), columns_of(in_b)
 
 
 def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
@@ -138,7 +135,7 @@ def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
     )
     ids = np.concatenate([np.setdiff1d(a.ids, fused.ids), fused.ids])
     order = np.argsort(ids)
-    place = _points(order)
+    place = columns_of(order)
     return LandmarkGaussian(
         ids[order], mean.reshape(-1, 2)[order], covariance[np.ix_(place, place)]
     )

@@ -20,6 +20,9 @@ from teamslam.team.wire.digest import digest_of
 if TYPE_CHECKING:
     from teamslam.central.desk.verification.recorded import Recorded
 
+Maps = Sequence[m.MapEstimate]
+Starts = Mapping[Stream, m.InitialPose]
+
 
 class NewestMapsCentre(ComparisonCentre):
     """Stores the newest map of every robot, and the streams' initial poses.
@@ -70,14 +73,7 @@ class NewestMapsCentre(ComparisonCentre):
         final = self.fuse(maps, self._starts, self.attendance.now_ns, final=True)
         return [Outgoing(ch.FINAL_MAP, "", final)]
 
-    def fuse(
-        self,
-        maps: Sequence[m.MapEstimate],
-        starts: Mapping[Stream, m.InitialPose],
-        now_ns: int,
-        *,
-        final: bool,
-    ) -> m.FusedMap:
+    def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
         """Fuse these maps."""
         raise NotImplementedError
 
@@ -129,14 +125,7 @@ class LatestCentre(NewestMapsCentre):
         fused = self.fuse(maps, self._starts, self.attendance.now_ns, final=False)
         return [Outgoing(ch.FUSED_MAP, "", fused)]
 
-    def fuse(
-        self,
-        maps: Sequence[m.MapEstimate],
-        starts: Mapping[Stream, m.InitialPose],
-        now_ns: int,
-        *,
-        final: bool,
-    ) -> m.FusedMap:
+    def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
         """Fuse the maps in the team's frame."""
         placed = [each for each in maps if is_placed(each, starts)]
         values = {x.robot: _value(x) for x in placed}
@@ -158,14 +147,7 @@ class LatestCentre(NewestMapsCentre):
 class AloneCentre(NewestMapsCentre):
     """No fusion: a final map for single-robot teams only."""
 
-    def fuse(
-        self,
-        maps: Sequence[m.MapEstimate],
-        starts: Mapping[Stream, m.InitialPose],
-        now_ns: int,
-        *,
-        final: bool,
-    ) -> m.FusedMap:
+    def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
         """The map of a single robot; for several an empty map, with the reason."""
         reason = ""
         if not maps:

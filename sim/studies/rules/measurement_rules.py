@@ -16,7 +16,7 @@ from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyfram
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
-from teamslam.team.estimation.mount import moved_by
+from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.plausible import start_beyond
 from teamslam.team.estimation.se2 import Pose, inverse
 from teamslam.team.wire import channels as ch
@@ -157,21 +157,15 @@ class MeasurementCentre(ComparisonCentre):
         }
         self._start(
             {
-                name: self._sensors_start(name, np.zeros(3) if pose is None else pose, covariance)
+                name: start_of_sensor(
+                    np.zeros(3) if pose is None else pose,
+                    covariance,
+                    np.array(self.models[name].sensor.mount),
+                )
                 for name, (pose, covariance) in known.items()
             }
         )
         return True
-
-    def _sensors_start(
-        self, robot: str, pose: Pose, covariance: Matrix | None
-    ) -> tuple[Pose, Matrix | None]:
-        sensor = self.models[robot].sensor
-        if not sensor.is_mounted:
-            return pose, covariance
-        uncertain = np.zeros((3, 3)) if covariance is None else covariance
-        start = moved_by(PoseGaussian(pose, uncertain), np.array(sensor.mount))
-        return start.mean, None if covariance is None else start.covariance
 
     def _is_placed(self, start: m.InitialPose) -> bool:
         value = translate.start_of(start)

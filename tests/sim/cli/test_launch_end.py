@@ -1,6 +1,7 @@
 """The end of a launch: interruption, full disk, and a router killed as the run ends."""
 
 import errno
+import json
 import os
 from io import StringIO
 
@@ -15,6 +16,7 @@ from teamslam.central.desk.report import page
 from teamslam.central.desk.report.run import Run
 from teamslam.sim.cli import launch
 from teamslam.sim.cli.main import app
+from teamslam.sim.cli.options import write_json
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.launch.launch import Outcome
 from teamslam.sim.scenarios.scenario import dumps
@@ -46,9 +48,9 @@ def test_figures_are_written_whole_or_not_at_all(tmp_path):
     file.write_text("old")
     launch._check_writable(file)
     assert file.read_text() == "old"
-    launch._write_whole(file, "new")
+    write_json(file, {"new": 1})
     assert [each.name for each in tmp_path.iterdir()] == ["figures.json"]
-    assert file.read_text() == "new"
+    assert json.loads(file.read_text()) == {"new": 1}
 
 
 def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_elsewhere(
