@@ -1,6 +1,7 @@
 """The commands `teamslam experiment NAME`: one per entry of the catalogue, `all`, and `merge`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -183,10 +184,22 @@ def _require_joblib() -> None:
         fail(f"experiments need joblib: {install_command('studies')}", WRONG_USE)
 
 
+@contextmanager
+def _stoppable(output: Path) -> Iterator[None]:
+    """Exit with advice where the runs are interrupted, or the scheduler is unusable."""
+    from teamslam.sim.studies.experiments.cases import SchedulerError
+
+    try:
+        yield
+    except SchedulerError as error:
+        fail(str(error), WRONG_USE)
+    except KeyboardInterrupt:
+        fail(f"interrupted; results so far are in {output}: repeat the command to continue", FAILED)
+
+
 def _run_shard(asked: Asked, text: str) -> None:
     _require_joblib()
 
-    from teamslam.sim.studies.experiments.cases import SchedulerError
     from teamslam.sim.studies.experiments.experiment import without_datasets
     from teamslam.sim.studies.experiments.progress import shown
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
@@ -207,15 +220,8 @@ def _run_shard(asked: Asked, text: str) -> None:
     if not tasks:
         fail(without_datasets(asked.name), WRONG_USE)
     part = tasks_of(tasks, shard)
-    try:
+    with _stoppable(asked.output):
         _, failed = compute_runs(part, asked.output, asked.jobs or cores(), shown, asked.scheduler)
-    except SchedulerError as error:
-        fail(str(error), WRONG_USE)
-    except KeyboardInterrupt:
-        fail(
-            f"interrupted; results so far are in {asked.output}: repeat the command to continue",
-            FAILED,
-        )
     study = Study(
         name=asked.name,
         seeds=asked.seeds,
@@ -239,7 +245,6 @@ def _run(asked: Asked) -> None:
 
     _require_joblib()
 
-    from teamslam.sim.studies.experiments.cases import SchedulerError
     from teamslam.sim.studies.experiments.experiment import without_datasets
     from teamslam.sim.studies.experiments.output import printed, to_json, write
     from teamslam.sim.studies.experiments.progress import shown
@@ -252,15 +257,8 @@ def _run(asked: Asked) -> None:
     plans = asked.plans()
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
-    try:
+    with _stoppable(asked.output):
         concluded = computed(plans, asked.output, asked.jobs or cores(), shown, asked.scheduler)
-    except SchedulerError as error:
-        fail(str(error), WRONG_USE)
-    except KeyboardInterrupt:
-        fail(
-            f"interrupted; results so far are in {asked.output}: repeat the command to continue",
-            FAILED,
-        )
     origin = provenance()
     console = Console()
     if not console.is_terminal:

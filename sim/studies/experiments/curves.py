@@ -73,7 +73,7 @@ def curves_run(
     ids, positions = true_landmarks(samples)
     truth = dict(zip(ids.tolist(), positions, strict=True))
     first = scenario.robots[0].id
-    maps = _maps(samples, first)
+    maps = running_maps(samples, first)
     paths = {name: estimated_poses(samples, pose_keys(team, name)) for name in evaluation.robots}
     found: Figures = {
         "poses": {
@@ -163,7 +163,8 @@ def _pose_curve(found: PoseErrors) -> Figures:
     }
 
 
-def _maps(samples: Sequence[Sample], robot: str) -> list[Map]:
+def running_maps(samples: Sequence[Sample], robot: str) -> list[Map]:
+    """Fused maps with landmarks, or else those of the robot."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [

@@ -19,6 +19,7 @@ from teamslam.sim.studies.experiments.curves import (
     estimated_poses,
     messages,
     pose_keys,
+    running_maps,
     short,
     true_landmarks,
 )
@@ -33,7 +34,7 @@ from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
-from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.bus import Sample
 
 FRAME_S = 0.2
 FRAMES = 1400
@@ -156,15 +157,7 @@ def _robot(
 def _map(
     samples: list[Sample], robot: str, truth: Mapping[int, np.ndarray], start_ns: int
 ) -> Figures | None:
-    fused, own = (
-        [
-            each
-            for each in messages(samples, key)
-            if isinstance(each, m.FusedMap | m.MapEstimate) and each.ids
-        ]
-        for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot))
-    )
-    maps = fused or own
+    maps = running_maps(samples, robot)
     if not maps:
         return None
     errors, sigmas = [], []
@@ -189,7 +182,7 @@ def _map(
 def _clouds(samples: list[Sample], robot: str) -> list[list[list[float]]]:
     clouds = [
         floats(message.poses, "poses").reshape(-1, 3)[:, :2].round(3).tolist()
-        for message in (opened(s)[2] for s in samples if s.key == ch.PARTICLES.key(robot))
+        for message in messages(samples, ch.PARTICLES.key(robot))
         if isinstance(message, m.ParticleCloud)
     ]
     every = max(1, len(clouds) // 8)

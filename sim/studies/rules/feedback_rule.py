@@ -19,7 +19,7 @@ from teamslam.sim.studies.rules.map_fusion import (
     kalman,
     kalman_per_axis,
 )
-from teamslam.team import translate
+from teamslam.sim.studies.rules.map_rules import members_of, value_of
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -105,23 +105,16 @@ class RoundsCentre(ComparisonCentre):
         return msgspec.structs.replace(last, final=True, reasons=reasons)
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
-        values = {
-            x.robot: LandmarkGaussian(
-                *translate.landmarks_of(x), translate.landmark_covariance_of(x)
-            )
-            for x in maps
-        }
+        values = {x.robot: value_of(x) for x in maps}
         value, refused = fused_totally(
             RULES[self.config.fusion], values, self.config.bounds.coordinate_m
-        )
-        members = tuple(
-            m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence)
-            for x in maps
         )
         payload = b"".join(x.ids + x.means + x.covariance for x in maps)
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)
-        self._fused = self._message(number, stamp_ns, members, value, payload + previous, refused)
+        self._fused = self._message(
+            number, stamp_ns, members_of(maps), value, payload + previous, refused
+        )
         return Outgoing(ch.FUSED_MAP, "", self._fused)
 
     def _message(

@@ -128,7 +128,7 @@ class LatestCentre(NewestMapsCentre):
     def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
         """Fuse the maps in the team's frame."""
         placed = [each for each in maps if is_placed(each, starts)]
-        values = {x.robot: _value(x) for x in placed}
+        values = {x.robot: value_of(x) for x in placed}
         value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
         away = sorted({x.robot for x in maps} - {x.robot for x in placed})
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
@@ -137,7 +137,7 @@ class LatestCentre(NewestMapsCentre):
             self.config,
             _digest(self.config_digest, placed),
             value,
-            _members(placed),
+            members_of(placed),
             stamp_ns=max((x.stamp_ns for x in placed), default=0),
             final=final,
             reasons=reasons,
@@ -154,13 +154,13 @@ class AloneCentre(NewestMapsCentre):
             reason = "no fusion, and this estimator makes no map"
         elif len(self.robots) != 1:
             reason = "no fusion: each robot has its own map"
-        value = NO_LANDMARKS if reason else _value(maps[0])
+        value = NO_LANDMARKS if reason else value_of(maps[0])
         self.landmarks = len(value.ids)
         return fused_message(
             self.config,
             _digest(self.config_digest, maps),
             value,
-            _members(maps),
+            members_of(maps),
             stamp_ns=max((x.stamp_ns for x in maps), default=now_ns),
             final=True,
             joint=not maps or maps[0].joint,
@@ -178,7 +178,8 @@ def _name(estimate: m.MapEstimate) -> tuple[int, int]:
     return estimate.incarnation, estimate.sequence
 
 
-def _members(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
+def members_of(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
+    """Names of these maps."""
     return tuple(
         m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence) for x in maps
     )
@@ -188,7 +189,8 @@ def _digest(settings: bytes, maps: Sequence[m.MapEstimate]) -> bytes:
     return digest_of(settings, *(x.ids + x.means + x.covariance for x in maps))
 
 
-def _value(estimate: m.MapEstimate) -> LandmarkGaussian:
+def value_of(estimate: m.MapEstimate) -> LandmarkGaussian:
+    """The landmarks of a robot's own map."""
     return LandmarkGaussian(
         *translate.landmarks_of(estimate), translate.landmark_covariance_of(estimate)
     )
