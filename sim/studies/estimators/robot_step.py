@@ -12,6 +12,11 @@ from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, tangent
 from teamslam.team.shapes import Float, UInt32
 
+POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
+"""Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without
+lateral noise, or fewer than four different particles.
+"""
+
 
 class RobotStep(NamedTuple):
     """A robot's motion since its last turn, then its measurements at the end of it.

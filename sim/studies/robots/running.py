@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR
 from teamslam.sim.studies.robots.estimator import Estimates, KnownMap
 from teamslam.sim.studies.robots.filter import Step
 from teamslam.sim.studies.robots.filters import FILTERS
@@ -30,11 +31,6 @@ from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.own_map import Cloud, InitialPose, thin_out
-
-POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without
-lateral noise, or fewer than four different particles.
-"""
 
 
 class RunningEstimator:

@@ -8,8 +8,7 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.sim.studies.estimators import joint_fastslam
 from teamslam.sim.studies.estimators.joint_fastslam import JointFastSlam
-from teamslam.sim.studies.estimators.robot_step import RobotStep, uncertain_start
-from teamslam.sim.studies.robots.running import POSE_FLOOR
+from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep, uncertain_start
 from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
 from teamslam.team.config import Sensor
