@@ -183,18 +183,6 @@ def test_nothing_is_broadcast_before_there_is_anything():
     assert rule().publish_due(float("-inf"), 10**18) == []
 
 
-def test_a_gap_holds_back_the_chain_and_is_listed_as_missing():
-    found = rule()
-    for name, submaps in SUBMAPS.items():
-        for submap in submaps:
-            if (name, submap.sequence) != ("r2", 2):
-                found.store.add_submap(submap)
-    assert found.store.processed(("r2", 1)) == 2
-    fused = final(found)
-    assert fused.missing == build.version(r2=2)
-    assert fused.members == build.version(r1=4, r2=1)
-
-
 def test_a_refused_submap_changes_no_bit_and_says_why():
     found = rule()
     for submap in SUBMAPS.every():

@@ -47,21 +47,6 @@ def test_what_was_appended_is_there_again_and_goes_on(tmp_path):
     assert found.submaps == 4
 
 
-def test_a_torn_or_damaged_end_is_cut_off_and_nothing_before_it(tmp_path):
-    records = [record_of(each) for each in MEMBERS]
-    whole = MAGIC + b"".join(records)
-    before = len(whole) - len(records[-1])
-    for cut in (1, 7, 9, len(records[-1]) - 1):
-        path = tmp_path / f"{cut}.set"
-        assert kept_in(path, whole[: before + cut]) == len(MEMBERS) - 1
-        assert path.read_bytes() == whole[:before]
-    damaged = bytearray(whole)
-    damaged[before + 20] ^= 1
-    assert kept_in(tmp_path / "damaged.set", bytes(damaged)) == len(MEMBERS) - 1
-    assert kept_in(tmp_path / "torn.set", MAGIC[:3]) == 0
-    assert (tmp_path / "torn.set").read_bytes() == MAGIC
-
-
 RECORDS = [record_of(each) for each in MEMBERS]
 WHOLE = MAGIC + b"".join(RECORDS)
 ENDS = [len(MAGIC), *(len(MAGIC) + n for n in accumulate(map(len, RECORDS)))]

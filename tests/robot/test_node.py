@@ -156,14 +156,6 @@ def test_any_order_of_arrival_and_duplicates_give_the_same_submaps(order, again)
     assert payloads(out + node.handle(END, 0)) == lonely()
 
 
-def test_run_twice_everything_it_says_is_equal():
-    one, two = (
-        [encoded(o.message) for o in [*node.begin(), *driven(node, MEASUREMENTS)]]
-        for node in (RobotNode(config()), RobotNode(config()))
-    )
-    assert one == two
-
-
 STREAMS = {
     "observations at the ends of intervals": stream("r1", 11),
     "observations between odometry stamps": stream("r1", 11, off_ns=400_000_000),

@@ -48,14 +48,6 @@ def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
     assert inbox.waiting == 0, "nothing of a past incarnation is kept"
 
 
-def test_a_measurement_waits_until_those_before_it_are_here():
-    inbox = Inbox()
-    inbox.put(measurement(1))
-    assert names(inbox) == []
-    inbox.put(measurement(0))
-    assert names(inbox) == [(0, 0), (0, 1)]
-
-
 def test_who_stops_taking_finds_the_next_measurement_later():
     inbox = Inbox()
     for number in range(3):

@@ -187,7 +187,7 @@ def told_twice(turn):
 
 @pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
 def test_it_is_consistent_and_a_measurement_used_twice_is_found(twice):
-    runs, total, dof = 200, 0.0, 0
+    runs, total, dof = 80, 0.0, 0
     for seed in range(runs):
         rounds, truth = team_run(seed, steps=6)
         turns = [told_twice(turn) if twice else turn for turn in turns_of(rounds)]

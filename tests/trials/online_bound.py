@@ -1,7 +1,5 @@
 """Bound of online poses: the batch estimate of all measurements of the team until then.
 
-    python -m tests.trials.online_bound [SCENARIO …] [--seeds FIRST-LAST]
-
 The batch smoother of all robots' measurements up to t, marginalised to the poses at t, linearised
 at the truth: an extended Kalman filter over all robots' poses and all landmarks whose Jacobians are
 taken at the true state. No delay, no submaps, no error of linearisation: no estimator that has to
@@ -10,17 +8,12 @@ robot's RMSE over this one's says how much of it the estimator owes, and how muc
 Simulated worlds with known initial poses, one noise per second; the models are written again here.
 """
 
-import argparse
-import sys
-from collections.abc import Iterator
-from statistics import fmean, median
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world import streams as s
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
@@ -193,37 +186,3 @@ def longest_s(stamps_ns: np.ndarray, far: np.ndarray) -> float:
         if far_since is not None:
             longest = max(longest, (stamp_ns - far_since) * 1e-9)
     return longest
-
-
-def runs(name: str, seeds: range, silent_s: float) -> Iterator[dict[str, float]]:
-    """The bound's figures of each robot and seed, without the first silent_s."""
-    for seed in seeds:
-        scenario = with_options(load(name), seed=seed)
-        for robot in bounds(scenario, streams_of(scenario)).values():
-            at = robot.stamps_ns[robot.stamps_ns >= silent_s * 1e9]
-            silent = longest_s(robot.stamps_ns, robot.nees_on_arcs() > FAR)
-            yield {"rmse_m": robot.rmse_m(at), "sigma_m": robot.sigma_m(at), "silent_s": silent}
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("scenarios", nargs="*", default=("thesis", "thesis-b"))
-    parser.add_argument("--seeds", default="1000-1019", help="FIRST-LAST, both in it")
-    parser.add_argument("--from-s", type=float, default=24.0, help="when the first prior is there")
-    parser.add_argument("--window-s", type=float, default=12.0, help="how long is silent")
-    told = parser.parse_args()
-    first, _, last = told.seeds.partition("-")
-    for name in told.scenarios:
-        found = list(runs(name, range(int(first), int(last or first) + 1), told.from_s))
-        errors = [each["rmse_m"] for each in found]
-        expected = fmean(each["sigma_m"] ** 2 for each in found) ** 0.5
-        ratio = max(errors) / median(errors)
-        print(f"{name}, seeds {told.seeds}: median {median(errors):.3f} m, worst {max(errors):.3f}")
-        print(f"  worst over median {ratio:.2f}, expected RMSE {expected:.3f} m")
-        silent = [each["silent_s"] for each in found if each["silent_s"] > told.window_s]
-        print(f"  outside their ellipse for longer than a window: {len(silent)} of {len(found)}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

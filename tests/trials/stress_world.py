@@ -1,13 +1,11 @@
 """Write data sets with a known fault, by a generator of its own: it imports nothing of the project.
 
-    python -m tests.trials.stress_world FOLDER --hidden --carried-off r2 15 2.0 150
-    python -m tests.trials.stress_world FOLDER --late r2 0.2
+    write(StressWorld(hidden=True, carried_off=(CarriedOff("r2", 15.0, 2.0, 150.0),)), folder)
 
 Robots drive exact arcs in a square and measure landmarks by range and bearing. A fault changes the
 measurements alone, never the truth. SI units, radians.
 """
 
-import argparse
 import math
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
@@ -280,52 +278,3 @@ def _errors(
 
 def _table(path: Path, head: str, rows: list[str]) -> None:
     path.write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")
-
-
-def main() -> None:
-    """Write one world with the faults that the arguments name."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    for name, of in (("seed", int), ("robots", int), ("landmarks", int), ("seconds", float)):
-        parser.add_argument(f"--{name}", type=of, default=getattr(StressWorld, name))
-    parser.add_argument("--hidden", action="store_true")
-    parser.add_argument("--no-starts", action="store_true")
-    off = ("ROBOT", "METRES", "RADIANS", "AT_S")
-    parser.add_argument("--carried-off", nargs=4, action="append", default=[], metavar=off)
-    parser.add_argument("--late", nargs=2, action="append", default=[], metavar=("ROBOT", "S"))
-    parser.add_argument("--bearing-offset", nargs=2, action="append", default=[])
-    parser.add_argument("--odometry-scale", type=float, default=1.0)
-    parser.add_argument("--moved", nargs=4, action="append", default=[])
-    parser.add_argument("--mirrored", nargs="*", default=[])
-    parser.add_argument("--outliers", type=float, default=0.0)
-    parser.add_argument("--grid", type=int, default=0)
-    parser.add_argument("--clutter", type=int, default=0)
-    parser.add_argument("--same-id", nargs=2, action="append", default=[])
-    given = parser.parse_args()
-    world = StressWorld(
-        seed=given.seed,
-        robots=given.robots,
-        landmarks=given.landmarks,
-        seconds=given.seconds,
-        hidden=given.hidden,
-        starts=not given.no_starts,
-        carried_off=tuple(
-            CarriedOff(r, *(float(each) for each in rest)) for r, *rest in given.carried_off
-        ),
-        late={robot: float(by) for robot, by in given.late},
-        odometry_scale=given.odometry_scale,
-        bearing_offset={robot: float(by) for robot, by in given.bearing_offset},
-        moved=tuple(
-            MovedLandmark(int(i), (float(x), float(y)), float(t)) for i, x, y, t in given.moved
-        ),
-        mirrored=tuple(given.mirrored),
-        outlier_share=given.outliers,
-        grid=given.grid,
-        clutter=given.clutter,
-        same_id=tuple((int(a), int(b)) for a, b in given.same_id),
-    )
-    print(write(world, given.folder))
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,6 @@ from teamslam.central.desk.view.drawn import (
     PATH_POINTS,
     Track,
     centre_particles,
-    landmarks_of,
     place_points,
 )
 from teamslam.central.desk.view.export import export_views, with_views
@@ -35,7 +34,7 @@ from teamslam.team.wire import views
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.codec import decoded
 from tests import build
-from tests.support import fused_map, spd
+from tests.support import fused_map
 
 S = 1_000_000_000
 
@@ -183,20 +182,6 @@ def test_no_robot_hears_a_view(node):
 
 
 # What is drawn.
-
-
-def test_the_blocks_of_a_joint_covariance_are_those_of_the_whole_matrix():
-    P = spd(6)
-    joint = fused_map(
-        joint=True,
-        ids=from_ids([1, 2, 3]),
-        means=from_floats(range(6)),
-        covariance=translate.joint_bytes(P),
-    )
-    blocks = msgspec.structs.replace(
-        joint, joint=False, covariance=translate.block_bytes(translate.blocks_of(P))
-    )
-    np.testing.assert_array_equal(landmarks_of(joint).blocks, landmarks_of(blocks).blocks)
 
 
 def test_a_long_path_keeps_its_ends_and_few_points():

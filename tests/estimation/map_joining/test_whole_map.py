@@ -67,14 +67,6 @@ def test_ids_stay_ascending_when_new_landmarks_lie_between_known_ones():
     assert np.abs(whole.mean[3:].reshape(-1, 2) - world.landmarks[whole.ids]).max() < 2.0
 
 
-def test_joining_leaves_its_inputs_as_they_were():
-    world = team(5, robots=1, submaps=3)
-    before = whole_of(world, 2)
-    bytes_before = before.mean.tobytes(), before.covariance.tobytes()
-    joined(before, world.submaps[2].local)
-    assert (before.mean.tobytes(), before.covariance.tobytes()) == bytes_before
-
-
 def test_absorbing_its_own_marginal_changes_nothing():
     whole = whole_of(team(6, robots=1, submaps=5))
     again = absorbed(whole, whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])

@@ -43,7 +43,7 @@ def drive(seed, steps=20):
     return told, truth
 
 
-def mean_nees(covariance_of, runs=200):
+def mean_nees(covariance_of, runs=80):
     """The mean over runs of ξᵀ C⁻¹ ξ / 3 with truth = mean ∘ Exp(ξ)."""
     total = 0.0
     for seed in range(runs):
@@ -54,7 +54,7 @@ def mean_nees(covariance_of, runs=200):
 
 
 def test_its_covariance_is_true_and_one_that_is_only_added_up_is_not():
-    low, high = chi2_interval(3, 0.999, 200)
+    low, high = chi2_interval(3, 0.999, 80)
     assert low < mean_nees(lambda told: reckoned(told).pose.covariance) < high
     assert not low < mean_nees(added_up) < high
 

@@ -92,7 +92,7 @@ def test_the_full_covariance_is_the_joining_of_the_team():
     assert svd_joining.variance_factor(state) == 1.0
 
 
-def map_nees(weighting, honest, runs=200):
+def map_nees(weighting, honest, runs=80):
     """NEES and dof of the map over many teams; spherical submaps are drawn as they are weighted."""
     values = []
     for seed in range(runs):
@@ -202,7 +202,7 @@ def test_a_mutual_sighting_alone_ties_two_frames(a_from_b, pose_a, pose_b_in_a):
 
 def test_an_exchange_is_consistent_for_spherical_errors_and_not_if_landmarks_count_again():
     honest, twice, dof = [], [], 0
-    for seed in range(200):
+    for seed in range(80):
         (a, b), _, points = two_maps(seed, common=12)
         merged = svd_joining.exchanged(a, b).landmarks
         error = (merged.means - points).ravel()
@@ -258,7 +258,7 @@ def test_the_full_exchange_is_least_squares_in_both_maps_metrics(seed):
 
 def test_a_full_exchange_is_consistent_and_not_if_a_map_is_exchanged_twice():
     honest, twice, dof = 0.0, 0.0, 0
-    for seed in range(200):
+    for seed in range(80):
         (a, b), _, points = full_maps(seed, common=6)
         once = svd_joining.exchanged_fully(a, b).landmarks
         again = svd_joining.exchanged_fully(once, b).landmarks
