@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -30,16 +30,19 @@ from tests.namespaces import NET, ip, network
 from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
 
 PORT = 7447
+ROUTER = f"tcp/{NET}.1:{PORT}"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+Commands = Mapping[str, Sequence[str]]
 
 
 @dataclass
 class Run:
-    """The result of one run; cuts: at [s after the start], whose link, for how long [s]."""
+    """The result of one run; kills and cuts: at [s after the start], who, for how long [s]."""
 
     number: int
+    kills: list[tuple[float, str]] = field(default_factory=list)
     cuts: list[tuple[float, str, float]] = field(default_factory=list)
-    exits: dict[str, int | None] = field(default_factory=dict)
+    exits: dict[str, int] = field(default_factory=dict)
     wall_s: float = 0.0
     equal: bool = False
     check: str = ""
@@ -51,135 +54,198 @@ class Run:
         unnamed = bool(self.lacks) and not self.check
         return self.equal and not unnamed and not any(self.exits.values())
 
-
-def commands(scenario: Path, robots: Sequence[str], speed: str) -> dict[str, list[str]]:
-    there = ["--connect", f"tcp/{NET}.1:{PORT}"]
-    what = str(scenario)
-    found = {
-        "recorder": ["record", what, "--output", "run/log.mcap", *there],
-        "central": ["central", what, *there],
-        "world": ["world", what, "--speed", speed, *there],
-    }
-    return found | {robot: ["robot", what, robot, *there] for robot in robots}
-
-
-def one(number: int, scenario: Path, robots: Sequence[str], expected: bytes, options) -> Run:
-    rng = random.Random(f"{options.seed} {number}")
-    run = Run(number)
-    told = commands(scenario, robots, options.speed)
-    with tempfile.TemporaryDirectory() as place, network(list(told)) as names:
-        folder = Path(place).resolve()
-        (folder / "run").mkdir()
-        started: dict[str, subprocess.Popen[bytes]] = {}
-
-        def start(node: str, arguments: Sequence[str]) -> None:
-            with (folder / "run" / f"{node}.log").open("wb") as said:
-                started[node] = subprocess.Popen(
-                    ["ip", "netns", "exec", names[node], *PROGRAM, *arguments],
-                    cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-                    env={**os.environ, **ONE_THREAD},
-                )  # fmt: skip
-
-        try:
-            start("router", ["router", "--listen", f"tcp/{NET}.1:{PORT}", "--insecure"])
-            await_text(folder / "run" / "router.log", "listening at")
-            for node, arguments in told.items():
-                start(node, arguments)
-            for robot in robots:
-                await_text(folder / "run" / f"{robot}.log", "connected")
-            began = time.monotonic()
-            cut_and_wait(run, names["router"], rng, list(told), started, options)
-            run.wall_s = time.monotonic() - began
-        finally:
-            for node, process in started.items():
-                run.exits[node] = process.poll()
-                if process.poll() is None:
-                    process.send_signal(signal.SIGTERM if node == "router" else signal.SIGKILL)
-                process.wait(20.0)
-            run.exits.pop("router", None)
-        run.exits = {n: 99 if status is None else status for n, status in run.exits.items()}
-        run.equal = final_in(folder) == expected
-        run.lacks = lacking(folder)
-        checked = subprocess.run(
-            [*PROGRAM, "log", "check", "run/log.mcap"],
-            cwd=folder, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
-        if not run.good and options.keep:
-            shutil.copytree(folder, Path(options.keep) / f"run{number}", dirs_exist_ok=True)
-    return run
+    def __str__(self) -> str:
+        cuts = ", ".join(f"{node} at {at:.1f} for {for_s:g}" for at, node, for_s in self.cuts)
+        kills = ", ".join(f"{node} at {at:.1f}" for at, node in self.kills)
+        wrong = {node: status for node, status in self.exits.items() if status}
+        words = [
+            f"{self.number:3} {'good' if self.good else 'BAD '} {self.wall_s:5.1f} s",
+            "map equal" if self.equal else "MAP DIFFERS",
+            f"killed {kills or 'nobody'}",
+            f"cut {cuts or 'nobody'}",
+            *([f"exits {wrong}"] if wrong else []),
+            *([f"log lacks {', '.join(self.lacks)}"] if self.lacks else []),
+            *([f"check: {self.check.splitlines()[0][:120]}"] if self.check else []),
+        ]
+        return "; ".join(words)
 
 
-def cut_and_wait(run: Run, hub: str, rng: random.Random, nodes, started, options) -> None:
-    """Cut links at random moments, mend each, and return when all have ended or time is over."""
-    began = time.monotonic()
-    due = sorted(rng.uniform(0.0, options.span) for _ in range(options.cuts))
+class Team:
+    """The processes of a run, each in its namespace; by node its command and its link's name.
+
+    A driver starts when its robot is connected.
+    """
+
+    def __init__(self, folder: Path, told: Commands, names: Mapping[str, str]) -> None:
+        self.folder, self.names = folder, names
+        router = [*PROGRAM, "router", "--listen", ROUTER, "--insecure"]
+        self.told = {"router": router, **told}
+        self.started: dict[str, subprocess.Popen[bytes]] = {}
+
+    def begin(self) -> None:
+        """Start all processes."""
+        self.start("router")
+        await_text(self.folder / "run" / "router.log", "listening at")
+        drivers = [node for node in self.told if node.startswith("driver-")]
+        for node in self.told:
+            if node != "router" and node not in drivers:
+                self.start(node)
+        for robot in (node for node, words in self.told.items() if "robot" in words):
+            await_text(self.folder / "run" / f"{robot}.log", "connected")
+        for node in drivers:
+            self.start(node)
+
+    def start(self, node: str) -> None:
+        """Start it, or start it again."""
+        with (self.folder / "run" / f"{node}.log").open("ab") as said:
+            self.started[node] = subprocess.Popen(
+                ["ip", "netns", "exec", self.names[link_of(node)], *self.told[node]],
+                cwd=self.folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+                env={**os.environ, **ONE_THREAD},
+            )  # fmt: skip
+
+    def restart(self, node: str) -> None:
+        """Kill it and start it again; `ip netns exec` has become the process itself."""
+        self.started[node].kill()
+        self.started[node].wait()
+        self.start(node)
+
+    def is_alive(self, node: str) -> bool:
+        return self.started[node].poll() is None
+
+    def stop(self) -> dict[str, int]:
+        """End what is left; how each had ended by itself, 99 where it had not."""
+        found = {node: process.poll() for node, process in self.started.items()}
+        for node, process in self.started.items():
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM if node == "router" else signal.SIGKILL)
+            process.wait(20.0)
+        found.pop("router", None)
+        return {node: 99 if status is None else status for node, status in found.items()}
+
+
+def link_of(node: str) -> str:
+    """The name of a process's link at the bridge: 15 letters at most."""
+    return node.replace("driver", "d")
+
+
+def disturb(run: Run, team: Team, mortal: Sequence[str], options: argparse.Namespace) -> None:
+    """Kill and cut at random moments; return when all have ended or time is over."""
+    rng = random.Random(f"{options.seed} {run.number}")
+    moments = [(rng.uniform(0.0, options.span), "kill") for _ in range(options.kills)]
+    moments += [(rng.uniform(0.0, options.span), "cut") for _ in range(options.cuts)]
+    moments.sort()
+    nodes = [node for node in team.started if node != "router"]
+    hub = team.names["router"]
     mends: list[tuple[float, str]] = []
-    while time.monotonic() - began < options.timeout:
-        at = time.monotonic() - began
-        whole = [node for node in nodes if node not in {cut for _, cut in mends}]
-        if due and at >= due[0] and whole:
-            due.pop(0)
-            node = rng.choice(whole)
-            for_s = rng.choice([0.3, 1.0, 3.0, options.longest])
-            ip("-n", hub, "link", "set", node, "down")
-            mends.append((at + for_s, node))
-            run.cuts.append((round(at, 1), node, for_s))
+    began = time.monotonic()
+    while (at := time.monotonic() - began) < options.timeout:
+        if moments and at >= moments[0][0]:
+            _, what = moments.pop(0)
+            alive = [node for node in mortal if team.is_alive(node)]
+            whole = [node for node in nodes if node not in {cut for _, cut in mends}]
+            if what == "kill" and alive:
+                node = rng.choice(alive)
+                team.restart(node)
+                run.kills.append((round(at, 1), node))
+            elif what == "cut" and whole:
+                node, for_s = rng.choice(whole), rng.choice([0.3, 1.0, 3.0, options.longest])
+                ip("-n", hub, "link", "set", link_of(node), "down")
+                mends.append((at + for_s, node))
+                run.cuts.append((round(at, 1), node, for_s))
         for until, node in [mend for mend in mends if at >= mend[0]]:
             mends.remove((until, node))
-            ip("-n", hub, "link", "set", node, "up")
-        if not any(started[node].poll() is None for node in nodes):
+            ip("-n", hub, "link", "set", link_of(node), "up")
+        if not any(map(team.is_alive, nodes)):
             return
         time.sleep(0.02)
 
 
-def row(run: Run) -> str:
-    cuts = ", ".join(f"{node} at {at:.1f} for {for_s:g}" for at, node, for_s in run.cuts)
-    wrong = {node: status for node, status in run.exits.items() if status}
-    words = [
-        f"{run.number:3} {'good' if run.good else 'BAD '} {run.wall_s:5.1f} s",
-        "map equal" if run.equal else "MAP DIFFERS",
-        f"cut {cuts or 'nobody'}",
-        *([f"exits {wrong}"] if wrong else []),
-        *([f"log lacks {', '.join(run.lacks)}"] if run.lacks else []),
-        *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
-    ]
-    return "; ".join(words)
+def play(
+    number: int,
+    folder: Path,
+    told: Commands,
+    expected: bytes,
+    options: argparse.Namespace,
+    mortal: Sequence[str] = (),
+) -> Run:
+    """A team from its first process to its final map; mortal: the nodes that may be killed."""
+    run = Run(number)
+    (folder / "run").mkdir()
+    with network([link_of(node) for node in told]) as names:
+        team = Team(folder, told, names)
+        try:
+            team.begin()
+            began = time.monotonic()
+            disturb(run, team, mortal, options)
+            run.wall_s = time.monotonic() - began
+        finally:
+            run.exits = team.stop()
+    run.equal = final_in(folder) == expected
+    run.lacks = lacking(folder)
+    checked = subprocess.run(
+        [*PROGRAM, "log", "check", "run/log.mcap"],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
+    if not run.good and options.keep:
+        shutil.copytree(folder, Path(options.keep) / f"run{number}", dirs_exist_ok=True)
+    return run
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def options_of(description: str, kills: int) -> argparse.ArgumentParser:
+    """The options that trials with cut links share."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--kills", type=int, default=kills, help="in each run")
     parser.add_argument("--cuts", type=int, default=5, help="in each run")
     parser.add_argument("--longest", type=float, default=12.0, help="seconds of the longest cut")
-    parser.add_argument("--span", type=float, default=12.0, help="seconds in which they begin")
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--speed", default="4")
     parser.add_argument("--seed", default="1")
-    parser.add_argument("--timeout", type=float, default=300.0)
+    parser.add_argument("--timeout", type=float, default=600.0)
     parser.add_argument("--keep", help="keep the folders of runs that went wrong here")
     parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place:
-        scenario = shortened(Path(place), options.steps)
-        resolved = load(scenario)
-        expected = expected_of(resolved)
-        robots = [robot.id for robot in resolved.robots]
-        runs = []
-        if options.json and options.json.exists():
-            runs = [Run(**row) for row in json.loads(options.json.read_text())]
-        for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
-            runs.append(one(number, scenario, robots, expected, options))
-            print(row(runs[-1]), flush=True)
-            if options.json:
-                options.json.write_text(json.dumps([asdict(run) for run in runs]))
-    good, cuts = sum(run.good for run in runs), sum(len(run.cuts) for run in runs)
+    return parser
+
+
+def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> int:
+    """Make the runs that the file does not have, print them and the totals; the exit status."""
+    runs = []
+    if options.json and options.json.exists():
+        runs = [Run(**row) for row in json.loads(options.json.read_text())]
+    for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
+        with tempfile.TemporaryDirectory() as place:
+            runs.append(one(number, Path(place).resolve()))
+        print(runs[-1], flush=True)
+        if options.json:
+            options.json.write_text(json.dumps([asdict(run) for run in runs]))
+    good = sum(run.good for run in runs)
+    kills, cuts = (sum(len(getattr(run, what)) for run in runs) for what in ("kills", "cuts"))
     print(
-        f"{good} of {len(runs)} runs good, {cuts} links cut; map equal in "
-        f"{sum(r.equal for r in runs)}, log whole in {sum(not r.lacks for r in runs)}; "
+        f"{good} of {len(runs)} runs good, {kills} processes killed, {cuts} links cut; map equal "
+        f"in {sum(r.equal for r in runs)}, log whole in {sum(not r.lacks for r in runs)}; "
         f"load {os.getloadavg()[0]:.1f}"
     )
     return 0 if good == len(runs) else 1
+
+
+def main() -> int:
+    parser = options_of(__doc__, kills=0)
+    parser.add_argument("--span", type=float, default=12.0, help="seconds in which cuts begin")
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--speed", default="4")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place:
+        what = str(shortened(Path(place), options.steps))
+        resolved = load(what)
+        expected = expected_of(resolved)
+        there = ["--connect", ROUTER]
+        told = {
+            "recorder": [*PROGRAM, "record", what, "--output", "run/log.mcap", *there],
+            "central": [*PROGRAM, "central", what, *there],
+            "world": [*PROGRAM, "world", what, "--speed", options.speed, *there],
+            **{each.id: [*PROGRAM, "robot", what, each.id, *there] for each in resolved.robots},
+        }
+        return play_all(lambda number, at: play(number, at, told, expected, options), options)
 
 
 if __name__ == "__main__":
