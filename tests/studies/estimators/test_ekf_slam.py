@@ -178,7 +178,7 @@ def short_run(seed, repeat):
 
 @pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
 def test_a_short_window_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
-    honest, twice = (np.array([short_run(seed, k) for seed in range(80)]) for k in (1, 2))
+    honest, twice = (np.array([short_run(seed, k) for seed in range(200)]) for k in (1, 2))
     for runs, is_right in ((honest, True), (twice, False)):
         dof = runs[:, column + 1].sum()
         low, high = chi2_interval(int(dof), 0.999, 1)

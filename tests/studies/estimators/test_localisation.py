@@ -146,7 +146,7 @@ def short_run(seed, repeat):
 @pytest.mark.parametrize("column", [0, 2], ids=["NEES", "NIS"])
 def test_it_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
     for repeat in (1, 2):
-        runs = np.array([short_run(seed, repeat) for seed in range(80)])
+        runs = np.array([short_run(seed, repeat) for seed in range(200)])
         dof = runs[:, column + 1].sum()
         low, high = chi2_interval(int(dof), 0.999, 1)
         assert (low < runs[:, column].sum() / dof < high) == (repeat == 1)
