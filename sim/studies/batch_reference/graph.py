@@ -38,6 +38,15 @@ def load_gtsam() -> Any:
     return gtsam
 
 
+def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
+    """Levenberg-Marquardt to the last digits that GTSAM's costs have."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(iterations)
+    parameters.setRelativeErrorTol(1e-13)
+    parameters.setAbsoluteErrorTol(1e-11)
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters)
+
+
 def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
     """A linear graph's Newton step, and its length in standard deviations."""
     step = linear.optimize()

@@ -19,6 +19,7 @@ from teamslam.sim.studies.batch_reference.graph import (
     FLOOR_SIGMAS,
     load_gtsam,
     newton_step,
+    optimizer_of,
     start_factor,
     under_loss,
 )
@@ -205,12 +206,7 @@ def _descended(
     batch: GrowingBatch, scale: float | None, iterations: int
 ) -> tuple[GrowingBatch, int]:
     gtsam = load_gtsam()
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(iterations)
-    parameters.setRelativeErrorTol(1e-13)
-    parameters.setAbsoluteErrorTol(1e-11)
-    graph = batch.graph(scale)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, batch.values, parameters)
+    optimizer = optimizer_of(gtsam, batch.graph(scale), batch.values, iterations)
     try:
         values = optimizer.optimize()
     except RuntimeError as error:

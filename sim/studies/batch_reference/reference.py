@@ -46,6 +46,7 @@ from teamslam.sim.studies.batch_reference.graph import (
     landmark_starts,
     load_gtsam,
     newton_step,
+    optimizer_of,
     pose_key,
     values_of,
 )
@@ -226,11 +227,7 @@ def _gtsam() -> Any:
 
 
 def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(ITERATIONS)
-    parameters.setRelativeErrorTol(1e-13)
-    parameters.setAbsoluteErrorTol(1e-11)
-    return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
+    return optimizer_of(gtsam, graph, initial, ITERATIONS).optimize()
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:

@@ -8,8 +8,6 @@ right minimum. A wrong map without a warning is silent. An alarm is a warning of
 more than a large or nonlinear covariance.
 """
 
-import msgspec
-
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
 from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
@@ -21,8 +19,9 @@ from teamslam.sim.studies.experiments.team_runs import (
     over_seeds,
     table_of,
     team_task,
+    with_robots,
+    with_world,
 )
-from teamslam.sim.world.config import SimulatedWorld
 from teamslam.team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")
@@ -141,13 +140,5 @@ def _cases(options: Options) -> dict[str, list[Task]]:
 
 
 def _few(scenario: Scenario, count: int, seen: bool) -> Scenario:
-    assert isinstance(scenario.world, SimulatedWorld)
-    world = msgspec.structs.replace(scenario.world, landmarks=(), landmark_count=count)
-    node_s = SEEN_EVERY_S if seen else 0.0
-    robots = tuple(
-        msgspec.structs.replace(
-            robot, front_end=msgspec.structs.replace(robot.front_end, node_s=node_s)
-        )
-        for robot in scenario.robots
-    )
-    return unknown_starts(msgspec.structs.replace(scenario, world=world, robots=robots))
+    few = with_world(unknown_starts(scenario), landmarks=(), landmark_count=count)
+    return with_robots(few, "front_end", node_s=SEEN_EVERY_S if seen else 0.0)

@@ -21,8 +21,9 @@ from teamslam.sim.studies.experiments.team_runs import (
     over_seeds,
     table_of,
     team_task,
+    with_world,
 )
-from teamslam.sim.world.config import OutlierKind, SimulatedWorld
+from teamslam.sim.world.config import OutlierKind
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
@@ -92,10 +93,6 @@ def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
 
 def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
     """The scenario with outliers, and a centre that requires two submaps of a landmark."""
-    replace = msgspec.structs.replace
-    assert isinstance(scenario.world, SimulatedWorld)
-    return replace(
-        scenario,
-        world=replace(scenario.world, outlier_share=SHARE, outlier_kind=kind),
-        central=replace(scenario.central, landmark_submaps=LANDMARK_SUBMAPS),
-    )
+    central = msgspec.structs.replace(scenario.central, landmark_submaps=LANDMARK_SUBMAPS)
+    spoilt = with_world(scenario, outlier_share=SHARE, outlier_kind=kind)
+    return msgspec.structs.replace(spoilt, central=central)

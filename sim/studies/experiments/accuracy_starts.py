@@ -4,8 +4,6 @@ A merge is wrong where the first pose of a robot that joined lies outside its ow
 After a right merge only the map's position is undetermined, so maps are compared after alignment.
 """
 
-import msgspec
-
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
 from teamslam.sim.studies.experiments.task import Task
@@ -15,6 +13,7 @@ from teamslam.sim.studies.experiments.team_runs import (
     over_seeds,
     table_of,
     team_task,
+    with_world,
 )
 from teamslam.team.estimation.consistency import chi2_limit
 
@@ -86,9 +85,7 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
 
 def unknown_starts(scenario: Scenario) -> Scenario:
     """The scenario with the first robot's initial pose only."""
-    names = tuple(robot.id for robot in scenario.robots[1:])
-    world = msgspec.structs.replace(scenario.world, unknown_starts=names)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, unknown_starts=tuple(robot.id for robot in scenario.robots[1:]))
 
 
 def _merges(runs: list[Figures]) -> Figures:

@@ -19,7 +19,13 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.drawing import figure, ruled
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, mean, table_of
+from teamslam.sim.studies.experiments.team_runs import (
+    Figures,
+    mean,
+    table_of,
+    with_robots,
+    with_world,
+)
 from teamslam.team.config import Estimator, FusionRule
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
@@ -122,8 +128,8 @@ def association_run(
     scenario = load("waypoints")
     error_m = SPACING_M / ratio
     sensor = {"range_sigma": 0.6 * error_m, "bearing_sigma": 0.8 * error_m / VIEW_M}
-    world = msgspec.structs.replace(
-        scenario.world,
+    scenario = with_world(
+        msgspec.structs.replace(scenario, robots=scenario.robots[:1]),
         size_m=SIZE_M,
         landmark_count=LANDMARKS,
         visible_to_m=VIEW_M,
@@ -131,13 +137,8 @@ def association_run(
         clutter=clutter,
         missed=missed,
     )
-    robots = tuple(
-        msgspec.structs.replace(each, sensor=msgspec.structs.replace(each.sensor, **sensor))
-        for each in scenario.robots[:1]
-    )
-    scenario = msgspec.structs.replace(scenario, world=world, robots=robots)
     scenario = with_options(
-        scenario,
+        with_robots(scenario, "sensor", **sensor),
         seed=seed,
         robots=1 if alone else 2,
         estimator=estimator,

@@ -31,6 +31,7 @@ from teamslam.sim.studies.experiments.downs_simulated import (
     SimulatedTable,
     paired_test,
     sample_picture,
+    t_test_table,
 )
 from teamslam.sim.studies.experiments.drawing import figure, ruled
 from teamslam.sim.studies.experiments.experiment import (
@@ -44,8 +45,7 @@ from teamslam.sim.studies.experiments.experiment import (
     without_datasets,
 )
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, team_task
-from teamslam.sim.world.config import UtiasWorld
+from teamslam.sim.studies.experiments.team_runs import Figures, team_task, with_world
 
 Row = tuple[float | None, ...]
 """Errors [m] of robots 1 … 5, or of the team alone."""
@@ -210,10 +210,7 @@ class PrintedTable(NamedTuple):
 
 def _profile(options: Options) -> Scenario:
     scenario = load("utias")
-    if not options.quick or not isinstance(scenario.world, UtiasWorld):
-        return scenario
-    world = msgspec.structs.replace(scenario.world, duration_s=QUICK_S)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, duration_s=QUICK_S) if options.quick else scenario
 
 
 def _ekf(options: Options, dataset: Dataset, *, his: bool) -> Task:
@@ -301,18 +298,10 @@ def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
 
 def _test_table(compared: Compared | None, tests: Mapping[str, Figures]) -> Table:
     text, printed = ("", 0.0) if compared is None else (compared.text, compared.printed_p)
-    rows = [
-        (
-            name, str(test["pairs"]),
-            *("–" if test[key] is None else f"{test[key]:.3g}"
-              for key in ("mean_before_m", "mean_after_m", "p")),
-        )
-        for name, test in tests.items()
-    ]  # fmt: skip
-    return Table(
+    return t_test_table(
         f"paired t-test, {text}",
-        ("figures", "pairs", "mean before [m]", "mean after [m]", "p"),
-        tuple(rows),
+        "figures",
+        tests,
         f"the text prints p = {printed:g}; two-sided, scipy.stats.ttest_rel",
     )
 

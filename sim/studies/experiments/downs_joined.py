@@ -30,7 +30,13 @@ from teamslam.sim.studies.estimators.svd_joining import (
 from teamslam.sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
 from teamslam.sim.studies.experiments.experiment import Dataset
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, expected_s
+from teamslam.sim.studies.experiments.team_runs import (
+    Figures,
+    expected_s,
+    scenario_task,
+    with_robots,
+    with_world,
+)
 from teamslam.sim.studies.rules.svd_rule import tied
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
@@ -65,24 +71,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
     """
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
-    robots = tuple(
-        change(
-            robot,
-            front_end=change(
-                robot.front_end, window_s=STEP_S, window_m=0.0, keyframe_s=STEP_S, node_s=0.0,
-                biases=(),
-            ),
-        )
-        for robot in scenario.robots
-    )  # fmt: skip
-    central = change(
-        scenario.central, tick_s=NEVER_S, covariance_factor=1.0,
-        withdraw_above=None,
-    )  # fmt: skip
-    world = scenario.world
-    if isinstance(world, UtiasWorld):
-        world = change(world, start_sigma_m=0.0, start_sigma_rad=0.0)
-    return change(scenario, robots=robots, central=central, world=world)
+    if isinstance(scenario.world, UtiasWorld):
+        scenario = with_world(scenario, start_sigma_m=0.0, start_sigma_rad=0.0)
+    steps = {"window_s": STEP_S, "window_m": 0.0, "keyframe_s": STEP_S, "node_s": 0.0}
+    scenario = with_robots(scenario, "front_end", **steps, biases=())
+    central = change(scenario.central, tick_s=NEVER_S, covariance_factor=1.0, withdraw_above=None)
+    return change(scenario, central=central)
 
 
 def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
@@ -97,15 +91,9 @@ def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
 
 def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> Task:
     place = scenario.name if dataset is None else dataset.name
-    return Task(
-        f"teamslam.sim.studies.experiments.downs_joined:{work}",
-        {"scenario": msgspec.to_builtins(scenario)}
-        | ({} if dataset is None else {"sha256": dataset.sha256}),
-        f"{place}, {scenario.estimator}{f', {note}' if note else ''}, "
-        f"{len(scenario.robots)} robots, seed {scenario.seed}",
-        expected_s(scenario),
-        {} if dataset is None else {"path": str(dataset.path)},
-    )
+    label = f"{place}, {scenario.estimator}{f', {note}' if note else ''}, "
+    label += f"{len(scenario.robots)} robots, seed {scenario.seed}"
+    return scenario_task(f"downs_joined:{work}", scenario, label, expected_s(scenario), dataset)
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from scipy.optimize import Bounds, differential_evolution
 
@@ -29,8 +28,7 @@ from teamslam.sim.studies.experiments.experiment import (
     without_datasets,
 )
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.sim.world.config import SimulatedWorld, UtiasWorld
+from teamslam.sim.studies.experiments.team_runs import Figures, with_world
 from teamslam.team.estimation.map_joining.alignment import procrustes
 from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float
@@ -187,15 +185,12 @@ def _runs(options: Options) -> list[tuple[str, Task]]:
     for name in ("downs-10", "downs-100"):
         for seed in options.seeds:
             scenario = with_options(load(name), robots=2, seed=seed)
-            if isinstance(scenario.world, SimulatedWorld):
-                world = msgspec.structs.replace(scenario.world, steps=STEPS)
-                scenario = msgspec.structs.replace(scenario, world=world)
-            found.append((f"{name}, seed {seed}", spherical_task(scenario)))
+            task = spherical_task(with_world(scenario, steps=STEPS))
+            found.append((f"{name}, seed {seed}", task))
     for dataset in options.datasets:
         scenario = load("utias")
-        if options.quick and isinstance(scenario.world, UtiasWorld):
-            part = msgspec.structs.replace(scenario.world, duration_s=DURATION_S)
-            scenario = msgspec.structs.replace(scenario, world=part)
+        if options.quick:
+            scenario = with_world(scenario, duration_s=DURATION_S)
         found.append((dataset.name, spherical_task(scenario, dataset)))
     return found
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from scipy.stats import ttest_rel
 
@@ -20,11 +19,10 @@ from teamslam.sim.studies.experiments.downs_joined import (
     spherical_task,
     whole_run_task,
 )
-from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled, spread
+from teamslam.sim.studies.experiments.drawing import as_map, draw_map, figure, ruled, spread
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, team_task
-from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.studies.experiments.team_runs import Figures, table_of, team_task, with_world
 
 WORLDS = ("downs-10", "downs-100")
 TEAM = 2
@@ -107,9 +105,8 @@ class SimulatedTable(NamedTuple):
         tests = self._tests(options, results)
         tables = [table]
         if tests:
-            rows = tuple((name, *_test_cells(test)) for name, test in tests.items())
-            columns = ("before → after", "pairs", "mean before [m]", "mean after [m]", "p")
-            tables.append(Table("paired t-test of the simulator's maps as they lie", columns, rows))
+            title_of_tests = "paired t-test of the simulator's maps as they lie"
+            tables.append(t_test_table(title_of_tests, "before → after", tests))
         picture = Picture(
             "simulator",
             f"{title}: runs on his simulator, one dot a seed on a logarithmic scale; bar: the "
@@ -197,21 +194,15 @@ def _draw_sample(title: str, sample: Figures, path: Path) -> None:
         color=RED, label="true landmarks",
     )  # fmt: skip
     draw_map(axis, sample["means"], sample["blocks"], label="map, 95 %")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    as_map(axis, adjustable="datalim")
     axis.set_title(f"EKF: {title}", fontsize=11)
     picture.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    ruled(axis)
     picture.savefig(path, dpi=110)
 
 
 def _task(world: str, method: Simulated, options: Options, seed: int) -> Task:
     scenario = with_options(load(world), robots=method.robots, seed=seed)
-    if options.quick and isinstance(scenario.world, SimulatedWorld):
-        part = msgspec.structs.replace(scenario.world, steps=QUICK_STEPS)
-        scenario = msgspec.structs.replace(scenario, world=part)
-    return method.task(scenario)
+    return method.task(with_world(scenario, steps=QUICK_STEPS) if options.quick else scenario)
 
 
 def _by_seed(
@@ -237,9 +228,15 @@ def paired_test(pairs: Sequence[tuple[float, float]]) -> Figures:
     }
 
 
-def _test_cells(test: Figures) -> list[str]:
-    numbers = (test[key] for key in ("mean_before_m", "mean_after_m", "p"))
-    return [str(test["pairs"]), *("–" if n is None else f"{n:.3g}" for n in numbers)]
+def t_test_table(title: str, first: str, tests: Mapping[str, Figures], note: str = "") -> Table:
+    """Table of paired t-tests by name; first: heading of the names."""
+    shown = (
+        ("pairs", "pairs", "{}"),
+        ("mean_before_m", "mean before [m]", "{:.3g}"),
+        ("mean_after_m", "mean after [m]", "{:.3g}"),
+        ("p", "p", "{:.3g}"),
+    )
+    return table_of(title, first, tests, shown, note)
 
 
 def _cells(values: Sequence[float]) -> list[str]:

@@ -102,6 +102,14 @@ def draw_map(
     draw_ellipses(axis, dots, np.array(blocks).reshape(-1, 2, 2), colour, zorder=5)
 
 
+def as_map(axis: "Axes", **equal: Any) -> None:
+    """Axes in metres with equal scales; equal: further options of them."""
+    axis.set_aspect("equal", **equal)
+    axis.set_xlabel("x [m]")
+    axis.set_ylabel("y [m]")
+    ruled(axis)
+
+
 def ruled(axis: "Axes") -> None:
     """Draw a grid behind the curves."""
     axis.grid(color="#e4e4e4", linewidth=0.6)

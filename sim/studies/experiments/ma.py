@@ -25,7 +25,7 @@ from teamslam.sim.studies.experiments.curves import (
 )
 from teamslam.sim.studies.experiments.experiment import Dataset
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, named
+from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, named, scenario_task
 from teamslam.sim.studies.experiments.xu import Method, with_particles
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
@@ -58,14 +58,9 @@ _LINE_POINTS = 1400
 def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
     """Run of one method on the first 1400 frames of a set."""
     scenario = _scenario(method, seed)
-    return Task(
-        "teamslam.sim.studies.experiments.ma:ma_run",
-        {"scenario": msgspec.to_builtins(scenario), "sha256": dataset.sha256},
-        f"{dataset.name}, {method.robots} robots, {named(method.estimator, method.fusion)}, "
-        f"seed {seed}",
-        _COST_S * method.robots,
-        {"path": str(dataset.path)},
-    )
+    pair = named(method.estimator, method.fusion)
+    label = f"{dataset.name}, {method.robots} robots, {pair}, seed {seed}"
+    return scenario_task("ma:ma_run", scenario, label, _COST_S * method.robots, dataset)
 
 
 def _scenario(method: Method, seed: int) -> Scenario:

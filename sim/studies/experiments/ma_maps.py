@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from teamslam.central.desk.drawing import RED, SKY, TRUTH_COLOUR, colour_of
-from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled
+from teamslam.sim.studies.experiments.drawing import as_map, draw_map, figure
 from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Options,
@@ -123,11 +123,8 @@ def _draw(axis: "Axes", run: Figures) -> None:
     )
     if run["map"] is not None:
         draw_map(axis, run["map"]["means"], run["map"]["blocks"])
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
+    as_map(axis, adjustable="datalim")
     axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
-    ruled(axis)
 
 
 FIGURE_3 = PathFigure(

@@ -55,14 +55,15 @@ def team_task(
     pair = named(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
     place += f", {note}" if note else ""
-    return Task(
-        "teamslam.sim.studies.experiments.team_runs:team_run",
-        {"scenario": msgspec.to_builtins(scenario), "batch": batch, "noise": noise}
-        | ({"minimum": True} if minimum else {})
-        | ({} if dataset is None else {"sha256": dataset.sha256}),
+    return scenario_task(
+        "team_runs:team_run",
+        scenario,
         f"{place}, {len(scenario.robots)} robots, {pair}, seed {scenario.seed}",
         expected_s(scenario, batch=batch, minimum=minimum),
-        {} if dataset is None else {"path": str(dataset.path)},
+        dataset,
+        batch=batch,
+        noise=noise,
+        **({"minimum": True} if minimum else {}),
     )
 
 
@@ -78,6 +79,44 @@ def expected_s(scenario: Scenario, *, batch: bool = False, minimum: bool = False
     landmarks = world.landmark_count or len(world.landmarks)
     a_step *= (1.0 + landmarks / _DOUBLING_LANDMARKS) * (1.0 + batch) * (1.0 + minimum)
     return a_step * steps * len(scenario.robots)
+
+
+def scenario_task(
+    work: str,
+    scenario: Scenario,
+    label: str,
+    cost: float,
+    dataset: Dataset | None = None,
+    **parameters: Any,
+) -> Task:
+    """Make the task of a scenario, on a data set if given. work: `module:function` of the
+    experiments; parameters: further ones.
+    """
+    return Task(
+        f"teamslam.sim.studies.experiments.{work}",
+        {"scenario": msgspec.to_builtins(scenario)}
+        | parameters
+        | ({} if dataset is None else {"sha256": dataset.sha256}),
+        label,
+        cost,
+        {} if dataset is None else {"path": str(dataset.path)},
+    )
+
+
+def with_world(scenario: Scenario, **changes: Any) -> Scenario:
+    """Change values of the scenario's world."""
+    world = msgspec.structs.replace(scenario.world, **changes)
+    return msgspec.structs.replace(scenario, world=world)
+
+
+def with_robots(scenario: Scenario, part: str, **changes: Any) -> Scenario:
+    """Change values of a part of every robot's configuration, as `front_end` or `sensor`."""
+    replace = msgspec.structs.replace
+    robots = (
+        replace(robot, **{part: replace(getattr(robot, part), **changes)})
+        for robot in scenario.robots
+    )
+    return replace(scenario, robots=tuple(robots))
 
 
 def named(estimator: str, fusion: str) -> str:

@@ -18,8 +18,7 @@ from teamslam.sim.studies.experiments.curves import curves_task
 from teamslam.sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.studies.experiments.team_runs import Figures, with_robots, with_world
 from teamslam.team.config import MotionNoise
 
 if TYPE_CHECKING:  # Matplotlib takes half a second to import
@@ -166,12 +165,9 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 def _telling(scenario: Scenario) -> Scenario:
     """The scenario with a map at every step of a filter without windows."""
-    replace = msgspec.structs.replace
-    robots = tuple(
-        replace(robot, front_end=replace(robot.front_end, window_s=STEP_S))
-        for robot in scenario.robots
-    )
-    return replace(scenario, robots=robots, central=replace(scenario.central, broadcast_s=STEP_S))
+    central = msgspec.structs.replace(scenario.central, broadcast_s=STEP_S)
+    scenario = with_robots(scenario, "front_end", window_s=STEP_S)
+    return msgspec.structs.replace(scenario, central=central)
 
 
 def as_coded(scenario: Scenario) -> Scenario:
@@ -183,35 +179,21 @@ def as_coded(scenario: Scenario) -> Scenario:
     `get_observations(xtrue(:,i), …)` measures from the pose before the motion; so the world
     measures at its start.
     """
-    replace = msgspec.structs.replace
-    assert isinstance(scenario.world, SimulatedWorld)
-    robots = tuple(
-        replace(robot, sensor=replace(robot.sensor, bearing_sigma=CODED_BEARING_SIGMA))
-        for robot in scenario.robots
-    )
-    world = replace(scenario.world, visible_from_m=0.0, observe_at_start=True)
-    return with_noise(replace(scenario, robots=robots, world=world), *CODED_NOISE)
+    coded = with_world(scenario, visible_from_m=0.0, observe_at_start=True)
+    return with_noise(with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE)
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
     """Set the number of particles of robots and centre."""
-    replace = msgspec.structs.replace
-    robots = tuple(
-        replace(robot, front_end=replace(robot.front_end, particles=particles))
-        for robot in scenario.robots
-    )
-    central = replace(scenario.central, particles=particles)
-    return replace(scenario, robots=robots, central=central)
+    central = msgspec.structs.replace(scenario.central, particles=particles)
+    scenario = with_robots(scenario, "front_end", particles=particles)
+    return msgspec.structs.replace(scenario, central=central)
 
 
 def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
     """Set the odometry noise (m, rad) of a step of a second."""
-    replace = msgspec.structs.replace
-    motion = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
-    robots = tuple(
-        replace(robot, motion=replace(robot.motion, **motion)) for robot in scenario.robots
-    )
-    return replace(scenario, robots=robots)
+    noise = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
+    return with_robots(scenario, "motion", **noise)
 
 
 def _of(run: Figures, what: str) -> Figures | None:

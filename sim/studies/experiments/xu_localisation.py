@@ -22,7 +22,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.estimators import localisation
 from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.experiments.curves import true_landmarks
-from teamslam.sim.studies.experiments.drawing import figure, ruled, spread
+from teamslam.sim.studies.experiments.drawing import as_map, figure, spread
 from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
@@ -32,7 +32,7 @@ from teamslam.sim.studies.experiments.experiment import (
     combined,
 )
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures
+from teamslam.sim.studies.experiments.team_runs import Figures, with_world
 from teamslam.sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from teamslam.sim.world.config import SimulatedWorld
@@ -141,19 +141,16 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def _stages_task(options: Options, seed: int) -> Task:
-    scenario = _alone(seed, PARTICLES)
-    assert isinstance(scenario.world, SimulatedWorld)
-    world = msgspec.structs.replace(scenario.world, paths=(STRETCH,), steps=STRETCH_STEPS)
-    return _task("stages_run", msgspec.structs.replace(scenario, world=world), options, seed)
+    scenario = with_world(_alone(seed, PARTICLES), paths=(STRETCH,), steps=STRETCH_STEPS)
+    return _task("stages_run", scenario, options, seed)
 
 
 def _anywhere_task(options: Options, seed: int) -> Task:
     scenario = _alone(seed, ANYWHERE_PARTICLES)
     assert isinstance(scenario.world, SimulatedWorld)
-    world = msgspec.structs.replace(
-        scenario.world, steps=ANYWHERE_STEPS[-1], paths=(_beginning(scenario.world),)
-    )
-    return _task("anywhere_run", msgspec.structs.replace(scenario, world=world), options, seed)
+    leg = _beginning(scenario.world)
+    scenario = with_world(scenario, steps=ANYWHERE_STEPS[-1], paths=(leg,))
+    return _task("anywhere_run", scenario, options, seed)
 
 
 def _beginning(world: SimulatedWorld) -> tuple[tuple[float, float], ...]:
@@ -410,10 +407,7 @@ def _draw_place(axis: "Axes", landmarks: list[list[float]], true: list[float]) -
         true[0], true[1], marker="o", markersize=10, markerfacecolor="none",
         markeredgecolor=BLACK, linestyle="", label="true position", zorder=6,
     )  # fmt: skip
-    axis.set_aspect("equal")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
-    ruled(axis)
+    as_map(axis)
 
 
 def _draw_anywhere(run: Figures, path: Path) -> None:

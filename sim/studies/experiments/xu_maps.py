@@ -9,7 +9,13 @@ import numpy as np
 
 from teamslam.central.desk.drawing import RED, TRUTH_COLOUR, colour_of
 from teamslam.sim.studies.experiments import xu_errors
-from teamslam.sim.studies.experiments.drawing import draw_map, figure, ruled, sampled, spread
+from teamslam.sim.studies.experiments.drawing import (
+    as_map,
+    draw_map,
+    figure,
+    sampled,
+    spread,
+)
 from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
@@ -161,10 +167,7 @@ def _draw_paths(axis: "Axes", shot: Figures) -> None:
             axis.plot(points[:, 0], points[:, 1], color=each, linewidth=width, label=label)
     axis.set_xlim(-10, 110)
     axis.set_ylim(-10, 110)
-    axis.set_aspect("equal")
-    axis.set_xlabel("x [m]")
-    axis.set_ylabel("y [m]")
-    ruled(axis)
+    as_map(axis)
 
 
 class PathFigure(NamedTuple):
