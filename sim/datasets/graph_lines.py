@@ -13,7 +13,7 @@ those of the measured second one. Weights may be left out: then they are 1.
 https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,25 +36,27 @@ POSES = ("VERTEX_SE2", "VERTEX2")
 POSE_EDGES = ("EDGE_SE2", "EDGE2", "ODOMETRY")
 POINT_EDGES = ("EDGE_SE2_XY", "LANDMARK")
 SPATIAL = ("EDGE3", "VERTEX3", "EDGE_SE3:QUAT", "VERTEX_SE3:QUAT", "EDGE_SE3_XYZ", "VERTEX_XYZ")
+
+
+class Form(NamedTuple):
+    """Words before the numbers of a keyword's line, counts of numbers, and their meaning."""
+
+    names: int
+    counts: tuple[int, ...]
+    words: str
+
+
 FORMS = {
-    "VERTEX_SE2": "pose x y theta",
-    "VERTEX2": "pose x y theta",
-    "VERTEX_XY": "landmark x y",
-    "FIX": "pose",
-    "EDGE_SE2": "pose pose x y theta and six numbers of the information",
-    "EDGE2": "pose pose x y theta and six numbers of the information",
-    "ODOMETRY": "pose pose x y theta and six numbers of the information",
-    "EDGE_SE2_XY": "pose landmark x y and three numbers of the information",
-    "LANDMARK": "pose landmark x y and three numbers of the information",
+    **dict.fromkeys(POSES, Form(1, (3,), "pose x y theta")),
+    "VERTEX_XY": Form(1, (2,), "landmark x y"),
+    "FIX": Form(1, (0,), "pose"),
+    **dict.fromkeys(
+        POSE_EDGES, Form(2, (9, 3), "pose pose x y theta and six numbers of the information")
+    ),
+    **dict.fromkeys(
+        POINT_EDGES, Form(2, (5, 2), "pose landmark x y and three numbers of the information")
+    ),
 }
-COUNTS = {
-    **dict.fromkeys(POSES, ((1, 3),)),
-    "VERTEX_XY": ((1, 2),),
-    "FIX": ((1, 0),),
-    **dict.fromkeys(POSE_EDGES, ((2, 9), (2, 3))),
-    **dict.fromkeys(POINT_EDGES, ((2, 5), (2, 2))),
-}
-"""Numbers of indices and of values of each keyword."""
 TRUTH = "_groundtruth"
 """Ending of the name of a file's errorless twin."""
 HEAD = 65_536
@@ -101,6 +103,30 @@ def lines_of(path: Path) -> Iterator[Line]:
             yield Line(path.name, number, words[0], words[1:])
 
 
+def read_lines(
+    path: Path, forms: Mapping[str, Form], graph: FactorGraph
+) -> Iterator[tuple[Line, Float[np.ndarray, " n"]]]:
+    """Lines of a graph with their numbers; lines of other keywords are counted in the graph.
+
+    forms: of each keyword. Raises DatasetError with file, line and remedy.
+    """
+    for line in lines_of(path):
+        if line.keyword in SPATIAL:
+            raise line.error("a graph in three dimensions; planar ones are read")
+        form = forms.get(line.keyword)
+        if form is None:
+            if not line.keyword.replace("_", "").replace(":", "").isupper():
+                raise line.error(f"no keyword {line.keyword!r}: known are {', '.join(forms)}")
+            graph.unused[line.keyword] = graph.unused.get(line.keyword, 0) + 1
+            continue
+        if len(line.words) - form.names not in form.counts:
+            raise line.error(
+                f"{len(line.words)} words after {line.keyword}, {form.names + form.counts[0]} "
+                f"expected ({form.words}): complete the line, or take it out"
+            )
+        yield line, line.values(form.names)
+
+
 def first_line(path: Path) -> Line | None:
     """First line of a graph's file, of either format; None for other files."""
     known = {*FORMS, *SPATIAL, "VERTEX_SE2:PRIOR", "EDGE_RANGE"}
@@ -128,20 +154,11 @@ def read_graph(path: Path) -> FactorGraph:
 
 def _read(path: Path) -> FactorGraph:
     graph = FactorGraph(path.stem)
-    found = list(lines_of(path))
+    found = list(read_lines(path, FORMS, graph))
     fixed: list[Key] = []
-    is_toro = any(line.keyword == "VERTEX2" for line in found)
-    for line in found:
-        if line.keyword not in COUNTS:
-            _leave_out(line, graph)
-            continue
-        indices, count = COUNTS[line.keyword][0]
-        if len(line.words) not in [sum(each) for each in COUNTS[line.keyword]]:
-            raise line.error(
-                f"{len(line.words)} words after {line.keyword}, {indices + count} expected "
-                f"({FORMS[line.keyword]}): complete the line, or take it out"
-            )
-        first, values = ("", line.identity(0)), line.values(indices)
+    is_toro = any(line.keyword == "VERTEX2" for line, _ in found)
+    for line, values in found:
+        first = ("", line.identity(0))
         if line.keyword in POSES:
             graph.poses[first] = values
         elif line.keyword == "FIX":
@@ -159,15 +176,6 @@ def _read(path: Path) -> FactorGraph:
             graph.point_edges.append(PointEdge(first, line.identity(1), values[:2], covariance))
     graph.priors = {key: (graph.poses[key], None) for key in fixed if key in graph.poses}
     return split_at_gaps(graph)
-
-
-def _leave_out(line: Line, graph: FactorGraph) -> None:
-    """Count a line of another keyword; raises DatasetError for 3-D and for text."""
-    if line.keyword in SPATIAL:
-        raise line.error("a graph in three dimensions; planar ones are read")
-    if not line.keyword.replace("_", "").replace(":", "").isupper():
-        raise line.error(f"no keyword {line.keyword!r}: known are {', '.join(FORMS)}")
-    graph.unused[line.keyword] = graph.unused.get(line.keyword, 0) + 1
 
 
 def _covariance(

@@ -16,18 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from teamslam.sim.datasets.factor_graph import FactorGraph, Key, Matrix, PointEdge, PoseEdge
-from teamslam.sim.datasets.graph_lines import SPATIAL, Line, lines_of
+from teamslam.sim.datasets.graph_lines import Form, Line, read_lines
 from teamslam.team.config import UNNAMED
 from teamslam.team.shapes import Float
 
 FORMS = {
-    "VERTEX_SE2": (2, 3, "time pose x y theta"),
-    "VERTEX_XY": (1, 2, "landmark x y"),
-    "VERTEX_SE2:PRIOR": (2, 9, "time pose x y theta and six numbers of the covariance"),
-    "EDGE_SE2": (3, 9, "time pose pose x y theta and six numbers of the covariance"),
-    "EDGE_SE2_XY": (3, 5, "time pose landmark x y and three numbers of the covariance"),
+    "VERTEX_SE2": Form(2, (3,), "time pose x y theta"),
+    "VERTEX_XY": Form(1, (2,), "landmark x y"),
+    "VERTEX_SE2:PRIOR": Form(2, (9,), "time pose x y theta and six numbers of the covariance"),
+    "EDGE_SE2": Form(3, (9,), "time pose pose x y theta and six numbers of the covariance"),
+    "EDGE_SE2_XY": Form(3, (5,), "time pose landmark x y and three numbers of the covariance"),
 }
-"""Words before the numbers, numbers, and meaning of each keyword."""
 SYMBOL = re.compile("([A-Za-z]+)([0-9]{1,10})")
 
 
@@ -39,19 +38,8 @@ def is_pyfg(line: Line) -> bool:
 def read_pyfg(path: Path) -> FactorGraph:
     """Read a file; raises DatasetError with file, line and remedy."""
     graph = FactorGraph(path.stem, are_true=True)
-    for line in lines_of(path):
-        if line.keyword in SPATIAL:
-            raise line.error("a graph in three dimensions; planar ones are read")
-        if line.keyword not in FORMS:
-            graph.unused[line.keyword] = graph.unused.get(line.keyword, 0) + 1
-            continue
-        names, count, form = FORMS[line.keyword]
-        if len(line.words) != names + count:
-            raise line.error(
-                f"{len(line.words)} words after {line.keyword}, {names + count} expected ({form}): "
-                "complete the line, or take it out"
-            )
-        _take(line, line.values(names), graph)
+    for line, values in read_lines(path, FORMS, graph):
+        _take(line, values, graph)
     return graph
 
 

@@ -43,30 +43,30 @@ class Used:
 class Process:
     """Child of this process.
 
-    exit: status (negative: signal), None while running. used: resources, with the last memory
-    measurement.
+    used: resources, with the last memory measurement.
     """
 
     def __init__(self, started: "subprocess.Popen[bytes]") -> None:
         self.pid = started.pid
-        self.exit: int | None = None
         self.used = Used()
+        self._status: int | None = None
         self._started = started
 
-    def poll(self) -> int | None:
-        """Exit status; None while running."""
-        if self.exit is None:
+    @property
+    def exit(self) -> int | None:
+        """Exit status (negative: signal); None while running."""
+        if self._status is None:
             pid, status, used = os.wait4(self.pid, os.WNOHANG)
             if pid:
-                self.exit = os.waitstatus_to_exitcode(status)
+                self._status = os.waitstatus_to_exitcode(status)
                 # Bytes on macOS, kilobytes elsewhere. The peak includes that of the starting
                 # program.
                 most_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
                 cpu_s = used.ru_utime + used.ru_stime
                 peak_rss_mb = self.used.peak_rss_mb or most_mb
                 self.used = replace(self.used, cpu_s=cpu_s, peak_rss_mb=peak_rss_mb)
-                self._started.returncode = self.exit
-        return self.exit
+                self._started.returncode = self._status
+        return self._status
 
     def measure(self) -> None:
         """Measure the memory share and its peak, on Linux."""
@@ -83,7 +83,7 @@ class Process:
     def wait(self, timeout_s: float) -> bool:
         """Whether it ends within this time."""
         deadline = time.monotonic() + timeout_s
-        while self.poll() is None:
+        while self.exit is None:
             if time.monotonic() >= deadline:
                 return False
             time.sleep(LOOK_S)
@@ -91,7 +91,7 @@ class Process:
 
     def signal(self, number: int) -> None:
         """Send a signal unless it has ended."""
-        if self.poll() is None:
+        if self.exit is None:
             os.kill(self.pid, number)
 
 
@@ -104,17 +104,15 @@ class Starter:
     def __init__(self, since_ns: int) -> None:
         self._environment = _environment(os.environ, since_ns)
 
-    def start(self, words: Sequence[str], output: int) -> Process:
+    def start(self, words: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
         """Start `teamslam WORDS` in its own session; output: descriptor of output and errors."""
-        return Process(
-            subprocess.Popen(  # noqa: S603 - our own program, no shell
-                [*PROGRAM, *words],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=self._environment,
-                start_new_session=True,
-            )
+        return subprocess.Popen(  # noqa: S603 - our own program, no shell
+            [*PROGRAM, *words],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=self._environment,
+            start_new_session=True,
         )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from teamslam.sim.launch.processes import Starter, Used
+from teamslam.sim.launch.processes import Process, Starter, Used
 from teamslam.team.wire.text import one_line
 
 LAST_LINES = 12
@@ -43,7 +43,7 @@ class Ended:
         return f"ended with exit status {self.exit}"
 
 
-class Child:
+class Child(Process):
     """A `teamslam …` process with its own output file."""
 
     def __init__(
@@ -55,23 +55,9 @@ class Child:
         self.output = folder / f"{name}.log"
         with self.output.open("ab" if life else "wb") as file:
             self._before = self.output.stat().st_size
-            self._process = starter.start(arguments, file.fileno())
+            super().__init__(starter.start(arguments, file.fileno()))
         # A short run may end before the next measurement.
         self.measure()
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    def measure(self) -> None:
-        """Measure its share of memory."""
-        self._process.measure()
-
-    @property
-    def exit(self) -> int | None:
-        """Exit status; None while running."""
-        return self._process.poll()
 
     @property
     def is_stopped(self) -> bool:
@@ -93,17 +79,17 @@ class Child:
 
     def kill(self) -> None:
         """End it at once, even if stopped."""
-        self._process.signal(signal.SIGKILL)
+        self.signal(signal.SIGKILL)
 
     def stop(self) -> None:
         """Request its end."""
         if self.exit is None:
             self._asked = True
-            self._process.signal(signal.SIGTERM)
+            self.signal(signal.SIGTERM)
 
     def end(self, deadline: float) -> Ended:
         """Wait until `deadline` (monotonic), then end it; returns how it ended."""
-        while not self._process.wait(max(0.0, deadline - time.monotonic())):
+        while not self.wait(max(0.0, deadline - time.monotonic())):
             self.kill()
             deadline = math.inf
         return self.ended()
@@ -113,7 +99,7 @@ class Child:
         status = self.exit
         assert status is not None
         asked = self._asked and status != -signal.SIGKILL
-        return Ended(self.name, self.pid, status, self.last_lines(), asked, self._process.used)
+        return Ended(self.name, self.pid, status, self.last_lines(), asked, self.used)
 
     def last_lines(self) -> tuple[str, ...]:
         """Last lines of its output."""
