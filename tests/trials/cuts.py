@@ -91,7 +91,11 @@ class Team:
             if node != "router" and node not in drivers:
                 self.start(node)
         for robot in (node for node, words in self.told.items() if "robot" in words):
-            await_text(self.folder / "run" / f"{robot}.log", "connected")
+            log = self.folder / "run" / f"{robot}.log"
+            while "connected" not in log.read_text("utf-8", "replace"):
+                if not self.is_alive(robot):
+                    self.start(robot)  # the first connection has its patience only
+                time.sleep(0.2)
         for node in drivers:
             self.start(node)
 

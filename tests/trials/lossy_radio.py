@@ -15,7 +15,6 @@ import fcntl
 import os
 import random
 import select
-import signal
 import struct
 import subprocess
 import sys
@@ -31,16 +30,15 @@ from pathlib import Path
 from teamslam.sim.scenarios.scenario import load
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.roster import nodes_of
-from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, shortened
+from tests.trials.cuts import PORT, Team
+from tests.trials.kills import PROGRAM, expected_of, final_in, shortened
 
 HOME, AWAY = "10.213.78.1", "10.213.78.2"
-PORT = 7447
 MOST_PACKETS = 2_000
 """Number of packets under way; further ones are lost, as in a full buffer."""
 CLONE_NEWNET = 0x4000_0000
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x4004_54CA, 0x0001, 0x1000
 FAR = "r1"
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 
 @dataclass
@@ -166,11 +164,12 @@ def one(
     loss: int, delay: int, scenario: Path, robots: list[str], expected: bytes, keys, options
 ) -> Run:
     run = Run(loss, delay)
-    protocol = "tcp" if options.open else "tls"
+    place_of = f"{'tcp' if options.open else 'tls'}/{HOME}:{PORT}"
     door = [] if options.open else ["--keys", str(keys)]
-    there = ["--connect", f"{protocol}/{HOME}:{PORT}", *door]
+    there = ["--connect", place_of, *door]
     what = str(scenario)
-    commands = {
+    told = {
+        "router": ["router", "--listen", place_of, *(door or ["--insecure"])],
         "recorder": ["record", what, "--output", "run/log.mcap", *there],
         "central": ["central", what, *there],
         "world": ["world", what, "--speed", options.speed, *there],
@@ -178,50 +177,20 @@ def one(
     }
     with (
         tempfile.TemporaryDirectory() as place,
-        radio(loss, delay, f"{loss} {delay}") as (
-            home,
-            away,
-            link,
-        ),
+        radio(loss, delay, f"{loss} {delay}") as (home, away, link),
     ):
         folder = Path(place).resolve()
         (folder / "run").mkdir()
-        started: dict[str, subprocess.Popen[bytes]] = {}
-
-        def start(node: str, arguments: list[str]) -> None:
-            where = away if node == FAR else home
-            with (folder / "run" / f"{node}.log").open("ab") as said:
-                started[node] = subprocess.Popen(
-                    ["ip", "netns", "exec", where, *PROGRAM, *arguments],
-                    cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-                    env={**os.environ, **ONE_THREAD},
-                )  # fmt: skip
-
+        names = {node: away if node == FAR else home for node in told}
+        team = Team(folder, {node: [*PROGRAM, *words] for node, words in told.items()}, names)
         try:
-            open_door = ["--insecure"] if options.open else door
-            start("router", ["router", "--listen", f"{protocol}/{HOME}:{PORT}", *open_door])
-            await_text(folder / "run" / "router.log", "listening at")
-            for node, arguments in commands.items():
-                start(node, arguments)
-            far = folder / "run" / f"{FAR}.log"
-            while "connected" not in far.read_text("utf-8", "replace"):
-                if started[FAR].poll() is not None:
-                    start(FAR, commands[FAR])  # the first connection has its patience only
-                time.sleep(0.2)
+            team.begin()
             began = time.monotonic()
-            disturb(run, link, started, commands, options)
+            disturb(run, link, team, options)
             run.wall_s = time.monotonic() - began
-            run.exits = {node: process.poll() for node, process in started.items()}
+            run.exits = {node: process.poll() for node, process in team.started.items()}
         finally:
-            for process in reversed(started.values()):
-                if process.poll() is None:
-                    process.send_signal(signal.SIGTERM)
-            for process in started.values():
-                try:
-                    process.wait(15.0)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait()
+            team.stop()
         if run.exits.pop("router") is not None:
             run.exits["router"] = 99
         final = final_in(folder)
@@ -236,7 +205,7 @@ def one(
     return run
 
 
-def disturb(run: Run, link: Radio, started, commands, options) -> None:
+def disturb(run: Run, link: Radio, team: Team, options) -> None:
     """Cut the link at even intervals, and return when all have ended or time is over."""
     began = time.monotonic()
     due = [options.first + k * (options.cut + options.between) for k in range(options.cuts)]
@@ -250,7 +219,7 @@ def disturb(run: Run, link: Radio, started, commands, options) -> None:
             link.cut = True
             run.cuts.append(round(at, 1))
             mend_s = at + options.cut
-        if all(started[node].poll() is not None for node in commands):
+        if not any(team.is_alive(node) for node in team.started if node != "router"):
             return
         time.sleep(0.05)
 
