@@ -75,14 +75,12 @@ def _other_mount(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, 
 
 def _turned(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
     seen = world.streams[0].landmark_detections
-    assert seen.covariances is not None
     turned = seen.covariances[:, ::-1] * np.array([1.0, -1.0, 1.0])
     return robot, replace(world.streams[0], landmark_detections=replace(seen, covariances=turned))
 
 
 def _less_lateral(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
     told = world.streams[0].intervals
-    assert told.covariances is not None
     less = told.covariances.copy()
     less[:, 1, :] *= 0.1
     less[:, :, 1] *= 0.1
@@ -156,9 +154,6 @@ def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWi
 def window_nees(closed: ClosedWindow, world: WorldStreams) -> tuple[float, int]:
     """NEES of a submap against the truth in its own frame, and its degrees of freedom."""
     stream = world.streams[0]
-    assert stream.truth is not None
-    assert stream.truth_ns is not None
-    assert world.landmarks is not None
     start, end = (
         stream.truth[int(np.searchsorted(stream.truth_ns, at))]
         for at in (closed.start_ns, closed.end_ns)

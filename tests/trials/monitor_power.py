@@ -43,7 +43,6 @@ def robust() -> Scenario:
 def found_at(fold: Fold, claimed: float, normal: float) -> Finding:
     """Finding of the monitor for the map with all covariances times `claimed`."""
     key = fold.main_key
-    assert key is not None
     settings = replace(
         fold.main.settings, covariance_factor=claimed * fold.main.settings.covariance_factor
     )

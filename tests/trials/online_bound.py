@@ -99,7 +99,6 @@ class _AtTruth:
     """The error e = estimate − truth of (all poses, all landmarks) and its covariance."""
 
     def __init__(self, world: WorldStreams) -> None:
-        assert world.landmarks is not None
         self._landmarks = world.landmarks
         self._place = {int(id_): k for k, id_ in enumerate(world.landmark_ids)}
         self._poses = 3 * len(world.streams)
@@ -168,8 +167,6 @@ class _AtTruth:
 
 
 def _true(stream: RobotStream, stamp_ns: int) -> np.ndarray:
-    assert stream.truth is not None
-    assert stream.truth_ns is not None
     return np.asarray(stream.truth[np.searchsorted(stream.truth_ns, stamp_ns)])
 
 

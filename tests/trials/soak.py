@@ -29,7 +29,6 @@ from rich.console import Console
 from rich.table import Table
 
 from teamslam.sim.scenarios.scenario import dumps, load, with_options
-from teamslam.sim.world.config import SimulatedWorld
 
 EVERY_S = 5.0
 """Wall time between two looks."""
@@ -102,8 +101,6 @@ def team_time(log: Path) -> float:
     """The team time [s] of a log's last message."""
     with log.open("rb") as stream:
         summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
     return summary.statistics.message_end_time / 1e9
 
 
@@ -120,7 +117,6 @@ def main() -> int:
     if told.fusion:
         scenario = with_options(scenario, fusion=told.fusion)
     world = scenario.world
-    assert isinstance(world, SimulatedWorld)
     steps = int(1.2 * seconds * told.speed) + 1000  # never the end before the time is over
     scenario = msgspec.structs.replace(scenario, world=msgspec.structs.replace(world, steps=steps))
     with tempfile.TemporaryDirectory() as place:

@@ -103,8 +103,6 @@ def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
     """Each robot's initial pose as the command line takes it."""
     found = {}
     for s in streams:
-        assert s.start is not None
-        assert s.start.covariance is not None
         x, y, theta = (repr(float(v)) for v in s.start.pose)
         sigmas = np.diag([START_SIGMAS[0] ** 2, START_SIGMAS[0] ** 2, START_SIGMAS[1] ** 2])
         assert np.array_equal(sigmas, s.start.covariance), "other sigmas than the reader's"
@@ -232,8 +230,6 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
              str(place / "mcap"), str(port), str(speed)],
             "publisher.log", stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         )  # fmt: skip
-        assert publisher.stdin is not None
-        assert publisher.stdout is not None
         publisher.stdout.readline()
         logs = [run / f"driver_{robot}.log" for robot in at]
         for log in logs:
