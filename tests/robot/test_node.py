@@ -514,15 +514,25 @@ def outliers(measurements, share):
     return spoilt
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3])
-def test_measurements_far_from_their_predictions_are_said_unless_they_are_gated(share):
-    for estimator in ("hybrid", "ekf-slam"):
-        node = RobotNode(config(estimator=estimator))
-        driven(node, outliers(published(stream("r1", 30)), share), end=False)
-        status = node.status()
-        assert status.figures["nis_dof"] > 40
-        said = [each for each in status.warnings if "far from their predictions" in each]
-        assert len(said) == (share > 0.0 and estimator == "ekf-slam"), status
+@pytest.mark.parametrize(
+    ("estimator", "fusion", "share", "warned"),
+    [
+        ("hybrid", "join", 0.0, False),
+        ("hybrid", "join", 0.3, False),
+        ("ekf-slam", "alone", 0.0, False),
+        ("ekf-slam", "alone", 0.3, True),
+    ],
+)
+def test_measurements_far_from_their_predictions_are_reported_unless_they_are_gated(
+    estimator, fusion, share, warned
+):
+    node = node_for(config(estimator=estimator, fusion=fusion))
+    driven(node, outliers(published(stream("r1", 30)), share), end=False)
+    status = node.status()
+    assert status.figures["nis_dof"] > 40
+    found = [each for each in status.warnings if "far from their predictions" in each]
+    assert len(found) == warned, status
+    assert ("gated" in status.figures) == (share > 0.0 and estimator == "hybrid")
 
 
 def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():

@@ -16,6 +16,8 @@ constexpr double JITTER[3] = {1e-6, 1e-6, 1e-8};  // added to each motion's vari
 constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 100;
 constexpr double MOST_REJECTED = 0.05;
 constexpr int ROUNDS = 5;                         // of classifying and smoothing; it comes to rest in two or three
+constexpr int LEAST_STEPS = 2, MOST_STEPS = 10;   // of Gauss-Newton in a round
+constexpr double CONVERGED = 0.1;                 // largest last step, in standard deviations
 
 // A symmetric 2 × 2 covariance of range and bearing.
 struct Covariance2 {
@@ -250,14 +252,17 @@ std::vector<bool> Consensus::confirmed_by_others() const {
   return taken;
 }
 
-// Two Gauss-Newton steps, and the covariance at the second; whether the normal equations are positive
-// definite. A landmark without an accepted measurement stays where it is, with the squared reach of the
-// sensor as its variance.
+// Gauss-Newton steps until no unknown moves by a tenth of its standard deviation, and the covariance at
+// the last one; whether the normal equations are positive definite. Away from the optimum a correct
+// measurement is far from its prediction, and would be rejected: odometry of a long window starts there.
+// A landmark without an accepted measurement stays where it is, with the squared reach of the sensor as
+// its variance.
 bool Consensus::smooth(Smoothed& window, const std::vector<bool>& taken) const {
   auto& [path, metrics, landmarks, slots, covariance] = window;
   const std::size_t first = window.first(), size = first + 2 * landmarks.size();
   const std::vector<double> counts = window.counts(taken);
-  for (int step = 0; step < 2; step++) {
+  double farthest = 0.0;  // squared, in variances
+  for (int step = 0; step < LEAST_STEPS || (step < MOST_STEPS && farthest > CONVERGED * CONVERGED); step++) {
     dense::Matrix A(size, size), b(size, 1);
     for (std::size_t k = 1; k < path.size(); k++) {
       const auto [x, y, turn] = se2::logarithm(se2::between(motions_[k].mean, se2::between(path[k - 1], path[k])));
@@ -292,6 +297,8 @@ bool Consensus::smooth(Smoothed& window, const std::vector<bool>& taken) const {
     covariance = dense::inverse_from_factor(*L);
     if (!dense::is_finite(covariance)) return false;
     const dense::Matrix x = dense::product(covariance, b);
+    farthest = 0.0;
+    for (std::size_t i = 0; i < size; i++) farthest = std::max(farthest, x[i][0] * x[i][0] / covariance[i][i]);
     for (std::size_t k = 1; k < path.size(); k++)
       path[k] = se2::compose(path[k], se2::exponential({x[3 * k - 3][0], x[3 * k - 2][0], x[3 * k - 1][0]}));
     for (std::size_t slot = 0; slot < landmarks.size(); slot++) {
