@@ -46,7 +46,11 @@ def standing(sensor: Sensor, robot: str = "r1", start: Pose | None = None) -> Ch
     step = increment_of(config.motion, 1.0, 0.0, 0.0)
     seen = [[7], [7, 9], [7]]
     scans = [
-        Scan(np.array(ids, np.uint32), np.array([4.2, 3.5][: len(ids)]), np.full(len(ids), 0.26))
+        Scan(
+            np.array(ids, np.uint32),
+            np.array([4.2, 3.5][: len(ids)]),
+            np.array([0.26, -0.96][: len(ids)]),
+        )
         for ids in seen
     ]
     stamps = np.arange(4) * 10**9

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -12,7 +13,10 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.plain_cost import PlainCost
 from teamslam.sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
+from teamslam.team.config import FrontEnd
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
+from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.marginals import joint_cost
 from teamslam.team.estimation.map_joining.minima import minimum, searched
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
@@ -82,11 +86,22 @@ def test_submaps_that_deny_the_truth_are_found():
     assert not found.wrong
 
 
-def test_a_run_is_asked_for_its_own_final_map():
-    scenario = short(120)
+@pytest.mark.parametrize("biases", [(), FrontEnd().biases], ids=["without biases", "default"])
+def test_a_run_is_asked_for_its_own_final_map(biases):
+    scenario = short(80)
+    robots = tuple(
+        msgspec.structs.replace(
+            each, front_end=msgspec.structs.replace(each.front_end, biases=biases)
+        )
+        for each in scenario.robots
+    )
+    scenario = msgspec.structs.replace(scenario, robots=robots)
     samples = list(run_team(scenario, streams_of(scenario)))
-    fold = final_fold(samples)
-    assert fold.main.cost == pytest.approx(final_map(samples).chi2, rel=1e-6)
+    fold, published = final_fold(samples), final_map(samples).chi2
+    robust = converged(fold, replace(fold.main.settings, robust=True))
+    rel = 0.05 if biases else 1e-6
+    assert joint_cost(robust).chi2 == pytest.approx(published, rel=rel)
+    assert fold.main.cost > (1.0 - 1e-6) * published, "plain squares bound the robust loss"
     found = true_minimum(samples, evaluate(samples))
     assert not found.wrong
     assert not found.excluded

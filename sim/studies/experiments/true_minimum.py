@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import Path, interpolate_truth
@@ -74,7 +75,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 
 
 def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, recomputed from a log."""
+    """The centre's final fold, recomputed from a log with plain squares and without biases."""
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -86,7 +87,8 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
         if value is not None:
             ticks.add_start(value)
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
-            ticks.add_submap(submap, b"", sightings.get((*stream, sequence), ()))
+            unbiased = msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
+            ticks.add_submap(unbiased, b"", sightings.get((*stream, sequence), ()))
     ticks.fold_until(float("inf"))
     return converged(ticks.fold, replace(ticks.settings, robust=False))
 
