@@ -11,8 +11,7 @@ import msgspec
 
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import Sample, try_open
 
 LISTENS = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORDER)
 _NAMES = frozenset(channel.name for channel in LISTENS)
@@ -37,10 +36,9 @@ class Agreement:
         found = ch.channel_of(sample.key)
         if found is None or found[0].name not in _NAMES:
             return
-        try:
-            channel, name, message = opened(sample)
-        except WireError:
+        if (sound := try_open(sample)) is None:
             return
+        channel, name, message = sound
         if channel is ch.TEAM_CONFIG:
             self._folding.add(name)
         elif isinstance(message, m.GivenUp):

@@ -193,13 +193,9 @@ def judge(
     for each in (robot, judgement.second.robot):
         team.await_robot(each)
     verdict = m.Verdict(
-        stamp_ns=0,
-        robot=robot,
-        judgement=judgement,
-        by="operator",
-        reason=reason,
+        stamp_ns=0, robot=robot, judgement=judgement, by="operator", reason=reason,
         withdrawn=withdrawn,
-    )
+    )  # fmt: skip
     publish_order(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
     for fused in team.maps(patience_s):
         holds = any(

@@ -6,6 +6,8 @@ precedence while it is present. Map messages of robots that are not peers are ig
 """
 
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from typing import TypeVar
 
 import msgspec
 
@@ -55,7 +57,8 @@ class PeersAsCentre:
             self._centre = True
             self._concluded = self._concluded or sample.key == ch.FINAL_MAP.key()
         elif sample.key == _TOKEN:
-            self._centre = self._centre and _is_alive(sample)
+            token = _decoded(sample, m.Liveliness)
+            self._centre = self._centre and (token is None or token.alive)
         found = ch.channel_of(sample.key)
         if found is None:
             return None
@@ -83,17 +86,19 @@ class PeersAsCentre:
             if name != self._robot:
                 return None
         if channel is ch.TEAM_WITHDRAWAL:
-            name = _withdrawn(sample) or name
+            order = _decoded(sample, m.Withdrawal)
+            name = name if order is None else order.robot
         renamed = msgspec.structs.replace(sample, key=as_channel.key(name))
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
 
     def _learn(self, sample: Sample) -> None:
         """Read the peers from the scenario."""
-        try:
-            team = team_config(decoded(sample.payload, m.Configuration).configuration)
-        except (WireError, ValueError):
+        message = _decoded(sample, m.Configuration)
+        if message is None:
             return
-        self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
+        with suppress(ValueError):
+            team = team_config(message.configuration)
+            self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
 
     def _agreed(self) -> Sample | None:
         agreed = self.agreement.agreed
@@ -103,9 +108,8 @@ class PeersAsCentre:
         return as_centre_final(agreed)
 
     def _spoken(self, sample: Sample) -> Sample | None:
-        try:
-            message = decoded(sample.payload, m.Configuration)
-        except WireError:
+        message = _decoded(sample, m.Configuration)
+        if message is None:
             return None
         as_centre = msgspec.structs.replace(message, node="central")
         return msgspec.structs.replace(sample, payload=encoded(as_centre))
@@ -114,9 +118,8 @@ class PeersAsCentre:
         """Status of the peer's fold as a centre's status."""
         if self._robot is None or node != ch.robot_node(self._robot):
             return None
-        try:
-            status = decoded(sample.payload, m.Status)
-        except WireError:
+        status = _decoded(sample, m.Status)
+        if status is None:
             return None
         figures = {
             name.removeprefix(_FOLD): value
@@ -129,18 +132,14 @@ class PeersAsCentre:
         return msgspec.structs.replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
 
 
-def _withdrawn(sample: Sample) -> str | None:
+M = TypeVar("M", bound=m.Message)
+
+
+def _decoded(sample: Sample, kind: type[M]) -> M | None:
     try:
-        return decoded(sample.payload, m.Withdrawal).robot
+        return decoded(sample.payload, kind)
     except WireError:
         return None
-
-
-def _is_alive(token: Sample) -> bool:
-    try:
-        return decoded(token.payload, m.Liveliness).alive
-    except WireError:
-        return True
 
 
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:

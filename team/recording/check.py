@@ -15,7 +15,7 @@ from teamslam.team.recording.records import check_index
 from teamslam.team.recording.repair import REPAIRED, read_undamaged
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.bus import Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 
 FILE = "file"
@@ -104,10 +104,8 @@ class _Evidence:
             self.channels.add(row[0])
         if row is None or row[0] not in (ch.TALLY, ch.STATUS):
             return
-        try:
-            message = opened(sample)[2]
-        except WireError:
-            return
+        found = try_open(sample)
+        message = None if found is None else found[2]
         if isinstance(message, m.Status) and row[1] == "recorder":
             self.last_word = message.warnings
         elif isinstance(message, m.Status):

@@ -16,8 +16,7 @@ import msgpack
 from teamslam.team.recording.received import Received
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import NO_COUNTER, Sample, try_open
 
 MISSING = "missing: "
 """Prefix of the recorder's last note, which lists missing messages."""
@@ -134,29 +133,22 @@ class Inventory:
         return self.streams.setdefault(NumberedStream(kind, robot, incarnation), Numbered())
 
     def _note_totals(self, sample: Sample) -> None:
-        try:
-            message = opened(sample)[2]
-        except WireError:
-            return  # reported by the message's reader
-        match message:
-            case m.Progress() | m.Done():
-                self._of("measurements", message.robot, message.incarnation).note_number(
-                    message.measurements - 1
-                )
-                self._of("submaps", message.robot, message.incarnation).note_number(
-                    message.submaps - 1
-                )
-            case m.StreamHead():
-                self._of("measurements", message.robot, message.incarnation).note_number(
-                    message.measurements - 1
-                )
-            case m.End():
-                for end in message.streams:
-                    self._of("measurements", end.robot, end.incarnation).note_number(
-                        end.measurements - 1
-                    )
+        found = try_open(sample)
+        match None if found is None else found[2]:  # reported by the message's reader
+            case m.Progress() | m.Done() as counted:
+                self._note_measurements(counted)
+                submaps = self._of("submaps", counted.robot, counted.incarnation)
+                submaps.note_number(counted.submaps - 1)
+            case m.StreamHead() as head:
+                self._note_measurements(head)
+            case m.End() as ended:
+                for end in ended.streams:
+                    self._note_measurements(end)
             case _:
                 pass
+
+    def _note_measurements(self, of: m.Progress | m.Done | m.StreamHead | m.StreamEnd) -> None:
+        self._of("measurements", of.robot, of.incarnation).note_number(of.measurements - 1)
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
         """Present measurements and submaps by (robot, incarnation)."""

@@ -197,6 +197,14 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     return channel, name, message
 
 
+def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
+    """Decode a sample as `opened` does; None if it is invalid or of no channel."""
+    try:
+        return opened(sample)
+    except WireError:
+        return None
+
+
 def shown(sample: Sample) -> tuple[Channel, str, Message]:
     """Decode a sample as `opened` does, with printable texts, for readers that show it."""
     channel, name, message = opened(sample)

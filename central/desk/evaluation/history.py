@@ -19,8 +19,7 @@ from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import Sample, try_open
 
 _NO_SPAN = (2**63 - 1, -(2**63))
 _CHANNELS = (
@@ -162,20 +161,19 @@ class _Gathering:
     measured_ns: tuple[int, int] = _NO_SPAN
     logged_ns: tuple[int, int] = _NO_SPAN
 
-    def take(self, sample: Sample, channel: ch.Channel | None) -> None:
+    def take(self, sample: Sample) -> None:
         self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
-        if channel in ch.SENSORS:
+        if ch.row_of(sample.key) in ch.SENSORS:
             self._take_measurement(sample)
-        self.take_contents(sample, channel)
+        self.take_contents(sample)
 
-    def take_contents(self, sample: Sample, channel: ch.Channel | None) -> None:
+    def take_contents(self, sample: Sample) -> None:
         """Process a message of any channel."""
-        if channel not in _CHANNELS:
+        if ch.row_of(sample.key) not in _CHANNELS:
             return
-        try:
-            _, name, message = opened(sample)
-        except WireError:
+        if (sound := try_open(sample)) is None:
             return  # counted by the evaluation
+        _, name, message = sound
         self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
         match message:
@@ -233,16 +231,10 @@ def history(samples: Iterable[Sample]) -> History:
     """Compute the history of a run from its samples in log order."""
     found = _Gathering()
     centre = PeersAsCentre()
-    rows: dict[str, ch.Channel | None] = {}
     for sample in samples:
-        if sample.key not in rows:
-            known = ch.channel_of(sample.key)
-            rows[sample.key] = None if known is None else known[0]
-        found.take(sample, rows[sample.key])
-        as_centre_sample = centre.of(sample)
-        if as_centre_sample is not None:
-            as_centre = ch.channel_of(as_centre_sample.key)
-            found.take_contents(as_centre_sample, None if as_centre is None else as_centre[0])
+        found.take(sample)
+        if (as_centre := centre.of(sample)) is not None:
+            found.take_contents(as_centre)
     spans = (found.measured_ns, found.logged_ns, (0, 0))
     span = next(each for each in spans if each != _NO_SPAN)
     return History(

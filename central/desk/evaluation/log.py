@@ -149,8 +149,10 @@ class Collected:
         self.unsound += id(sample) not in self._refused
         self._refused.add(id(sample))
 
-    def take(self, sample: Sample, channel: str, robot: str) -> None:
+    def take(self, sample: Sample) -> None:
         """Count a sample, and store it if its channel is collected."""
+        known = channel_of(sample.key)
+        channel, robot = ("", "") if known is None else (known[0].name, known[1])
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
@@ -204,12 +206,8 @@ def collect_log(samples: Iterable[Sample]) -> Collected:
     """Collect a log's contents from its samples."""
     found = Collected()
     centre = PeersAsCentre()
-    channels: dict[str, tuple[str, str]] = {}
     for sample in samples:
-        if sample.key not in channels:
-            known = channel_of(sample.key)
-            channels[sample.key] = ("", "") if known is None else (known[0].name, known[1])
-        found.take(sample, *channels[sample.key])
+        found.take(sample)
         counterpart = centre.of(sample)
         if counterpart is not None:
             found.keep(counterpart)

@@ -25,8 +25,7 @@ from teamslam.team.ros2.encoding import (
 from teamslam.team.ros2_answers import Answer, Answers
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import try_open
 
 TEAM_SPACE = "/teamslam"
 """Namespace of the team's map and diagnostics."""
@@ -73,12 +72,9 @@ def answers_of(log: Log) -> Iterator[Answer]:
     team = Answers(Names(TEAM_SPACE))
     final = False
     for sample in log.samples():
-        if ch.channel_of(sample.key) is None:
+        if (sound := try_open(sample)) is None:
             continue
-        try:
-            channel, name, message = opened(sample)
-        except WireError:
-            continue
+        channel, name, message = sound
         if channel is ch.ROBOT_CONFIG and isinstance(message, m.Configuration):
             robot = robots.setdefault(name, _Robot(name))
             robot.config = msgspec.json.decode(message.configuration, type=RobotConfig)

@@ -38,29 +38,12 @@ def binned(
 
     Returns interval middles [s] and sums; values outside the run count at its ends.
     """
-    where = _bins(history, stamps_ns)
+    edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
+    at = np.searchsorted(edges, history.seconds(stamps_ns), "right")
+    where = np.clip(at - 1, 0, BINS - 1)
     filled = np.bincount(where, minlength=BINS) > 0
     sums = [np.bincount(where, weights=v, minlength=BINS)[filled] for v in values]
-    return _middles(history)[filled], sums
-
-
-def _edges(history: History) -> Float[np.ndarray, " e"]:
-    return np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
-
-
-def _middles(history: History) -> Float[np.ndarray, " b"]:
-    edges = _edges(history)
-    middles: Float[np.ndarray, " b"] = 0.5 * (edges[1:] + edges[:-1])
-    return middles
-
-
-def _bins(history: History, stamps_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Interval of each stamp; stamps outside the run count at its ends."""
-    at: Int64[np.ndarray, " n"] = np.searchsorted(
-        _edges(history), history.seconds(stamps_ns), "right"
-    )
-    clipped: Int64[np.ndarray, " n"] = np.clip(at - 1, 0, BINS - 1)
-    return clipped
+    return (0.5 * (edges[1:] + edges[:-1]))[filled], sums
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
@@ -102,25 +85,15 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     for name, robot in evaluation.robots.items():
         if robot.online is None or evaluation.arbitrary_frame:
             continue
-        centres, (sums, counts) = binned(
-            history,
-            robot.online.stamps_ns,
-            robot.online.nees / 3.0,
-            np.ones(len(robot.online.nees)),
-        )
+        nees, ones = robot.online.nees / 3.0, np.ones(len(robot.online.nees))
+        centres, (sums, counts) = binned(history, robot.online.stamps_ns, nees, ones)
         axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=labels[name])
         largest = max(largest, float((sums / counts).max()))
-    nees = history.map_nees
-    if len(nees.values):
-        seconds = history.seconds(nees.stamps_ns)
-        axis.plot(
-            seconds,
-            nees.values,
-            color=MAP_COLOUR,
-            linewidth=1.4,
-            label="map (blocks only,\nat the end joint)",
-        )
-        largest = max(largest, float(nees.values.max()))
+    of_map = history.map_nees
+    if len(of_map.values):
+        seconds, label = history.seconds(of_map.stamps_ns), "map (blocks only,\nat the end joint)"
+        axis.plot(seconds, of_map.values, color=MAP_COLOUR, linewidth=1.4, label=label)
+        largest = max(largest, float(of_map.values.max()))
     _scale(axis, max(largest, high))
     axis.set_ylabel("NEES per dof")
     axis.set_title(
@@ -139,13 +112,8 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         if not measured.any():
             continue
         values = squared[measured] / dof[measured]
-        axis.plot(
-            centres[measured],
-            values,
-            color=colours.get(name, MAP_COLOUR),
-            linewidth=1.2,
-            label=labels[name],
-        )
+        colour = colours.get(name, MAP_COLOUR)
+        axis.plot(centres[measured], values, color=colour, linewidth=1.2, label=labels[name])
         largest = max(largest, float(values.max()))
         low, high = chi2_interval(int(np.median(dof[measured])), BAND, 1)
         lows.append(low)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from teamslam.central.desk.verification.centre import recomputed_centre, recomputed_peer
-from teamslam.central.desk.verification.differences import first_difference
+from teamslam.central.desk.verification.differences import FieldDifference, first_difference
 from teamslam.central.desk.verification.recorded import (
     Identity,
     Recorded,
@@ -172,30 +172,27 @@ def _compared(
 def _difference(
     output: RecordedOutput, recomputed: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
+    """Difference of a recorded message from the recomputed one; None within the tolerance."""
     lacks = None if recomputed is not None else _lacking(output.message, log)
     if recomputed is None:
-        none = "none" if lacks is None else f"{lacks}: none"
-        field, recorded_text, recomputed_text = "the message", "there", none
+        found = FieldDifference(
+            "the message", "there", "none" if lacks is None else f"{lacks}: none"
+        )
     else:
-        found = first_difference(output.message, recomputed, exact=exact)
-        if found is None:
-            if not exact:
-                return None
-            field, recorded_text, recomputed_text = "the encoding", "another", "the program's"
-        else:
-            field, recorded_text, recomputed_text = found.field, found.recorded, found.recomputed
+        differs = first_difference(output.message, recomputed, exact=exact)
+        if differs is None and not exact:
+            return None
+        found = differs or FieldDifference("the encoding", "another", "the program's")
     sample = output.sample
-    names = _names(output.message)
-    unknown = lacks is not None
     return Difference(
         key=sample.key,
         stamp_ns=sample.stamp_ns,
         counter=sample.counter,
-        names=names,
-        field=field,
-        recorded=recorded_text,
-        recomputed=recomputed_text,
-        lacks=unknown,
+        names=_names(output.message),
+        field=found.field,
+        recorded=found.recorded,
+        recomputed=found.recomputed,
+        lacks=lacks is not None,
     )
 
 

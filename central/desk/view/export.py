@@ -10,8 +10,7 @@ from teamslam.team.recording.reader import Log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import Sample, try_open
 
 VIEWED = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
 """Channels of a viewer."""
@@ -24,11 +23,8 @@ def for_viewer(
     found = ch.channel_of(sample.key)
     if found is None or found[0].name not in channels:
         return None
-    try:
-        channel, _, message = opened(sample)
-    except WireError:
-        return None  # nodes reject it
-    return channel, message
+    sound = try_open(sample)
+    return None if sound is None else (sound[0], sound[2])
 
 
 class Viewing:

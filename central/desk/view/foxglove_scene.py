@@ -5,7 +5,7 @@ The map plane is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from foxglove import messages as fox
@@ -171,28 +171,10 @@ def log_line(stamp_ns: int, name: str, text: str, *, warns: bool) -> bytes:
     return bytes(found.encode())
 
 
-def _entity(
-    stamp_ns: int,
-    name: str,
-    *,
-    arrows: list[fox.ArrowPrimitive] | None = None,
-    cubes: list[fox.CubePrimitive] | None = None,
-    cylinders: list[fox.CylinderPrimitive] | None = None,
-    lines: list[fox.LinePrimitive] | None = None,
-    texts: list[fox.TextPrimitive] | None = None,
-    metadata: list[fox.KeyValuePair] | None = None,
-) -> fox.SceneEntity:
-    return fox.SceneEntity(
-        timestamp=stamp(stamp_ns),
-        frame_id=MAP_FRAME,
-        id=name,
-        arrows=arrows,
-        cubes=cubes,
-        cylinders=cylinders,
-        lines=lines,
-        texts=texts,
-        metadata=metadata,
-    )
+def _entity(stamp_ns: int, name: str, **primitives: Any) -> fox.SceneEntity:
+    """Entity in the frame of the map; primitives: lists, as `fox.SceneEntity` names them."""
+    at = stamp(stamp_ns)
+    return fox.SceneEntity(timestamp=at, frame_id=MAP_FRAME, id=name, **primitives)
 
 
 def _arrow(pose: fox.Pose, size_m: float, shade: Shade) -> fox.ArrowPrimitive:

@@ -22,17 +22,18 @@ def layout(team: str, robots: Sequence[str]) -> str:
         "Plot!consistency": _plot(
             "per degree of freedom (1 is right)",
             [
-                _line(f"{prefix}/{views.TEAM.key()}.status.joint_cost_per_dof", "joint cost", None),
-                _line(
-                    f"{prefix}/{views.TEAM.key()}.status.covariance_scale", "covariance scale", None
-                ),
-                _line(
-                    f"{prefix}/{views.TEAM.key()}.landmark_nees_per_dof", "map NEES per dof", None
-                ),
+                _line(f"{prefix}/{views.TEAM.key()}.{figure}", label, None)
+                for figure, label in (
+                    ("status.joint_cost_per_dof", "joint cost"),
+                    ("status.covariance_scale", "covariance scale"),
+                    ("landmark_nees_per_dof", "map NEES per dof"),
+                )
             ],
         ),
     }
-    plots = _column(["Plot!x", "Plot!y", "Plot!heading", "Plot!consistency"])
+    plots: object = "Plot!consistency"
+    for share, panel in ((50, "Plot!heading"), (33, "Plot!y"), (25, "Plot!x")):
+        plots = _split("column", panel, plots, share)
     left = _split("column", "3D!scene", "RosOut!events", 78)
     return json.dumps(
         {
@@ -103,9 +104,3 @@ def _split(direction: str, first: object, second: object, percentage: int) -> di
     return {
         "direction": direction, "first": first, "second": second, "splitPercentage": percentage,
     }  # fmt: skip
-
-
-def _column(panels: Sequence[str]) -> object:
-    if len(panels) == 1:
-        return panels[0]
-    return _split("column", panels[0], _column(panels[1:]), round(100 / len(panels)))
