@@ -31,15 +31,13 @@ class Checkpoint:
 class Checkpoints:
     """A stack of checkpoints by tick: a tick is pushed, a late input pops those that lack it."""
 
-    def __init__(self, begin: Fold = EMPTY_FOLD) -> None:
-        """Begin with this fold, before any tick."""
-        self._begin = begin
+    def __init__(self) -> None:
         self.kept: tuple[Checkpoint, ...] = ()
 
     @property
     def fold(self) -> Fold:
         """The fold over all ticks so far."""
-        return self.kept[-1].fold if self.kept else self._begin
+        return self.kept[-1].fold if self.kept else EMPTY_FOLD
 
     @property
     def tick(self) -> float:

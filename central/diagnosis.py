@@ -18,7 +18,13 @@ from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Contribution, moment
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.map_joining.hypotheses import CARRIED_OFF, MOVED, SHARED, explain
+from teamslam.team.estimation.map_joining.hypotheses import (
+    CARRIED_OFF,
+    MOVED,
+    SHARED,
+    Hypothesis,
+    explain,
+)
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
 from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, terms
@@ -99,11 +105,8 @@ def diagnose(
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
-    found = [
-        *_shared_errors(biases, scale),
-        *_mirrored(fold, withdrawn),
-        *map(_of_cut, carried),
-    ]
+    shared = list(_shared_errors(biases, scale))
+    found = [*shared, *_mirrored(fold, withdrawn), *map(_of_cut, carried)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
     try:
@@ -123,13 +126,24 @@ def diagnose(
                 at_ns=each.at_ns,
             )
             for each in accepted
-            if each.subject not in mirrored
+            if each.subject not in mirrored and not _is_bent(each, shared)
         ]
         left = finding(Agreement(0.0, 0.0, {}, tuple(terms(island).submaps)), normal, final=final)
         noise = [_noise(*each) for each in left.misscaled if each.robot not in mirrored]
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)
+
+
+def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
+    """Whether an apparent jump has less evidence than an error that the robot's submaps share.
+
+    The windows of a robot whose clock is late are bent where it turns, beyond their sensitivities.
+    """
+    if jump.cause != CARRIED_OFF:
+        return False
+    evidence = jump.evidence / jump.dof
+    return any(each.robot == jump.subject and each.evidence > evidence for each in shared)
 
 
 _REMEDIES: Mapping[str, str] = {

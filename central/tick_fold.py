@@ -27,9 +27,7 @@ condensed (but see FULL_UNNAMED).
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 
-from teamslam.central.carried_off import carried_off, seam_of
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
 from teamslam.central.fold_inputs import FoldInputs
@@ -48,7 +46,6 @@ from teamslam.team.estimation.contribution import Contribution, Stream, is_surve
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
-from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -121,7 +118,7 @@ class TickFold:
     def _restart(self, conviction: Conviction) -> None:
         self._conviction = conviction
         self._retried = 0.0
-        self.checkpoints = Checkpoints(replace(EMPTY_FOLD, cuts=conviction.cuts))
+        self.checkpoints = Checkpoints()
 
     # Inputs.
 
@@ -282,8 +279,8 @@ class TickFold:
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Cut, withdraw or suspend the robot that a trial of the fold finds, from the first tick
-        on; return whether there is one.
+        """Withdraw or suspend the robot that a trial of the fold finds, from the first tick on;
+        return whether there is one.
 
         at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
         of the map, so a fold that withdraws no robot computes it, too.
@@ -302,13 +299,7 @@ class TickFold:
         if fold is self.fold:
             self.checkpoints.note_tested(fold.size)
         self.undecided = found.undecided
-        if found.robot is None:
-            return False
-        rest = self.leave_out({found.robot}, self._until_ns).fold
-        if (seam := self._find_seam(rest, found.robot)) is not None:
-            self._restart(self._conviction.cut(seam, at))
-            return True
-        if not self.convicts:
+        if found.robot is None or not self.convicts:
             return False
         own = sum(n + 1 for stream, n in self.members(fold).items() if stream[0] == found.robot)
         if math.isinf(at) or own >= LEAST_SUBMAPS:
@@ -317,29 +308,6 @@ class TickFold:
             suspension = Suspension(found.reason, GROWTH * self._size_until(at))
             self._restart(self._conviction.suspend(found.robot, suspension, at))
         return True
-
-    def _find_seam(self, rest: Fold, robot: str) -> Seam | None:
-        """Find where a robot that contradicts the rest was carried off, by its submaps so far.
-
-        A stream is cut once by this.
-        """
-        limit = self._config.withdraw_above
-        done = {seam.stream for seam in self._conviction.cuts}
-        for stream, submaps in sorted(self._inputs.chains(robot).items()):
-            chain = [each for each in submaps if each.end_ns <= self._until_ns]
-            if limit is not None and stream not in done and chain:
-                found = carried_off(rest, chain, limit)
-                if found is not None:
-                    return seam_of(chain, found)
-        return None
-
-    def _cut_withdrawn(self, rest: Fold) -> bool:
-        """Cut the stream of a withdrawn robot instead, where all its submaps show the seam."""
-        for robot in sorted(self.convicted):
-            if (seam := self._find_seam(rest, robot)) is not None:
-                self._restart(self._conviction.cut(seam, math.inf))
-                return True
-        return False
 
     def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
         limit = self._config.withdraw_above
@@ -378,7 +346,6 @@ class TickFold:
     ) -> "TickFold":
         other = TickFold(self._config, limits, self._inputs)
         other.convicts = other._tries = False
-        other._restart(Conviction(cuts=self._conviction.cuts))
         other._ordered = self._gone.union(robots)
         other.fold_until(until_ns)
         return other
@@ -386,14 +353,16 @@ class TickFold:
     def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
         """Fold each robot's submaps by themselves where joining them contradicts; else nothing.
 
-        It does where a robot's disagreement with the team exceeds the limit, and as many times its
-        disagreement alone: too small covariances by themselves are no contradiction. A fold in
-        another frame than the team's is empty. ahead: the fold has the ticks that are not closed.
+        It does where a robot's disagreement with the team, be it by a single submap, exceeds the
+        limit, and as many times its disagreement alone: too small covariances by themselves are no
+        contradiction. A fold in another frame than the team's is empty. ahead: the fold has the
+        ticks that are not closed.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
             return {}
-        if not find_suspects(self.agreement(fold), limit):
+        together = disagreement(self.agreement(fold), least=1)
+        if max(together.values(), default=0.0) <= limit:
             if not self.suspended:
                 self._others.clear()
             return {}
@@ -402,10 +371,10 @@ class TickFold:
         for robot in sorted(team):
             own = self.leave_out(self._inputs.robots - {robot}, self._until_ns)
             apart = own.fold_ahead() if ahead else own.fold
-            alone.update(disagreement(own.agreement(apart)) if apart.contributions else {})
+            if apart.contributions:
+                alone.update(disagreement(own.agreement(apart), least=1))
             is_in_frame = apart.frame == fold.frame or apart.frame in fold.starts
             folds[robot] = apart if is_in_frame else EMPTY_FOLD
-        together = disagreement(self.agreement(fold))
         contradict = any(
             value > limit * max(1.0, alone.get(robot, 1.0)) for robot, value in together.items()
         )
@@ -452,9 +421,7 @@ class TickFold:
             if not fold.contributions:
                 return fold
             fold = converged(fold, self.settings)
-            if self._convict(fold, math.inf) or self.suspended:
-                continue
-            if not self._cut_withdrawn(fold):
+            if not self._convict(fold, math.inf) and not self.suspended:
                 return fold
 
     def _fold_raw(self) -> Fold:

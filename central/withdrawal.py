@@ -1,16 +1,17 @@
 """Find the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
-A robot's disagreement is the larger of two figures, both near or below 1 where its covariances are
-right, each counted where it is beyond chance: its share of the joint cost per degree of freedom,
-and the χ²/dof that most of its submaps exceed, the newest ones if it has few. The first detects a
-single contradiction at full weight, but a robust loss bounds it; the second detects a robot whose
-submaps disagree in the majority.
+A robot's disagreement is the largest of three figures, all near or below 1 where its covariances
+are right, each counted where it is beyond chance: its share of the joint cost per degree of
+freedom, which the robust loss bounds; the unweighted χ²/dof that most of its submaps exceed, the
+newest ones if it has few; and that which most of the newest inter-robot measurements by it or of it
+exceed. The robust loss discounts a minority, which is no reason to lose the robot. One that claims
+to stand still has submaps that fit the map, but is not where the others measure it.
 
 One wrong robot distorts the map and makes others disagree, too; one with overconfident covariances,
 or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement:
 each is left out in turn, and withdrawn only if the rest agree without it, and without no other. Two
 robots that contradict each other, and no third, are reported and both stay, unless one of them
-contradicts itself when alone.
+contradicts itself: when alone, one of its submaps is an outlier.
 """
 
 import math
@@ -18,7 +19,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
-from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 
 LEAST_SUBMAPS = 8
@@ -35,6 +35,8 @@ TRIED = 3
 """Most robots left out for a trial, the most suspect first; as many again of those that disagree
 least, since the map follows an overconfident robot.
 """
+OUTLIER = 0.5
+"""Weight below which a submap is an outlier."""
 LEAST_DOF = 3.0
 """Least degrees of freedom of a share of the joint cost that is judged."""
 SUSPICION, ACCORD = 20.0, 7.0
@@ -74,15 +76,13 @@ class Conviction:
     """The robots that a fold leaves out by itself.
 
     withdrawn: the reason by robot, in words. suspended: left out until tested again. at: the last
-    tick that this is based on. tested_from: the first tick tested under it. cuts: seams at which
-    robots that contradicted the rest were carried off; their streams are cut there.
+    tick that this is based on. tested_from: the first tick tested under it.
     """
 
     withdrawn: Mapping[str, str] = field(default_factory=dict)
     suspended: Mapping[str, Suspension] = field(default_factory=dict)
     at: float = -math.inf
     tested_from: float = -math.inf
-    cuts: tuple[Seam, ...] = ()
 
     def withdraw(self, robot: str, reason: str, at: float) -> "Conviction":
         """Withdraw one more robot."""
@@ -99,44 +99,54 @@ class Conviction:
         suspended = {each: why for each, why in self.suspended.items() if each != robot}
         return replace(self, suspended=suspended, at=max(self.at, at), tested_from=tested_from)
 
-    def cut(self, seam: Seam, at: float) -> "Conviction":
-        """Cut the stream of one more robot, which is not withdrawn then."""
-        robot = seam.stream[0]
-        withdrawn = {each: why for each, why in self.withdrawn.items() if each != robot}
-        without = self.acquit(robot, at, -math.inf)
-        return replace(without, withdrawn=withdrawn, cuts=(*self.cuts, seam))
 
-
-def disagreement(agreement: Agreement, chance: float = SUSPICION) -> dict[str, float]:
+def disagreement(
+    agreement: Agreement, chance: float = SUSPICION, least: int = FEWEST
+) -> dict[str, float]:
     """Return the disagreement of each robot that can be judged.
 
-    chance: a share of the joint cost that a sound robot exceeds with a probability above e^−chance
-    is no disagreement.
+    chance: a cost that a sound robot exceeds with a probability above e^−chance is no disagreement.
+    least: number of submaps of a robot that are judged.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, _ in agreement.submaps:
         if dof >= 1.0:
             costs.setdefault(robot, []).append((chi2, dof))
+    seen: dict[str, list[tuple[float, float]]] = {}
+    for observer, teammate, chi2 in agreement.sightings:
+        for robot in (observer, teammate):
+            seen.setdefault(robot, []).append((chi2, 2.0))
     found = {}
     for robot in sorted({*costs, *agreement.robots}):
-        of_submaps = _most(costs.get(robot, []), chance)
+        of_submaps = _most(costs.get(robot, []), chance, least)
+        of_sightings = _most_of_newest(seen.get(robot, []), chance, NEWEST)
         share = _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)
-        values = [each for each in (of_submaps, share) if each is not None]
+        values = [each for each in (of_submaps, of_sightings, share) if each is not None]
         if values:
             found[robot] = max(values)
     return found
 
 
-def _most(costs: Sequence[tuple[float, float]], chance: float) -> float | None:
+def _most(costs: Sequence[tuple[float, float]], chance: float, least: int = FEWEST) -> float | None:
     """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
     None with too few submaps.
 
-    costs: χ² and dof of each, oldest first. The probability that k of n submaps exceed χ² bounds of
-    probability e^−x each is below C(n, k) e^(−kx).
+    costs: χ² and dof of each, oldest first.
     """
     if len(costs) >= LEAST_SUBMAPS:
         return median(chi2 / dof for chi2, dof in costs)
-    if len(costs) < FEWEST:
+    return _most_of_newest(costs, chance, least)
+
+
+def _most_of_newest(
+    costs: Sequence[tuple[float, float]], chance: float, least: int
+) -> float | None:
+    """Return the χ²/dof that MOST_OF the NEWEST costs exceed, at most 1 where chance explains it;
+    None with too few.
+
+    The probability that k of n exceed χ² bounds of probability e^−x each is below C(n, k) e^(−kx).
+    """
+    if len(costs) < least:
         return None
     newest = costs[-NEWEST:]
     most = min(MOST_OF, len(newest))
@@ -213,7 +223,10 @@ def cost_share(chi2: float, dof: float, chance: float) -> float:
 
 
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
-    return alone is not None and disagreement(alone).get(robot, 0.0) > limit
+    if alone is None:
+        return False
+    is_split = any(each.weight < OUTLIER for each in alone.submaps)
+    return is_split or disagreement(alone).get(robot, 0.0) > limit
 
 
 def _largest(found: Mapping[str, float]) -> float:

@@ -76,8 +76,17 @@ class BiasEstimate(NamedTuple):
     sigma: float
 
 
+class SightingCost(NamedTuple):
+    """Unweighted χ² of an inter-robot measurement, which has 2 degrees of freedom at most."""
+
+    robot: str
+    teammate: str
+    chi2: float
+
+
 class Agreement(NamedTuple):
-    """Joint cost Σ w χ² and its degrees of freedom: in total, per robot and per submap.
+    """Joint cost Σ w χ² and its degrees of freedom: in total, per robot and per submap; and the
+    unweighted χ² of the inter-robot measurements, oldest first.
 
     An inter-robot measurement counts for its observer, a discounted landmark by its weight. Without
     a robust loss the total dof is the sum of the dimensions of submaps, inter-robot measurements
@@ -89,6 +98,7 @@ class Agreement(NamedTuple):
     dof: float
     robots: dict[str, tuple[float, float]]
     submaps: tuple[SubmapCost, ...]
+    sightings: tuple[SightingCost, ...] = ()
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
@@ -317,7 +327,13 @@ def joint_cost(fold: Fold) -> Agreement:
     chi2 = sum(robots[robot][0] for robot in sorted(robots))
     total = sum(robots[robot][1] for robot in sorted(robots))
     submaps = (*departed.submaps, *found.submaps)
-    return Agreement(chi2, total, {robot: robots[robot] for robot in sorted(robots)}, submaps)
+    return Agreement(
+        chi2,
+        total,
+        {robot: robots[robot] for robot in sorted(robots)},
+        submaps,
+        tuple(_sighting_costs(fold.main)),
+    )
 
 
 def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
@@ -339,6 +355,13 @@ def _sightings(island: Island) -> list[tuple[str, float, float]]:
     chi2, dof = weight * now.sighting_chi2, 2.0 - weight * now.explained_by_sightings
     observers = [each.sighting.robot for each in island.graph.sightings]
     return list(zip(observers, chi2.tolist(), dof.tolist(), strict=True))
+
+
+def _sighting_costs(island: Island) -> list[SightingCost]:
+    seen = zip(island.graph.sightings, island.estimate.sighting_chi2.tolist(), strict=True)
+    costs = [(each.sighting, chi2) for each, chi2 in seen]
+    costs.sort(key=lambda each: each[0].key)
+    return [SightingCost(of.robot, of.teammate, chi2) for of, chi2 in costs]
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:
