@@ -11,7 +11,7 @@ One wrong robot distorts the map and makes others disagree, too; one with overco
 or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement:
 each is left out in turn, and withdrawn only if the rest agree without it, and without no other. Two
 robots that contradict each other, and no third, are reported and both stay, unless one of them
-contradicts itself: when alone, one of its submaps is an outlier.
+contradicts itself: when alone, one of its submaps contradicts its others.
 """
 
 import math
@@ -35,8 +35,6 @@ TRIED = 3
 """Most robots left out for a trial, the most suspect first; as many again of those that disagree
 least, since the map follows an overconfident robot.
 """
-OUTLIER = 0.5
-"""Weight below which a submap is an outlier."""
 LEAST_DOF = 3.0
 """Least degrees of freedom of a share of the joint cost that is judged."""
 SUSPICION, ACCORD = 20.0, 7.0
@@ -223,10 +221,12 @@ def cost_share(chi2: float, dof: float, chance: float) -> float:
 
 
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
+    """Whether one of a robot's submaps contradicts its others, however little it weighs."""
     if alone is None:
         return False
-    is_split = any(each.weight < OUTLIER for each in alone.submaps)
-    return is_split or disagreement(alone).get(robot, 0.0) > limit
+    chance = SUSPICION + math.log(max(len(alone.submaps), 1))
+    costs = [cost_share(each.chi2, each.dof, chance) for each in alone.submaps]
+    return max([*costs, disagreement(alone).get(robot, 0.0)]) > limit
 
 
 def _largest(found: Mapping[str, float]) -> float:

@@ -9,12 +9,11 @@ import pytest
 from teamslam.central.carried_off import cuts_of
 from teamslam.central.diagnosis import describe, diagnose
 from teamslam.central.tick_fold import TickFold
-from teamslam.central.withdrawal import OUTLIER
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
-from teamslam.team.estimation.map_joining.marginals import bias_estimates, joint_cost
+from teamslam.team.estimation.map_joining.marginals import BELIEVED, bias_estimates, joint_cost
 from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
@@ -90,7 +89,7 @@ def test_the_seam_and_the_motion_are_those_of_the_way_that_the_robot_was_carried
         (each.stamp_ns, "r3", 1, each.sequence) for each in carried()
     }
     assert (found.robot, found.at_ns) == ("r3", chain()[FIRST - 1].stamp_ns)
-    outliers = [each.sequence for each in joint_cost(fold).submaps if each.weight < OUTLIER]
+    outliers = [each.sequence for each in joint_cost(fold).submaps if each.weight < BELIEVED]
     assert outliers == [FIRST - 1], "one submap of r3 contradicts the others"
     true = folded(chain()).solve().main.graph.landmarks
     assert fold.main.graph.landmarks.keys() == true.keys()
