@@ -74,6 +74,8 @@ class CentralShell:
             self._bus.subscribe(channel)
         self._bus.watch_alive()
         self._shell.answer(ch.SUBMAPS, "", self.node.answer_submaps)
+        if self.node.config.fusion == "join":
+            self._shell.answer(ch.SITE, "", self.node.answer_site)
         self._request_orders()
         self._shell.look_for_the_end()
         self._restore()

@@ -348,6 +348,18 @@ class CentralNode:
         robot = decoded(request, m.SubmapsRequest).robot
         return [encoded(message) for message in self.store.messages_of(robot)]
 
+    def answer_site(self, request: bytes) -> Iterable[bytes]:
+        """Answer a `FoldRequest` with a saved map of the present set, solved in full.
+
+        The set is folded anew, so the running fold stays as it is. Raises NothingToSaveError.
+        """
+        decoded(request, m.FoldRequest)
+        fold = self.maps.fold
+        if not self.finished:
+            fold = self.fold_class(self.config, self.config_digest, self.store)
+            fold.make_map("final")
+        return [encoded(fold.save_map("site"))]
+
     # Status.
 
     @property

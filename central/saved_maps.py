@@ -15,7 +15,12 @@ from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import joint, points_of
-from teamslam.team.estimation.map_joining.saved_maps import FALSE_ALARM, displacements, maps_of
+from teamslam.team.estimation.map_joining.saved_maps import (
+    FALSE_ALARM,
+    SEQUENTIAL,
+    displacements,
+    maps_of,
+)
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
 
@@ -25,12 +30,14 @@ class NothingToSaveError(ValueError):
 
 
 def save_map(
-    fold: Fold, fused: m.FusedMap, name: str, before: Mapping[str, m.SavedMap]
+    fold: Fold, fused: m.FusedMap, name: str, before: Mapping[str, m.SavedMap], day: bytes
 ) -> m.SavedMap:
     """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
+    day: digest of the day's first submap, by which all maps of one day are known.
 
     With the biases c that all sensors share, the landmarks x are N(x̄ + S (c − c̄), P − S C Sᵀ) given
-    c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out.
+    c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out. One that moved by e, which
+    chance explains at SEQUENTIAL, may be an error of today: its covariance is P_ii + e eᵀ.
     """
     gone = {each.landmark for each in fused.changes if each.state == "gone"}
     chosen = [id_ for id_ in ids(fused.ids, "ids").tolist() if id_ not in gone]
@@ -45,6 +52,10 @@ def save_map(
     rows = dense.product(information(P[:k, :k], "the common biases"), P[:k, k:])
     means = mean[k:] - dense.product(mean[:k], rows)
     given = P[k:, k:] - dense.product(P[k:, :k], rows)
+    for each in fused.changes:
+        if each.state == "moved" and each.chi2 < chi2_limit(2, SEQUENTIAL):
+            at, e = 2 * chosen.index(each.landmark), np.array([each.dx, each.dy])
+            given[at : at + 2, at : at + 2] += np.outer(e, e)
     frame = fold.frame
     earlier = [before[robot] for robot, _ in fold.home if robot in before]
     unnamed = [id_ for id_ in chosen if id_ >= UNNAMED]
@@ -59,7 +70,7 @@ def save_map(
         sensitivity=from_floats(rows),
         counts=from_ids(_counts(island, chosen, before)),
         frame="" if frame is None else translate.frame_name(*frame),
-        sets=tuple(sorted({fused.digest, *(one for each in earlier for one in each.sets)})),
+        sets=tuple(sorted({day, *(one for each in earlier for one in each.sets)})),
         software=metadata.version("teamslam"),
         core=core.digest[:16],
     )

@@ -29,12 +29,17 @@ from teamslam.central.localising import (
     saved_landmarks,
 )
 from teamslam.central.monitor import NOTHING, finding
-from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
+from teamslam.central.saved_maps import (
+    NO_ROBOT,
+    NothingToSaveError,
+    landmark_changes,
+    save_map,
+)
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.tick_fold import TickFold
 from teamslam.central.unnamed_landmarks import verdict_of
 from teamslam.team import translate
-from teamslam.team.estimation.contribution import is_map
+from teamslam.team.estimation.contribution import is_map, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.store import Stream, SubmapStore
@@ -129,7 +134,16 @@ class SubmapFold:
         if self._final is None or not self._final[0].contributions:
             raise NothingToSaveError("there is no final map with a landmark")
         before = {saved.author: saved for saved in self.store.maps.values()}
-        return save_map(*self._final, name, before)
+        return save_map(*self._final, name, before, digest_of(encoded(self._first_submap())))
+
+    def _first_submap(self) -> m.Submap:
+        """Return the first submap of the final map: every later map of its team has it, too."""
+        assert self._final is not None
+        streams = {whole_of(stream) for stream in self._final[0].home if not is_map(stream)}
+        firsts = [self.store.chains[stream][0] for stream in sorted(streams)]
+        if not firsts:
+            raise NothingToSaveError(NO_ROBOT)
+        return min(firsts, key=lambda each: each.stamp_ns)
 
     def _file_members(self) -> None:
         """Add the store's new members to the ticks; folded ticks are folded again."""

@@ -1,8 +1,9 @@
 """Commands about maps: save the final map of a run, show a saved one, request that of a peer."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import typer
 
 from teamslam.sim.cli.help import Command, Group
@@ -13,7 +14,6 @@ from teamslam.sim.cli.options import (
     Connect,
     JsonFile,
     Keys,
-    LogArgument,
     TeamOption,
     connect_bus,
     fail,
@@ -21,6 +21,9 @@ from teamslam.sim.cli.options import (
     write_json,
 )
 from teamslam.team.wire.arrays import ids
+
+if TYPE_CHECKING:
+    from teamslam.team.wire.messages import SavedMap
 
 app = typer.Typer(
     name="map",
@@ -32,7 +35,11 @@ app = typer.Typer(
 
 @app.command(cls=Command, epilog="teamslam map save runs/first -o site.map")
 def save(
-    log: LogArgument,
+    log: Annotated[
+        Path | None,
+        typer.Argument(help="A log, or the folder of its run; without --team.", show_default=False),
+    ] = None,
+    *,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="The file to write.", metavar="FILE")
     ],
@@ -40,31 +47,68 @@ def save(
         str | None,
         typer.Option(help="Name of the map, as site; default: that of the file.", metavar="NAME"),
     ] = None,
+    team: Annotated[
+        str | None,
+        typer.Option(help="A running team, whose centre is asked for its map.", metavar="NAME"),
+    ] = None,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds to wait for the running centre.", min=0.1)
+    ] = 60.0,
 ) -> None:
     """Save the final map of a run as one Gaussian, for the teams of later days.
 
-    The map is solved again from the recorded submaps. If the run has loaded a
-    saved map, the new one contains it. A later team loads the file with --map.
+    The map is solved again from the recorded submaps, or by the centre of a
+    running team (--team) from those that it has. If the run has loaded a saved
+    map, the new one contains it. A later team loads the file with --map.
     """
-    from teamslam.central.desk.verification.centre import recorded_map
-    from teamslam.central.desk.verification.recorded import RerunError, recorded
-    from teamslam.central.saved_maps import NothingToSaveError
-    from teamslam.team.recording.reader import open_log
     from teamslam.team.saved_map import SavedMapError, map_name, write_map
 
+    if (log is None) == (team is None):
+        fail("give either a log or, for a running team, --team NAME", WRONG_USE)
     try:
-        saved = recorded_map(recorded(open_log(log)), map_name(name or output.stem))
+        named = map_name(name or output.stem)
+        found = _map_of_log(log) if log is not None else _map_of_team(team, connect, keys, patience)
+        saved = msgspec.structs.replace(found, name=named)
         write_map(output, saved)
     except SavedMapError as error:
         fail(str(error), WRONG_USE)
-    except (RerunError, NothingToSaveError) as error:
-        fail(f"{log}: {error}", FAILED)
     count, days = len(ids(saved.ids, "ids")), len(saved.sets)
     size = output.stat().st_size / 1e3
     typer.echo(
         f"wrote {output}: the map {saved.name} of {count} landmarks, {days} set"
         f"{'' if days == 1 else 's'}, {size:,.0f} kB"
     )
+
+
+def _map_of_log(log: Path) -> "SavedMap":
+    from teamslam.central.desk.verification.centre import recorded_map
+    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.saved_maps import NothingToSaveError
+    from teamslam.team.recording.reader import open_log
+
+    try:
+        return recorded_map(recorded(open_log(log)), "site")
+    except (RerunError, NothingToSaveError) as error:
+        fail(f"{log}: {error}", FAILED)
+
+
+def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: float) -> "SavedMap":
+    """Request the map of the running centre's present set."""
+    from teamslam.team.wire.bus import BusError
+    from teamslam.team.wire.channels import SITE
+    from teamslam.team.wire.codec import decoded
+    from teamslam.team.wire.messages import FoldRequest, SavedMap
+
+    with connect_bus(str(team), connect, keys, "operator") as bus:
+        try:
+            replies = bus.ask(SITE, "", FoldRequest(stamp_ns=0), patience)
+        except BusError as error:
+            fail(str(error), FAILED)
+    if not replies:
+        fail(f"no centre of the team {team} is running at {connect}: save from its log", FAILED)
+    return decoded(replies[-1], SavedMap)
 
 
 @app.command(cls=Command, epilog="teamslam map show site.map")

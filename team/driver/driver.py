@@ -28,6 +28,7 @@ from teamslam.team.driver.measured import DriverWarning, MeasurementError
 from teamslam.team.driver.motion import Odometer, Pose, between
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.keys.roster import KeysError
+from teamslam.team.saved_map import SavedMapError, read_map
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import BusError
@@ -67,7 +68,8 @@ class Driver:
     file; 0: connect later. bounds: physical limits of the robot; without them a yaw rate beyond
     LIKELY_RAD_S is refused, too. on_message: called in another thread with each message of the team
     for this robot: poses in the team's frame (`PoseEstimate`), maps (`FusedMap`), smoothed paths
-    (`Trajectory`) and the status of its process; it has to return at once.
+    (`Trajectory`) and the status of its process; it has to return at once. map: file of a saved map
+    that the team's map joins, as by `teamslam central --map`; one driver of the team is enough.
 
     Times `t` are seconds on one clock for the whole team, such as Unix time. Raises DriverError if
     the driver can not start; each call raises MeasurementError for an impossible value.
@@ -88,6 +90,7 @@ class Driver:
         patience_s: float = 10.0,
         bounds: Bounds | None = None,
         on_message: Callable[[m.Message], None] | None = None,
+        map: Path | str | None = None,  # noqa: A002
     ) -> None:
         if not re.fullmatch(measured.NAME, robot):
             raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
@@ -98,6 +101,7 @@ class Driver:
         self._known = None if landmarks is None else frozenset(landmarks)
         self._lock = threading.Lock()
         self._warned: set[str] = set()
+        saved = None if map is None else _read_map(Path(map), with_keys=keys is not None)
         path = Path(f"{robot}.stream" if file is None else file)
         try:
             self._journal, said = j.opened(path, robot, round(1e9 * latency_s))
@@ -110,6 +114,7 @@ class Driver:
         self._again: int | None = None if self._journal.calls else -1
         self._node = SourceNode(self._journal)
         self._node.on_message = on_message
+        self._node.maps = () if saved is None else (saved,)
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
             self._link.open(0.0 if self._journal.calls else patience_s)
@@ -560,6 +565,18 @@ def _times(
     """Convert the end and the length of an interval to [ns]."""
     length_ns = None if duration is None else measured.stamp_of(duration, "a duration")
     return measured.stamp_of(t, call), length_ns
+
+
+def _read_map(path: Path, *, with_keys: bool) -> m.SavedMap:
+    """Read a saved map for the team's set; raises DriverError."""
+    if with_keys:
+        raise DriverError(
+            f"{path}: with keys a driver may not publish a map: give it to `teamslam central --map`"
+        )
+    try:
+        return read_map(path)
+    except SavedMapError as error:
+        raise DriverError(str(error)) from None
 
 
 def _start_of(

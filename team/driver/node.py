@@ -67,6 +67,8 @@ class SourceNode:
         """Figures and warnings of the driver's input, such as a ROS 2 robot's topics."""
         self.on_message: Callable[[m.Message], None] | None = None
         """Called in the link's thread with each message of the team, for a program's own use."""
+        self.maps: tuple[m.SavedMap, ...] = ()
+        """Saved maps of earlier days, for the team's set."""
         self.listening = True
         """True until the robot's earlier progress has been received."""
 
@@ -93,11 +95,14 @@ class SourceNode:
     """Channels of the team's results, for a program that has subscribed to them."""
 
     def begin(self) -> list[Outgoing]:
-        """Publish the stream's initial pose and its head, for receivers that missed them."""
+        """Publish the saved maps, and the stream's initial pose and its head, for receivers that
+        missed them.
+        """
+        maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self.maps]
         if not self._incarnation:
-            return []
+            return maps
         start = self.journal.message(self._incarnation, 0)
-        return [Outgoing(ch.START, self._robot, start), *self.head(again=True)]
+        return [*maps, Outgoing(ch.START, self._robot, start), *self.head(again=True)]
 
     def publish(self) -> list[Outgoing]:
         """Publish the next measurements that credit allows, at most BATCH."""

@@ -246,6 +246,8 @@ ORDER_SIGNATURE = Channel(name="order_signature", template="operator/signature/{
                           recomputable=False, meaning="an operator's signature of an order")  # fmt: skip
 FOLD = Channel(name="fold", template="robot/{robot}/fold", message=m.FoldRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                meaning="the map of the peer's set as it is now")  # fmt: skip
+SITE = Channel(name="site", template="central/site", message=m.FoldRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
+               meaning="the map of the centre's set as it is now, as `saved_map`")  # fmt: skip
 MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False, recomputable=False,
                   meaning="members of the peer's set, as `carried`")  # fmt: skip
 CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="on request", delivery="stream", recorded=False, recomputable=False,
@@ -259,7 +261,7 @@ ENDS = (FINAL_MAP, TEAM_FINAL, CONCLUDED)
 """Messages that end a team: the centre's; without a centre each robot's, about itself."""
 ORDERS = (GIVEN_UP, ORDER, VERDICT, END_ORDER, ORDER_SIGNATURE)
 """Operators' orders, and the signatures with which peers relay them."""
-QUERIES = (MEASUREMENTS, SUBMAPS, SENT, KEPT, MEMBERS, FOLD)
+QUERIES = (MEASUREMENTS, SUBMAPS, SENT, KEPT, MEMBERS, FOLD, SITE)
 REPLIES = {
     MEASUREMENTS: SENSORS,
     SUBMAPS: (START, SUBMAP, SIGHTING_FACTOR),
@@ -267,6 +269,7 @@ REPLIES = {
     KEPT: (*ENDS, *ORDERS),
     MEMBERS: (CARRIED,),
     FOLD: (TEAM_MAP,),
+    SITE: (SAVED_MAP,),
 }
 """The channels of the replies to each query."""
 UNOPENED = (*QUERIES, VIEW)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from teamslam.central.desk.verification.centre import recomputed_centre, recorded_map
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.node import CentralNode, make_centre
+from teamslam.central.saved_maps import NothingToSaveError, save_map
 from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
@@ -25,6 +26,7 @@ from teamslam.team.store import SubmapStore
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, ids
+from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests.air import Air
 from tests.bits import SETS
@@ -131,6 +133,52 @@ def test_a_landmark_that_is_not_seen_again_is_gone_and_is_not_saved_again():
     assert gone[15].expected > 7.0
     saved = centre.maps.fold.save_map("later")
     assert 15 not in ids(saved.ids, "ids")
+
+
+def test_a_running_centre_saves_the_map_of_its_present_set():
+    """The final map of that set, without effect on the running fold; a day counts once."""
+    samples, centre, _ = day(1)
+    members = [s for s in samples if s.key.endswith(("/start", "/submap"))]
+    config, robots = centre.config, list(centre.robots)
+    half, undisturbed = make_centre(config, robots), make_centre(config, robots)
+    request = encoded(m.FoldRequest(stamp_ns=0))
+    with pytest.raises(NothingToSaveError):
+        half.answer_site(request)
+    for number, sample in enumerate(members):
+        message = opened(sample)[2]
+        assert [encoded(o.message) for o in half.handle(message, 0)] == [
+            encoded(o.message) for o in undisturbed.handle(message, 0)
+        ]
+        if number == len(members) // 2:
+            early = decoded(half.answer_site(request)[0], m.SavedMap)
+    whole = decoded(half.answer_site(request)[0], m.SavedMap)
+    assert whole == first_day()[1]
+    assert early.sets == whole.sets
+    assert (
+        np.diag(unpacked(floats(early.covariance, "covariance"), 36)).sum()
+        > np.diag(unpacked(floats(whole.covariance, "covariance"), 36)).sum()
+    )
+
+
+def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
+    """An error of 4 sigma that is called a move would replace years of sure observations."""
+    _, centre, _ = second_day()
+    fold, fused = centre.maps.fold._final
+    by = np.array([0.5, -0.2])
+
+    def covariance(chi2):
+        moved = m.LandmarkChange(landmark=15, state="moved", dx=by[0], dy=by[1], chi2=chi2)
+        saved = save_map(
+            fold, msgspec.structs.replace(fused, changes=(moved,)), "later", {}, bytes(8)
+        )
+        return unpacked(floats(saved.covariance, "covariance"), 2 * len(ids(saved.ids, "ids")))
+
+    more = covariance(20.0) - covariance(40.0)
+    at = 2 * ids(fused.ids, "ids").tolist().index(15)
+    block = more[at : at + 2, at : at + 2].copy()
+    more[at : at + 2, at : at + 2] = 0.0
+    assert np.allclose(block, np.outer(by, by))
+    assert np.abs(more).max() < 1e-12
 
 
 def with_means(change):

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from teamslam import Driver, DriverError, DriverWarning, MeasurementError
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import load
+from teamslam.team.saved_map import write_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
@@ -22,7 +23,7 @@ from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
-from tests.support import ROOT, wait_until
+from tests.support import ROOT, example, wait_until
 
 S = 10**9
 
@@ -75,6 +76,19 @@ def test_points_carry_their_own_covariances(alone):
     assert isinstance(seen, m.Points)
     assert floats(seen.positions, "positions").tolist() == [0.0, 2.0]
     assert floats(seen.covariances, "covariances").tolist() == [0.1, 0.02, 0.2]
+
+
+def test_a_saved_map_is_published_for_the_teams_set(alone, tmp_path):
+    saved, site = example(m.SavedMap), tmp_path / "site.map"
+    write_map(site, saved)
+    robot = alone(map=site)
+    assert robot._node.begin() == [Outgoing(ch.SAVED_MAP, saved.author, saved)]
+    robot.odometry(1.0, 0.0, 0.0)
+    messages(robot)
+    with pytest.raises(DriverError, match="central --map"):
+        alone(map=site, keys=tmp_path)
+    with pytest.raises(DriverError, match="no saved map"):
+        alone(map=tmp_path / "r1.stream")
 
 
 REFUSED = [

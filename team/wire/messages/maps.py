@@ -293,9 +293,9 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     `biases` taken as zero. biases: errors that all sensors share on every day, ascending;
     sensitivity: B × 2L floats: given these errors b the means are means + bᵀ sensitivity. Errors of
     single robots are part of the covariance. counts: number of submaps of each landmark, those of
-    earlier days included. frame: as in FusedMap. sets: digests of the final maps in it, of each
-    day, ascending: two maps with a set in common cannot be joined. software, core: version of the
-    program, digest of the native core.
+    earlier days included. frame: as in FusedMap. sets: for each day in it the digest of that day's
+    first submap, ascending: two maps with a day in common cannot be joined. software, core: version
+    of the program, digest of the native core.
     """
 
     name: Name

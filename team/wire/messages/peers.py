@@ -97,7 +97,7 @@ class Members(Message, frozen=True, kw_only=True, tag="members/1"):
 
 
 class FoldRequest(Message, frozen=True, kw_only=True, tag="fold_wanted/1"):
-    """Query to a peer that folds on request, for the map of its set."""
+    """Query to the centre, or to a peer that folds on request, for the map of its set."""
 
 
 class Certificate(Message, frozen=True, kw_only=True, tag="certificate/1"):
