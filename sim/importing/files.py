@@ -33,13 +33,21 @@ def import_files(
 ) -> tuple[RobotTables, list[str]]:
     """Import one robot's tables from CSV files; also returns notes on the files.
 
+    A file in TUM's format is its odometry, unless a map names it.
     everyones: file names of all robots; a table whose files only other robots have is omitted.
     command: command line to repeat with a map. Raises DatasetError; without a map its text proposes
     one, unless every column has our name.
     """
-    files = {path.name: read_table(path, str(path)) for path in paths}
+    files: dict[str, CsvTable] = {}
+    for path in paths:
+        poses = _tum_table(path)
+        name = path.name if poses is None or columns is not None else "odometry.csv"
+        files[name] = read_table(path, str(path)) if poses is None else poses
     if len(files) < len(paths):
-        raise DatasetError("two files have the same name: import them for one robot each")
+        raise DatasetError(
+            "two files have the same name, or two are trajectories of TUM: import them for one "
+            "robot each"
+        )
     chosen = _by_names(files, command) if columns is None else columns
     tables = RobotTables(robot)
     notes: list[str] = []
@@ -141,30 +149,40 @@ def _joined(tables: Sequence[CsvTable]) -> CsvTable:
     return CsvTable(first.name, columns, first.lines)
 
 
-def trajectory(path: Path) -> list[tuple[str, object, object, object]]:
+def trajectory(path: Path) -> list[tuple[str, ...]]:
     """Rows (t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or in TUM format; raises
     DatasetError.
     """
-    lines = path.read_text("utf-8", errors="replace").splitlines()
-    rows = [line for line in lines if line.strip() and not line.startswith("#")]
+    table = _tum_table(path) or read_table(path, str(path), ("t_s", *POSES))
+    if not table.has("t_s", *POSES):
+        raise table.fault("expected the columns t_s,x_m,y_m,theta_rad, or TUM's format")
+    return list(zip(*(table.columns[name] for name in ("t_s", *POSES)), strict=True))
+
+
+def _tum_table(path: Path) -> CsvTable | None:
+    """Read poses (t x y z qx qy qz qw) in TUM's format; None: another format.
+
+    The heading is that of the pose's x axis. Raises DatasetError.
+    """
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            words = line.split()
+            if not words or words[0].startswith("#"):
+                continue
+            if not rows and (len(words) != QUATERNION or "," in line):
+                return None
+            try:
+                x, y, _, qx, qy, qz, qw = map(float, words[1:])
+            except ValueError:
+                raise DatasetError(
+                    f"{path}, line {number}: expected t x y z qx qy qz qw: `{line.strip()[:60]}`"
+                ) from None
+            theta = atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+            rows.append((words[0], repr(x), repr(y), repr(theta)))
+            lines.append(number)
     if not rows:
         raise DatasetError(f"{path}: no pose in it")
-    if len(rows[0].split()) != QUATERNION:
-        table = read_table(path, str(path), ("t_s", *POSES))
-        if not table.has("t_s", *POSES):
-            raise table.fault("expected the columns t_s,x_m,y_m,theta_rad, or TUM's format")
-        return list(zip(*(table.columns[name] for name in ("t_s", *POSES)), strict=True))
-    found: list[tuple[str, object, object, object]] = []
-    for number, line in enumerate(lines, 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            x, y, _, qx, qy, qz, qw = (float(word) for word in words[1:])
-        except ValueError:
-            raise DatasetError(
-                f"{path}, line {number}: expected t x y z qx qy qz qw: `{line.strip()[:60]}`"
-            ) from None
-        theta = atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
-        found.append((words[0], x, y, theta))
-    return found
+    columns = zip(("t_s", *POSES), map(list, zip(*rows, strict=True)), strict=True)
+    return CsvTable(path.name, dict(columns), lines)

@@ -72,7 +72,11 @@ def import_data(request: Request, folder: Path) -> Report:
     bags = [path for path in request.sources if is_bag(path) and not is_own_log(path)]
     if bags:
         return _bags(request, folder)
-    if source.is_file() and source.suffix in (".csv", ".txt", ".tsv") and not is_graph(source):
+    if (
+        source.is_file()
+        and source.suffix in (".csv", ".txt", ".tsv", ".tum")
+        and not is_graph(source)
+    ):
         return _csv({request.robot or ONE_ROBOT: list(request.sources)}, request, folder)
     if source.is_dir() and (request.columns or len(request.sources) > 1 or _is_foreign(source)):
         return _csv(_files_by_robot(request), request, folder)

@@ -351,6 +351,18 @@ def test_truth_comes_from_a_trajectory_of_tum(tmp_path):
     assert "truth.txt, line 2: expected t x y z qx qy qz qw" in str(result.exception)
 
 
+def test_odometry_comes_from_a_trajectory_of_tum(tmp_path):
+    tum, seen = tmp_path / "wheels.tum", tmp_path / "observations.csv"
+    tum.write_text("# poses\n0 1 2 9 0 0 0 1\n1 2 2 9 0 0 1 0\n2 1 2 9 0 0 1 0\n")
+    seen.write_text("t_s,landmark,range_m,bearing_rad\n1,7,2.0,0.5\n")
+    result = run(tum, seen, "-o", tmp_path / "set")
+    assert result.exit_code == 0, result.output
+    (stream,) = read(tmp_path / "set").streams
+    assert stream.intervals.increments is not None
+    assert np.allclose(stream.intervals.increments, [[1, 0, np.pi], [1, 0, 0]])
+    assert stream.landmark_detections.ids.tolist() == [7]
+
+
 def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path):
     streams = [replace(teams.stream(name, 9), teammates=("r2", "r1")) for name in ("r1", "r2")]
     write_utias(teams.world_of(*streams), tmp_path / "utias")
