@@ -29,12 +29,7 @@ from teamslam.central.localising import (
     saved_landmarks,
 )
 from teamslam.central.monitor import NOTHING, finding
-from teamslam.central.saved_maps import (
-    NO_ROBOT,
-    NothingToSaveError,
-    landmark_changes,
-    save_map,
-)
+from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.tick_fold import TickFold
 from teamslam.central.unnamed_landmarks import verdict_of
@@ -142,7 +137,7 @@ class SubmapFold:
         streams = {whole_of(stream) for stream in self._final[0].home if not is_map(stream)}
         firsts = [self.store.chains[stream][0] for stream in sorted(streams)]
         if not firsts:
-            raise NothingToSaveError(NO_ROBOT)
+            raise NothingToSaveError("no robot has a submap in the final map")
         return min(firsts, key=lambda each: each.stamp_ns)
 
     def _file_members(self) -> None:
