@@ -90,10 +90,6 @@ class Boundary:
         message = self.let_in(sample, lambda: reply_of(payload, expected))
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
-    def give(self, node: Handler, message: m.Message) -> list[Outgoing]:
-        """Let the node handle a decoded message, such as a log's."""
-        return self.hand(node, message)
-
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
         """Decode a sample; returns its message, or the messages to publish if it is invalid."""
         try:

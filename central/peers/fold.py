@@ -127,7 +127,7 @@ class PeerFold:
 
     def _give(self, message: m.Message) -> list[Outgoing]:
         before = self.centre.finished
-        out = self.boundary.give(self.centre, message)
+        out = self.boundary.hand(self.centre, message)
         if self.centre.finished and not before:
             self.final = self.centre.final
             self.finals += 1

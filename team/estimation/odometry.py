@@ -7,7 +7,9 @@ motion on SE(2) with a part to the left, with or without a covariance of its own
 import math
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel
@@ -26,7 +28,7 @@ class Moved(NamedTuple):
     covariance: Float[np.ndarray, "3 3"] | None = None
 
 
-class OdometryInterval(NamedTuple):
+class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
     """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
     moved: the motion, where the odometry reports one; the speeds are then those of its twist.
@@ -49,9 +51,9 @@ class OdometryInterval(NamedTuple):
     def gone_on(self, end_ns: int, duration_ns: int) -> "OdometryInterval":
         """Extrapolate to a later interval at the same speeds."""
         if self.moved is None:
-            return self._replace(end_ns=end_ns, duration_ns=duration_ns)
+            return replace(self, end_ns=end_ns, duration_ns=duration_ns)
         twist = self.moved.twist * (duration_ns / self.duration_ns)
-        return self._replace(end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
+        return replace(self, end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
 
     @property
     def speed(self) -> float:

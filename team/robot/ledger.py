@@ -1,6 +1,6 @@
 """The ledger of law 1: the disposition of each measurement of an incarnation."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
@@ -12,6 +12,7 @@ IN_SIGHTING = "in a sighting factor"
 INITIAL_POSE = "start pose"
 """The disposition of an incarnation's measurement 0."""
 
+NO_SCAN = m.AnyOdometry | m.InitialPose
 
 OnDisposition = Callable[[int, str], None]
 """Receives the counter of a measurement and its disposition; a later call for the same one replaces
@@ -32,7 +33,7 @@ class Ledger:
         self, used: str, resumed: int = 0, on_disposition: OnDisposition | None = None
     ) -> None:
         self.used = used
-        self.counts = Counter({used: resumed} if resumed else {})
+        self.counts: dict[str, int] = defaultdict(int, {used: resumed} if resumed else {})
         self._on_disposition = on_disposition
         self._scans: dict[int, int] = {}
         self._detections: dict[int, int] = {}
@@ -42,20 +43,17 @@ class Ledger:
         self, measurement: m.Measurement, rejected: Rejection | None, used: str | None = None
     ) -> None:
         """Count one more measurement: rejected for this reason, or used."""
-        number, stamp_ns = measurement.number, measurement.stamp_ns
-        taken = self.used if used is None else used
-        if rejected is None:
-            match measurement:
-                case m.Detections():
-                    self._scans[number] = self._detections[number] = stamp_ns
-                case m.Observations() | m.Points():
-                    self._scans[number] = stamp_ns
-                case m.Sightings():
-                    self._sighted.add(number)
-                    taken = IN_SIGHTING
-                case _:
-                    pass
-        disposition = taken if rejected is None else rejected.disposition
+        number = measurement.number
+        disposition = used or self.used
+        if rejected is not None:
+            disposition = rejected.disposition
+        elif type(measurement) is m.Sightings:
+            self._sighted.add(number)
+            disposition = IN_SIGHTING
+        elif not isinstance(measurement, NO_SCAN):
+            self._scans[number] = measurement.stamp_ns
+            if isinstance(measurement, m.Detections):
+                self._detections[number] = measurement.stamp_ns
         self.counts[disposition] += 1
         if self._on_disposition is not None:
             self._on_disposition(number, disposition)

@@ -149,24 +149,27 @@ class Mapper:
     def take(self, measurement: m.Measurement) -> bool:
         """Take the next measurement; returns whether it closed a window."""
         self._taking = measurement
-        # A scan comes before the odometry that ends at its stamp, and that may end a window.
-        is_odometry = isinstance(measurement, m.AnyOdometry)
-        stamp_ns = self._team_ns(measurement)
-        # Where its clock has leapt too far, no receiver takes a submap with such a stamp.
-        is_near = another_time(stamp_ns, self._began_ns) is None
-        if is_near:
-            self.now_ns = max(self.now_ns, stamp_ns)
-            self.passed_ns = max(self.passed_ns, stamp_ns if is_odometry else stamp_ns - 1)
         self.note_input(measurement.number)
         if isinstance(measurement, m.AnyOdometry):
-            return self.drive(measurement, is_near)
+            stamp_ns = measurement.stamp_ns + self._offset_ns
+            return self.drive(measurement, self._note_time(stamp_ns, stamp_ns))
+        # A scan comes before the odometry that ends at its stamp, and that may end a window.
+        is_near = self._note_time(measurement.stamp_ns, measurement.stamp_ns - 1)
         self.account(measurement, self._observe(measurement, is_near))
         return False
 
-    def _team_ns(self, measurement: m.Measurement) -> int:
-        """Team time of a measurement [ns]: odometry is stamped by its own clock."""
-        offset_ns = self._offset_ns if isinstance(measurement, m.AnyOdometry) else 0
-        return measurement.stamp_ns + offset_ns
+    def _note_time(self, stamp_ns: int, passed_ns: int) -> bool:
+        """Note the team time of a measurement and the time that has passed with it.
+
+        False where its clock has leapt so far that no receiver takes a submap with such a stamp.
+        """
+        if another_time(stamp_ns, self._began_ns) is not None:
+            return False
+        if stamp_ns > self.now_ns:
+            self.now_ns = stamp_ns
+        if passed_ns > self.passed_ns:
+            self.passed_ns = passed_ns
+        return True
 
     def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
         """Account for the measurement in progress and add it to the open window."""
@@ -325,7 +328,9 @@ class Mapper:
         """Compute the open window again from its measurements."""
         self._reopen_window()
         for measurement in self._window:
-            is_near = another_time(self._team_ns(measurement), self._began_ns) is None
+            is_odometry = isinstance(measurement, m.AnyOdometry)
+            stamp_ns = measurement.stamp_ns + (self._offset_ns if is_odometry else 0)
+            is_near = another_time(stamp_ns, self._began_ns) is None
             self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
                 interval, rejected = self.judge_interval(measurement, is_near)

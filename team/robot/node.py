@@ -189,10 +189,10 @@ class RobotNode:
         refused = absurd(message)
         if refused is not None:
             return refused
+        if isinstance(message, m.Measurement):  # most messages are
+            own = message.robot == self.robot
+            return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
         match message:
-            case m.Measurement():
-                own = message.robot == self.robot
-                return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
             case m.Progress() if message.incarnation == self.account.incarnation:
                 if message.submaps > self.submaps + AHEAD:
                     return (
@@ -213,7 +213,8 @@ class RobotNode:
             self.inbox.put(message)
         else:
             self.receive(message)
-        return self._publish()
+        self.consume()
+        return self._publish() if self.out else []
 
     def receive(self, message: m.Message) -> None:
         """Take a message that is no measurement."""
@@ -249,18 +250,10 @@ class RobotNode:
         self.mapper.set_aside()
         if self.done and not self._has_sent_done:
             self._send_last_words()
-        return self._publish()
+        self.consume()
+        return self._publish() if self.out else []
 
     # Order and estimate.
-
-    def _publish(self) -> list[Outgoing]:
-        """Consume the measurements whose turn has come; returns all that is to be published."""
-        self.consume()
-        if not self.out:
-            return []
-        out = [*self.out]
-        self.out.clear()
-        return self._sound(out)
 
     def consume(self) -> None:
         """Consume the measurements whose turn has come, while the centre gives credit."""
@@ -272,30 +265,31 @@ class RobotNode:
     @property
     def is_held(self) -> bool:
         """Whether the robot waits for the centre's credit; an absent one need not give any."""
-        ahead = self.mapper.submaps.sent - self.account.acknowledged
-        return ahead > CREDIT_SUBMAPS and bool(self._centre_alive)
+        if not self._centre_alive:
+            return False
+        return self.mapper.submaps.sent - self.account.acknowledged > CREDIT_SUBMAPS
 
     def _consume(self, measurement: m.Measurement) -> None:
-        if isinstance(measurement, m.InitialPose):
+        if type(measurement) is m.InitialPose:
             self._leave_incarnation()
             self.mapper.begin(measurement)
             self.account.begin(measurement.incarnation)
         self.account.count(measurement)
         if self.mapper.take(measurement):
             self.report_progress()
-        if isinstance(measurement, m.Sightings):
+        if type(measurement) is m.Sightings:
             self._release(measurement.teammates)
         self.account.unreported += 1
         if self.account.unreported >= PROGRESS_MEASUREMENTS:
             self.report_progress()
 
-    def _sound(self, out: list[Outgoing]) -> list[Outgoing]:
-        """The messages that every receiver accepts; others are withheld and named.
+    def _publish(self) -> list[Outgoing]:
+        """Take the messages of `out` that every receiver accepts; others are withheld and named.
 
         Of a map what rounding has spoilt is left out.
         """
         sound = []
-        for each in out:
+        for each in self.out:
             why = unsound(each.message)
             if why is not None and isinstance(each.message, m.MapEstimate):
                 each = each._replace(message=translate.receivable(each.message)[0])
@@ -305,6 +299,7 @@ class RobotNode:
             else:
                 self.withheld += 1
                 self.warnings.append(f"withheld: {each.key}, {why}")
+        self.out.clear()
         return sound
 
     def _release(self, seen: tuple[str, ...]) -> None:

@@ -55,18 +55,17 @@ class Inbox:
 
         Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
-        if isinstance(measurement, InitialPose) != (measurement.number == 0):
+        number, incarnation = measurement.number, measurement.incarnation
+        if (type(measurement) is InitialPose) != (number == 0):
             what = type(measurement).__name__
-            return f"{what} as measurement {measurement.number}; the initial pose is measurement 0"
-        if self.next_measurement and measurement.incarnation > self.incarnation + NEAR_LIVES:
-            return (
-                f"of incarnation {measurement.incarnation}, while {self.incarnation} is in progress"
-            )
-        if measurement.incarnation != self.incarnation or self._began_ns is None:
+            return f"{what} as measurement {number}; the initial pose is measurement 0"
+        if incarnation != self.incarnation:
+            if self.next_measurement and incarnation > self.incarnation + NEAR_LIVES:
+                return f"of incarnation {incarnation}, while {self.incarnation} is in progress"
             return None
-        if measurement.number not in self._of_source:
-            return another_time(measurement.stamp_ns, self._began_ns)
-        return None
+        if self._began_ns is None or number in self._of_source:
+            return None
+        return another_time(measurement.stamp_ns, self._began_ns)
 
     def contradicts(self, end: End, robot: str) -> str | None:
         """Why an announced end cannot be the end of the robot's stream."""
@@ -92,7 +91,7 @@ class Inbox:
             if measurement is not None:
                 self._of_source.discard(self.next_measurement)
                 self.next_measurement += 1
-                if isinstance(measurement, InitialPose):
+                if type(measurement) is InitialPose:
                     self._began_ns = measurement.stamp_ns
                 return measurement
             beginnings = [e for e, r in self._later.items() if 0 in r] if self._later else None

@@ -21,6 +21,7 @@ class StreamJudge:
     def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
         self._bounds = bounds
         self._jump_ns = round(bounds.jump_s * 1e9)
+        self._longest_ns = bounds.interval_s * 1e9
         self._now_ns = now_ns
         self._jumped_ns: int | None = None
 
@@ -28,27 +29,27 @@ class StreamJudge:
         """Why an interval is refused: for `Rejection.SPEED` only its motion, otherwise all of
         it.
         """
-        stamp_ns, duration_ns = interval.end_ns, interval.duration_ns
+        stamp_ns, duration_ns, moved = interval.end_ns, interval.duration_ns, interval.moved
         if duration_ns == 0:
             return Rejection.NO_TIME
         if self._now_ns is not None:
-            if stamp_ns <= self._now_ns:
-                return Rejection.OLDER
-            near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
             ahead_ns = stamp_ns - self._now_ns
-            if ahead_ns > self._jump_ns and not 0 < stamp_ns - near_ns <= self._jump_ns:
-                self._jumped_ns = stamp_ns
-                return Rejection.TIME
+            if ahead_ns <= 0:
+                return Rejection.OLDER
+            if ahead_ns > self._jump_ns:
+                near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
+                if not 0 < stamp_ns - near_ns <= self._jump_ns:
+                    self._jumped_ns = stamp_ns
+                    return Rejection.TIME
         self._now_ns, self._jumped_ns = stamp_ns, None
-        bounds, moved = self._bounds, interval.moved
-        claimed = None if moved is None else moved.covariance
         if math.isnan(interval.forward):
             return Rejection.STEERING
+        bounds = self._bounds
         sensible = (
-            duration_ns <= bounds.interval_s * 1e9
+            duration_ns <= self._longest_ns
             and abs(interval.speed) <= bounds.speed_m_s
             and abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
-            and (claimed is None or _spread(claimed, bounds))
+            and (moved is None or moved.covariance is None or _spread(moved.covariance, bounds))
         )
         return None if sensible else Rejection.SPEED
 

@@ -187,10 +187,10 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     channel, name = found
     message: Message = decoded(sample.payload, *channel.kinds)
     robot = getattr(message, "robot", name)
-    if "{robot}" in channel.template and robot != name:
+    if robot != name and "{robot}" in channel.template:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
     sender = _sender_of(channel, message)
-    if sender not in (None, channel.publisher(name)):
+    if sender is not None and sender != channel.publisher(name):
         raise WireError(
             "wrong field", f"a message of {str(sender)[:80]!r} on the key {sample.key!r}"
         )
@@ -223,19 +223,16 @@ def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
             LOG.debug("dropped %s: %s", sample.key[:80], error)
 
 
+_WITH_NODE = {Configuration, Progress, Status, Liveliness, Fault, SetSummary, Members}
+"""Messages that name the node that sends them."""
+
+
 def _sender_of(channel: Channel, message: Message) -> str | None:
     """Return the node that a message names as its sender; None if it names none."""
-    match message:
-        case Configuration() | Progress() | Status() | Liveliness() | Fault():
-            return message.node
-        case SetSummary() | Members():
-            return message.node
-        case Withdrawal() if channel is ORDER:
-            return message.by
-        case TeamEnd() if channel is END_ORDER:
-            return message.by
-        case _:
-            return None
+    if type(message) in _WITH_NODE:
+        return message.node  # type: ignore[attr-defined, no-any-return]
+    is_order = channel is ORDER or channel is END_ORDER
+    return message.by if is_order and isinstance(message, Withdrawal | TeamEnd) else None
 
 
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:

@@ -54,7 +54,7 @@ class Channel:
     meaning: str
     alternatives: tuple[type[m.Message], ...] = ()
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[type[m.Message], ...]:
         """The types of messages on the key."""
         return (self.message, *self.alternatives)

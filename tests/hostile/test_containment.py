@@ -93,7 +93,7 @@ def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measure
     boundary = Boundary("robot/r1")
     said: list[list[m.Message]] = [[], []]
     for measurement in measurements:
-        said[0] += submaps(boundary.give(node, measurement))
+        said[0] += submaps(boundary.hand(node, measurement))
         if measurement is broken:
             without.inbox.next_measurement += 1
         else:
@@ -280,5 +280,5 @@ def test_an_interrupt_within_native_code_ends_the_run_and_is_no_fault():
 
     boundary = Boundary("central")
     with pytest.raises(KeyboardInterrupt):
-        boundary.give(Interrupted(), submap(0))
+        boundary.hand(Interrupted(), submap(0))
     assert boundary.faults == 0

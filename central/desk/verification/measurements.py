@@ -19,7 +19,8 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
     def put(self, message: m.Measurement) -> None:
         """Add a measurement unless its number is present."""
-        if self._messages.setdefault(message.number, message) != message:
+        known = self._messages.setdefault(message.number, message)
+        if known is not message and known != message:
             self.contradicted.append(message.number)
         self._odometry = None
 

@@ -1,8 +1,9 @@
 """Index a log by recorded inputs and recomputable outputs."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TypeVar
 
 import msgspec
@@ -48,7 +49,9 @@ class Recorded:
     on each withdrawn robot. unsound: number of invalid samples.
     """
 
-    measurements: dict[Stream, RecordedMeasurements] = field(default_factory=dict)
+    measurements: dict[Stream, RecordedMeasurements] = field(
+        default_factory=partial(defaultdict, RecordedMeasurements)
+    )
     configured: dict[str, m.Configuration] = field(default_factory=dict)
     outputs: list[RecordedOutput] = field(default_factory=list)
     reported: dict[Stream, int] = field(default_factory=dict)
@@ -76,8 +79,7 @@ class Recorded:
             return
         match message:
             case m.Measurement():
-                stream = (message.robot, message.incarnation)
-                self.measurements.setdefault(stream, RecordedMeasurements()).put(message)
+                self.measurements[message.robot, message.incarnation].put(message)
             case m.Configuration():
                 of_a_fold = channel is ch.TEAM_CONFIG
                 self.configured["central" if of_a_fold else message.node] = message

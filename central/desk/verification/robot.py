@@ -67,7 +67,7 @@ class RecomputedRobot:
 
     def given(self, message: m.Message) -> list[Outgoing]:
         """Handle a message as the shell does, with exceptions contained."""
-        return self._boundary.give(self.node, message)
+        return self._boundary.hand(self.node, message)
 
     def take_known_map(self, log: Recorded) -> None:
         """Handle the log's map, if the robot localises in one."""

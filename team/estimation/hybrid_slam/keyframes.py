@@ -139,18 +139,18 @@ class Segmenter:
         heading.
         """
         stamp_ns, duration_ns = interval.end_ns, interval.duration_ns
+        grid, keyframes = self._grid, []
         if measured:
-            self._last, self._unmeasured = interval, None
-            over = interval
+            self._unmeasured = None
+            over = self._last = interval
         else:
             over = self._last.gone_on(stamp_ns, duration_ns)
             self._unmeasured = _unmeasured(duration_ns * 1e-9, over.speed, over.yaw_rate)
-        keyframes = []
         self._here_ns = stamp_ns - duration_ns
         while self._waiting and self._waiting[0].stamp_ns <= stamp_ns:
             scan = self._waiting.pop(0)
-            if self._grid is not None:
-                keyframes += self._nodes(scan.stamp_ns - 1, over, self._grid)
+            if grid is not None:
+                keyframes += self._nodes(scan.stamp_ns - 1, over, grid)
             at_ns = self._go_on_to(scan.stamp_ns, over)
             if scan.is_unnamed:
                 keyframes += self._look(scan, at_ns)
@@ -159,8 +159,8 @@ class Segmenter:
             else:
                 seen = scan.ids, scan.ranges, scan.bearings
                 keyframes.append(self._keyframe_at(at_ns, *seen, scan.own))
-        if self._grid is not None:
-            keyframes += self._nodes(stamp_ns, over, self._grid)
+        if grid is not None and grid.next_ns <= stamp_ns:
+            keyframes += self._nodes(stamp_ns, over, grid)
         self._go_on_to(stamp_ns, over)
         self.now_ns = stamp_ns
         if self._keyframe and stamp_ns - self._keyframe_start_ns >= self._keyframe_ns:
@@ -214,7 +214,7 @@ class Segmenter:
         their node.
         """
         keyframes = []
-        while (next_ns := grid.next_ns) is not None and next_ns <= until_ns:
+        while (next_ns := grid.next_ns) <= until_ns:
             self._go_on_to(next_ns, over)
             if grid.reach(self._odometry):
                 keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
@@ -222,19 +222,18 @@ class Segmenter:
 
     def _go_on_to(self, stamp_ns: int, over: OdometryInterval) -> int:
         """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
-        if stamp_ns <= self._here_ns:
+        duration_ns = stamp_ns - self._here_ns
+        if duration_ns <= 0:
             return self._here_ns
-        self._integrate(stamp_ns - self._here_ns, over.end_ns - stamp_ns, over)
         self._here_ns = stamp_ns
-        return stamp_ns
-
-    def _integrate(self, duration_ns: int, rest_ns: int, over: OdometryInterval) -> None:
         part_s, added = duration_ns * 1e-9, self._unmeasured
         if over.moved is None:
             self._odometry.drive(part_s, over.forward, over.yaw_rate, added)
-            return
+            return stamp_ns
+        interval_s, rest_ns = over.duration_ns * 1e-9, over.end_ns - stamp_ns
         share, rest = duration_ns / over.duration_ns, rest_ns / over.duration_ns
-        self._odometry.move(*over.moved, over.duration_ns * 1e-9, part_s, share, rest, added)
+        self._odometry.move(*over.moved, interval_s, part_s, share, rest, added)
+        return stamp_ns
 
     def _keyframe_at(
         self,

@@ -87,13 +87,16 @@ class HybridSlam:
             self._start_ns = stamp_ns - interval.duration_ns
             self._segmenter.begin(self._start_ns)
         self._driven_m += abs(interval.speed) * interval.duration_ns * 1e-9
-        for keyframe in self._segmenter.drive(interval, measured=measured):
+        keyframes = self._segmenter.drive(interval, measured=measured)
+        for keyframe in keyframes:
             self._open.advance(keyframe)
             self.last_keyframe_ns = keyframe.stamp_ns
-        if self._is_full(stamp_ns - self._start_ns):
-            return self._close(self._start_ns, stamp_ns, self._segmenter.leave())
-        if self._grid is not None:
-            self._grid.go_on(stamp_ns)
+        lasting_ns = stamp_ns - self._start_ns
+        if keyframes or lasting_ns >= self._window_ns:
+            if self._is_full(lasting_ns):
+                return self._close(self._start_ns, stamp_ns, self._segmenter.leave())
+            if self._grid is not None:
+                self._grid.go_on(stamp_ns)
         return None
 
     def finish(self) -> tuple[ClosedWindow | None, int]:

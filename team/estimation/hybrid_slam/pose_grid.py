@@ -25,6 +25,8 @@ from teamslam.team.estimation.models import Increment, scanned
 from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Float
 
+NEVER_NS = 2**62
+"""Behind every stamp."""
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""
 
@@ -55,7 +57,10 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times of the open window and its inter-robot measurements."""
+    """The grid times of the open window and its inter-robot measurements.
+
+    next_ns: team time of the next node or inter-robot measurement; NEVER_NS where there is none.
+    """
 
     def __init__(self, sensor: Sensor, front_end: FrontEnd) -> None:
         self._sensor = sensor
@@ -64,6 +69,7 @@ class PoseGrid:
         self._window_ns = round(front_end.window_s * 1e9)
         self._teammate_speed = front_end.teammate_speed
         self._begin_ns = self._node_ns = self._last_ns = 0
+        self.next_ns = NEVER_NS
         self._uncovered: list[_Look] = []
         self._ahead: list[_Look] = []
         self._at_node: dict[tuple[int, str], list[tuple[int, CarriedPoint]]] = {}
@@ -74,11 +80,13 @@ class PoseGrid:
         self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
         self._last_ns = stamp_ns + self._window_ns
         self._uncovered, self._ahead, self._at_node = [], [], {}
+        self._find_next()
 
     def go_on(self, stamp_ns: int) -> None:
         """Extend a window that stays open to the next grid time after its planned end."""
         if stamp_ns >= self._begin_ns + self._window_ns:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
+            self._find_next()
 
     def observe(self, stamp_ns: int, counter: int, looks: TeammateScan) -> Rejection | None:
         """Keep inter-robot measurements until odometry covers their time; returns the reason if
@@ -99,15 +107,12 @@ class PoseGrid:
                 seen = of_base(seen, np.array(self._sensor.mount))
             look = _Look(stamp_ns, counter, teammates[k], seen, node_ns)
             self._uncovered.append(look)
+        self._find_next()
         return None if mask.any() else Rejection.SENSOR_LIMITS
 
-    @property
-    def next_ns(self) -> int | None:
-        """Team time of the next node or inter-robot measurement; None where there is none."""
-        times = [look.stamp_ns for look in self._uncovered[:1]]
-        if self._node_ns <= self._last_ns:
-            times.append(self._node_ns)
-        return min(times, default=None)
+    def _find_next(self) -> None:
+        look_ns = self._uncovered[0].stamp_ns if self._uncovered else NEVER_NS
+        self.next_ns = min(look_ns, self._node_ns if self._node_ns <= self._last_ns else NEVER_NS)
 
     def reach(self, odometry: core.Odometry) -> bool:
         """Note that the observer is at `next_ns`, where its odometry has brought it; True if that
@@ -122,11 +127,13 @@ class PoseGrid:
             else:
                 since_node = Increment(*odometry.since_node())
                 self._keep(look, carried_back(look.seen, since_node))
+            self._find_next()
             return False
         for look, since in zip(self._ahead, odometry.reach_node(), strict=True):
             self._keep(look, carried_on(look.seen, Increment(*since)))
         self._ahead = []
         self._node_ns += self._grid_ns
+        self._find_next()
         return True
 
     def sightings(self) -> tuple[NodeSighting, ...]:
