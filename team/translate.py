@@ -7,11 +7,10 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
-from teamslam.team.estimation.map_joining.joining import Contribution, InitialPoseFactor
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
 from teamslam.team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed

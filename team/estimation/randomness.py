@@ -16,7 +16,7 @@ def random_numbers(seed: int, robot: str, incarnation: int, sequence: int) -> co
     return core.Random(_key(seed, robot, incarnation, sequence))
 
 
-def generator(seed: int, robot: str, incarnation: int, sequence: int) -> np.random.Generator:
+def generator(seed: int, robot: str, incarnation: int, sequence: int) -> "np.random.Generator":
     """Make NumPy's generator of the key of `random_numbers`, whose normal numbers are NumPy's."""
     key = int.from_bytes(_key(seed, robot, incarnation, sequence), "little")
     return np.random.Generator(np.random.Philox(key=key))

@@ -129,7 +129,7 @@ def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
 
 
 def resampled(
-    particles: Particles, generator: np.random.Generator
+    particles: Particles, generator: "np.random.Generator"
 ) -> tuple[Particles, Int64[np.ndarray, " M"]]:
     """Equal weights again, each particle a copy of its parent; draws one uniform number."""
     parents = systematic_parents(particles.log_weights, generator.random())
@@ -152,7 +152,7 @@ def propagated_and_updated(
     bearings: Float[np.ndarray, " n"],
     proposal: Proposal,
     resample_below: float,
-    generator: np.random.Generator,
+    generator: "np.random.Generator",
     own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
     """One step: resamples if the particles are thin, moves, then takes the measurements.
@@ -181,7 +181,7 @@ def filter_step(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
     proposal: Proposal,
-    generator: np.random.Generator,
+    generator: "np.random.Generator",
     *,
     own: Own | None = None,
 ) -> tuple[Particles, float]:
@@ -199,7 +199,7 @@ def filter_step(
 
 
 def propagated(
-    particles: Particles, increment: Increment, generator: np.random.Generator
+    particles: Particles, increment: Increment, generator: "np.random.Generator"
 ) -> Particles:
     """Moves the particles without measurements: pose ∘ mean ∘ Exp(xi); weights and landmarks
     stay.

@@ -26,10 +26,10 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     NotDeterminedError,
+    ages,
     joint_marginal,
     settled,
 )
-from teamslam.team.estimation.map_joining.merging import ages
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from teamslam.team.estimation.map_joining.whole_map import end_pose, without
 from teamslam.team.estimation.submap import LocalMap

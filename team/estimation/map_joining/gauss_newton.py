@@ -99,6 +99,11 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 """Exceptions of a solve without a solution: a case to decide on, not a defect."""
 
 
+def ages(count: int) -> Int64[np.ndarray, " count"]:
+    """Ages of new factors: 0."""
+    return np.zeros(count, dtype=np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Island:
     """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.

@@ -40,12 +40,13 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     JoinSettings,
+    ages,
     final_cost,
     is_solvable,
     iterated,
 )
 from teamslam.team.estimation.map_joining.markers import add_markers, warn_of_unmarked
-from teamslam.team.estimation.map_joining.merging import Merge, ages, merge, sighted
+from teamslam.team.estimation.map_joining.merging import Merge, merge, sighted
 from teamslam.team.estimation.map_joining.minima import (
     Minimum,
     Search,

@@ -21,6 +21,7 @@ from teamslam.team.estimation.map_joining.alignment import Alignment, SharedPoin
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
+    ages,
     is_solvable,
     joint_marginal,
 )
@@ -33,7 +34,7 @@ from teamslam.team.estimation.map_joining.island_ties import (
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
 from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
-from teamslam.team.shapes import Float, Int64
+from teamslam.team.shapes import Float
 
 WORTH_TELLING = 1.0
 """Least gain in χ² for which a search is reported: below, it found the place of the first guess."""
@@ -52,11 +53,6 @@ class Waits(NamedTuple):
 
     why: str
     after_search: bool
-
-
-def ages(count: int) -> Int64[np.ndarray, " count"]:
-    """Ages of new factors: 0."""
-    return np.zeros(count, dtype=np.int64)
 
 
 def sighted(

@@ -19,12 +19,13 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
     Island,
+    ages,
     is_solvable,
     iterated,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
-from teamslam.team.estimation.map_joining.merging import ages, sighted
+from teamslam.team.estimation.map_joining.merging import sighted
 from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
 from teamslam.team.estimation.se2 import compose, transformed

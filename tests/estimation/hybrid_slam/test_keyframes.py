@@ -251,7 +251,7 @@ def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_t
     run = [OdometryInterval(*each) for each in zip(*map(np.ndarray.tolist, columns), strict=True)]
     stamps = sorted([1, int(ends[0]), SECOND, SECOND, int(ends[2]) + 5, int(ends[5]) - 1])
     poses, pose = [], np.zeros(3)
-    for end, duration, forward, yaw_rate, *_ in run:
+    for end, duration, forward, yaw_rate, _ in map(msgspec.structs.astuple, run):
         here = end - duration
         for until in (*(s for s in stamps[len(poses) :] if s <= end), None):
             part = (end if until is None else max(until, here)) - here
