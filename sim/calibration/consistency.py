@@ -28,12 +28,12 @@ from teamslam.team.estimation.contribution import InitialPoseFactor, Stream
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
+    ages,
     joint_marginal,
     settled,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost
-from teamslam.team.estimation.map_joining.merging import ages
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
 from teamslam.team.shapes import Float
 
