@@ -16,6 +16,7 @@ also be larger than that which a single submap resolves.
 """
 
 import math
+from bisect import insort
 from collections.abc import Iterator
 from typing import Final, Literal, NamedTuple
 
@@ -69,6 +70,10 @@ PROPOSED = 3
 """Most hypotheses of a kind that are solved in a round, by their evidence in the scan."""
 ROUNDS = 6
 """Most causes that are accepted."""
+
+
+ALL = slice(None)
+"""Every observation."""
 
 
 class Sights(NamedTuple):
@@ -149,10 +154,10 @@ class _Two(NamedTuple):
     evidence: float
 
 
-def _chi2_about(sights: Sights, point: Values) -> Values:
-    """Evaluate each observation's χ² about a place, at most FAR."""
-    x, y = (sights.points - point).T
-    xx, xy, yy = sights.spread.T
+def _chi2_about(sights: Sights, point: Values, own: slice = ALL) -> Values:
+    """Evaluate the χ² of each of some observations about a place, at most FAR."""
+    x, y = (sights.points[own] - point).T
+    xx, xy, yy = sights.spread[own].T
     chi2: Values = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     bounded: Values = np.minimum(chi2, FAR)
     return bounded
@@ -160,12 +165,28 @@ def _chi2_about(sights: Sights, point: Values) -> Values:
 
 def _centre(sights: Sights, own: Bool[np.ndarray, " n"]) -> Values:
     """Median place of some observations [m]."""
-    return np.array([float(np.median(sights.points[own, k])) for k in (0, 1)])
+    centre: Values = np.median(sights.points[own], axis=0)
+    return centre
+
+
+def _running_medians(values: Values) -> Values:
+    """Compute the medians of the first 1, 2, … n values."""
+    ordered: list[float] = []
+    medians = []
+    for k, value in enumerate(values.tolist()):
+        insort(ordered, value)
+        medians.append(0.5 * (ordered[k // 2] + ordered[(k + 1) // 2]))
+    return np.array(medians)
+
+
+def _least_side(n: int) -> int:
+    """Fewest of n observations at a place: a few misread ones are no second place."""
+    return max(LEAST_SIDE, math.ceil(STRAY * n))
 
 
 def _is_shared(own: Bool[np.ndarray, " n"]) -> bool:
-    """Whether both sides have enough observations: a few misread ones are no second place."""
-    least = max(LEAST_SIDE, math.ceil(STRAY * len(own)))
+    """Whether both sides have enough observations."""
+    least = _least_side(len(own))
     return least <= int(own.sum()) <= len(own) - least
 
 
@@ -181,10 +202,19 @@ def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _
 
 def change_of(sights: Sights) -> _Two | None:
     """Find the time at which a landmark's place changes most."""
-    n = len(sights.places)
-    sides = (np.arange(n) >= first for first in range(1, n))
-    found = (_split_by(sights, late, 0.0) for late in sides if _is_shared(late))
-    return max(found, key=lambda each: each.evidence, default=None)
+    n, least = len(sights.places), _least_side(len(sights.places))
+    if n < 2 * least:
+        return None
+    before = np.column_stack([_running_medians(each) for each in sights.points.T])
+    behind = np.column_stack([_running_medians(each[::-1])[::-1] for each in sights.points.T])
+    two = [
+        float(_chi2_about(sights, before[first - 1], slice(first)).sum())
+        + float(_chi2_about(sights, behind[first], slice(first, None)).sum())
+        for first in range(least, n - least + 1)
+    ]
+    one = float(_chi2_about(sights, before[-1]).sum())
+    best = int(np.argmax(one - np.array(two)))
+    return _Two(np.arange(n) >= least + best, one - two[best])
 
 
 def clusters_of(sights: Sights) -> _Two | None:

@@ -12,6 +12,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     aged,
+    ages,
     final_cost,
     iterated,
     settled,
@@ -24,7 +25,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     landmark_map,
     prior_for,
 )
-from teamslam.team.estimation.map_joining.merging import ages, sighted
+from teamslam.team.estimation.map_joining.merging import sighted
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
