@@ -87,9 +87,9 @@ def calibrate_models(
     Raises CalibrationError for insufficient measurements.
     """
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
-        found = _by_truth(worlds, scenario, progress)
+        found = _calibrate_by_truth(worlds, scenario, progress)
     else:
-        found = _by_the_map(worlds, scenario, progress)
+        found = _calibrate_by_map(worlds, scenario, progress)
     robots = dict.fromkeys(stream.robot for _, world in worlds for stream in world.streams)
     found = replace(found, team=tuple(robots))
     windows = [
@@ -106,7 +106,7 @@ def calibrate_models(
     return replace(found, detections=figures, notes=(*found.notes, *notes))
 
 
-def _by_truth(
+def _calibrate_by_truth(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
     data, notes = against_truth(worlds, scenario)
@@ -161,7 +161,7 @@ def _clock_figures(found: Mapping[str, clocks.Clock], scenario: Scenario) -> Map
     }
 
 
-def _clocks_by_map(
+def _align_clocks_by_map(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> tuple[Sequence[tuple[str, WorldStreams]], Mapping[str, clocks.Clock]]:
     """Move each robot's detections to its odometry's clock; returns the worlds and the clocks."""
@@ -192,10 +192,10 @@ def against_truth(
     notes: list[str] = []
     for label, world in worlds:
         paths = true_paths(world.streams)
-        turning = _turning_first(world, scenario)
+        turning = _find_turning_first(world, scenario)
         given = world, paths, _positions(world), TRUTH_GAP_NS, label, turning
         data += references(*given, scenario.robots[0])
-        notes += _left_out(label, world, paths, "no ground truth")
+        notes += _note_left_out(label, world, paths, "no ground truth")
     return data, notes
 
 
@@ -214,24 +214,24 @@ def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:
     )
 
 
-def _by_the_map(
+def _calibrate_by_map(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
     learnt = scenario
     figures: tuple[Figure, ...] = ()
-    worlds, of_clocks = _clocks_by_map(worlds, scenario, progress)
+    worlds, of_clocks = _align_clocks_by_map(worlds, scenario, progress)
     for turn in range(ROUNDS):
         data, notes = [], []
         for label, world in worlds:
             progress(f"joined map of {label}, {turn + 1} of {ROUNDS}")
-            mistrusting = _mistrusting(learnt)
+            mistrusting = _widen_motion(learnt)
             team = joined_team(world, mistrusting, lambda robot: progress(f"  {robot} is done"))
-            turning = _turning_first(world, scenario)
+            turning = _find_turning_first(world, scenario)
             given = world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning
             data += references(*given, scenario.robots[0])
-            notes += _left_out(label, world, team.paths, "not in the team's joined map")
+            notes += _note_left_out(label, world, team.paths, "not in the team's joined map")
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
-        figures = tuple(_with_systematic(f) for f in found)
+        figures = tuple(_add_systematic(f) for f in found)
         learnt = with_figures(scenario, figures, ())
     teams = []
     for label, world in worlds:
@@ -239,7 +239,7 @@ def _by_the_map(
         teams.append(joined_team(world, learnt))
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
-        of_central = _by_cost(teams[0], scenario.central, progress)
+        of_central = _fit_factor_by_cost(teams[0], scenario.central, progress)
     note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
@@ -249,7 +249,9 @@ def _by_the_map(
     )
 
 
-def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tuple[Figure, ...]:
+def _fit_factor_by_cost(
+    team: JoinedTeam, central: CentralConfig, progress: Progress
+) -> tuple[Figure, ...]:
     """Covariance factor for too few robots to compare, whose unnamed landmarks depend on it through
     association.
     """
@@ -261,12 +263,12 @@ def _by_cost(team: JoinedTeam, central: CentralConfig, progress: Progress) -> tu
     return () if figure is None else (figure,)
 
 
-def _turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
+def _find_turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[str]:
     names = (stream.robot for stream in world.streams)
     return frozenset(n for n in names if config_of(n, scenario).motion.kind == "turn-then-drive")
 
 
-def _left_out(
+def _note_left_out(
     label: str, world: WorldStreams, paths: Mapping[str, Path], pathless: str
 ) -> list[str]:
     """Robots without usable data, with the reason."""
@@ -278,7 +280,7 @@ def _left_out(
     ]
 
 
-def _with_systematic(figure: Figure) -> Figure:
+def _add_systematic(figure: Figure) -> Figure:
     if figure.name != "forward_scale":
         return figure
     return replace(figure, sigma=float(np.hypot(figure.sigma, SYSTEMATIC * figure.value)))
@@ -319,7 +321,7 @@ def _alarms(figures: Sequence[Figure], scenario: Scenario) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _mistrusting(scenario: Scenario) -> Scenario:
+def _widen_motion(scenario: Scenario) -> Scenario:
     def wider(noise: MotionNoise) -> MotionNoise:
         fields = msgspec.structs.asdict(noise)
         return MotionNoise(**{name: MISTRUST * value for name, value in fields.items()})

@@ -116,7 +116,7 @@ def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStrea
     teammates' paths stay comparable.
     """
     streams = tuple(
-        _moved(each, clocks[each.robot])
+        _move_detections(each, clocks[each.robot])
         if each.robot in clocks and clocks[each.robot].is_off
         else each
         for each in world.streams
@@ -124,7 +124,7 @@ def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStrea
     return replace(world, streams=streams)
 
 
-def _moved(stream: RobotStream, clock: Clock) -> RobotStream:
+def _move_detections(stream: RobotStream, clock: Clock) -> RobotStream:
     seen_ns, driven_ns = (round(each.value * 1e9) for each in (clock.detections, clock.odometry))
     intervals = replace(stream.intervals, end_ns=stream.intervals.end_ns - driven_ns)
     observations, sightings = (
@@ -155,7 +155,7 @@ def _at(data: Reference, late_ns: int) -> Reference:
     return replace(data, path=Path(data.path.stamps_ns + late_ns, data.path.poses))
 
 
-def _settled(step_at: Callable[[int], float | None]) -> float | None:
+def _settle_time(step_at: Callable[[int], float | None]) -> float | None:
     """Add steps to a time [s] until one is below SETTLED_S; None if undetermined or beyond
     LARGEST_S.
 
@@ -195,7 +195,7 @@ def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
             return None
         return _step(points, true, (later - earlier) / (2e-9 * STEP_NS), sensor)
 
-    return _settled(step_at)
+    return _settle_time(step_at)
 
 
 def _step(
@@ -249,7 +249,7 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
         sigma = 1.4826 * float(np.median(np.abs(gap))) + 1e-9
         return float(huber(_affine(gap, J), np.full(len(gap), sigma), np.zeros(3))[2])
 
-    return _settled(step_at)
+    return _settle_time(step_at)
 
 
 def _turns(

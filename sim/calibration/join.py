@@ -136,7 +136,7 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     stamps: list[int] = []
     window = slam.window
     longest_ns = LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
-    for message in _merged(stream, longest_ns):
+    for message in _merge(stream, longest_ns):
         if not isinstance(message, m.AnyOdometry):
             slam.observe(message.stamp_ns, translate.scan_of(message))
             continue
@@ -151,7 +151,7 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
 
 
-def _merged(
+def _merge(
     stream: RobotStream, longest_ns: int
 ) -> Iterator[m.AnyScan | m.Detections | m.AnyOdometry]:
     """A stream's scans and odometry, with intervals of one command between scans merged.

@@ -77,7 +77,7 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
     for name, sigma_of_fit in zip(next(iter(found.values()))[0], sigmas, strict=True):
         parts = [np.array([values[name] for values in each]) for each in found.values()]
         means = np.array([part.mean() for part in parts])
-        stray = max(_within(parts), float(sigma_of_fit))
+        stray = max(_spread_in_robot(parts), float(sigma_of_fit))
         of_means = stray**2 / counts
         between = float(np.var(means, ddof=1))
         off.append(np.sqrt(counts) * (means - means.mean()))
@@ -101,7 +101,7 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
     return Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
 
 
-def _within(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
+def _spread_in_robot(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
     """Spread of a robot's values, from the median of |v − v̄| √(n/(n − 1))."""
     off = [np.abs(part - part.mean()) * np.sqrt(len(part) / (len(part) - 1)) for part in parts]
     return MAD_TO_SIGMA * float(np.median(np.concatenate(off)))

@@ -60,7 +60,7 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
     for name, figures, declared in _parts(calibration):
         comments += [f"# {name}.{f.name}: {f.value:.5g} {_uncertainty(f)}" for f in figures]
         first, *inner = name.split(".")
-        learnt = nest_figures({}, [_rounded(figure) for figure in figures], declared)
+        learnt = nest_figures({}, [_round_figure(figure) for figure in figures], declared)
         if not learnt:
             continue
         below = document.setdefault(first, {})
@@ -76,18 +76,18 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
         robots += [{"id": name} for name in dict.fromkeys(named) if name not in known]
     by_id = {robot.get("id"): robot for robot in robots}
     for name, figures in calibration.robots.items():
-        of_robot = [_rounded(figure) for figure in figures]
+        of_robot = [_round_figure(figure) for figure in figures]
         by_id[name]["sensor"] = nest_figures(by_id[name].get("sensor", {}), of_robot, Sensor)
     for name, clock in calibration.clocks.items():
         comments.append(f"# {name} clock_offset_s: {clock.value:.5g} {_uncertainty(clock)}")
-        by_id[name]["clock_offset_s"] = _rounded(clock).value
+        by_id[name]["clock_offset_s"] = _round_figure(clock).value
     if robots:
         document.pop("robot_count", None)
         document["robots"] = robots
     return "\n".join([*_head(calibration, sources), *comments, "", tomli_w.dumps(document)])
 
 
-def _rounded(figure: Figure) -> Figure:
+def _round_figure(figure: Figure) -> Figure:
     return replace(figure, value=float(f"{figure.value:.5g}"))
 
 

@@ -20,7 +20,7 @@ def measurements_of(path: Path) -> tuple[WorldStreams, Scenario]:
     DatasetError, LogError or ScenarioError.
     """
     if path.suffix != ".mcap":
-        scenario = _with_its_robots(path)
+        scenario = _read_with_its_robots(path)
         return streams_of(scenario), scenario
     return measurements_in(path)
 
@@ -31,7 +31,7 @@ def own_scenario(path: Path) -> str | None:
     return own if own not in builtin_names() else None
 
 
-def _with_its_robots(path: Path) -> Scenario:
+def _read_with_its_robots(path: Path) -> Scenario:
     """Data set's scenario with all robots that have files."""
     own = scenario_beside(path)
     if own != "utias":

@@ -19,10 +19,10 @@ def moving_stretches(streams: Iterable[RobotStream]) -> int:
 
     An upper bound: a calibration omits stretches with an unknown reference path.
     """
-    return sum(map(_moving, streams))
+    return sum(map(_count_moving, streams))
 
 
-def _moving(stream: RobotStream) -> int:
+def _count_moving(stream: RobotStream) -> int:
     driven = stream.intervals
     if not len(driven.end_ns):
         return 0

@@ -149,7 +149,7 @@ def read_table(file: File, name: str, known: Sequence[str] | None = None) -> Csv
     except csv.Error as error:
         raise DatasetError(f"{name}, line {rows.line_num}: {error}; check its quotes") from None
     if delimiter != ",":
-        cells = _with_points(cells)
+        cells = _replace_commas(cells)
     if not header[0] and all(row[0] in (str(k), str(k + 1)) for k, row in enumerate(cells)):
         header, cells = header[1:], [row[1:] for row in cells]  # an index, as pandas writes it
     lowered = {column.lower(): column for column in known or ()}
@@ -182,7 +182,7 @@ def _delimiter(lines: Sequence[str]) -> str:
     return next((mark for mark in (",", ";", "\t") if mark in first), ",")
 
 
-def _with_points(cells: list[list[str]]) -> list[list[str]]:
+def _replace_commas(cells: list[list[str]]) -> list[list[str]]:
     """Convert decimal commas to points, unless points occur."""
     if any(POINT.fullmatch(cell) for row in cells for cell in row):
         return cells

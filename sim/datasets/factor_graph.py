@@ -88,14 +88,14 @@ class FactorGraph:
         for before, after in pairwise(ordered):
             if (before, after) not in links:
                 raise DatasetError(
-                    f"{self.name}: no edge from pose {_shown(before)} to pose {_shown(after)}: a "
-                    "robot's odometry links each pose to the next; number the poses in order, or "
+                    f"{self.name}: no edge from pose {_show_key(before)} to pose {_show_key(after)}: "
+                    "a robot's odometry links each pose to the next; number the poses in order, or "
                     "cut the file there"
                 )
         return ordered, [links[pair] for pair in pairwise(ordered)]
 
 
-def _shown(key: Key) -> str:
+def _show_key(key: Key) -> str:
     return f"{key[0]}{key[1]}"
 
 
@@ -124,13 +124,13 @@ def dead_reckoned(graph: FactorGraph) -> None:
         pose = graph.poses.setdefault(keys[0], np.zeros(3))
         for edge in edges:
             heading = on_circle(pose[2:] + edge.motion[2:])
-            end = np.concatenate((_placed(pose, edge.motion[:2]), heading))
+            end = np.concatenate((_place_point(pose, edge.motion[:2]), heading))
             pose = graph.poses.setdefault(edge.end, end)
     for seen in graph.point_edges:
-        graph.landmarks.setdefault(seen.landmark, _placed(graph.poses[seen.pose], seen.point))
+        graph.landmarks.setdefault(seen.landmark, _place_point(graph.poses[seen.pose], seen.point))
 
 
-def _placed(pose: Pose, point: Point) -> Point:
+def _place_point(pose: Pose, point: Point) -> Point:
     """Point in the frame of a pose."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.asarray(pose[:2] + np.array([[c, -s], [s, c]]) @ point)

@@ -124,7 +124,10 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
     truth_ns, poses, more = rows.truth_of(truth, driven)
     notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
     pose = None if start is None else rows.start_of(start)
-    landmarks, mates = together(_with_empty(seen.grouped(), empty_ns), unnamed), teammates.grouped()
+    landmarks, mates = (
+        together(_insert_empty(seen.grouped(), empty_ns), unnamed),
+        teammates.grouped(),
+    )
     begins = (np.array(driven or (), np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
     return RobotStream(
         robot=robot,
@@ -153,7 +156,7 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     return table.filled(REQUIRED[kind]) if len(table) else None
 
 
-def _with_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
+def _insert_empty(seen: Detections, empty_ns: Int64[np.ndarray, " E"]) -> Detections:
     empty_ns = np.setdiff1d(empty_ns, seen.stamps_ns)
     stamps = np.concatenate([seen.stamps_ns, empty_ns])
     counts = np.concatenate([np.diff(seen.offsets), np.zeros(len(empty_ns), np.int64)])

@@ -63,7 +63,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     used = slice(None)
     if form == POSES:
         steps, ends, used = between(numbers), stamps[1:], slice(1, None)
-        steps = _without_resets(rows, numbers, steps, duration)
+        steps = _omit_resets(rows, numbers, steps, duration)
     elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
         steps, ends, used = numbers[:-1], stamps[1:], slice(0, -1)
     else:
@@ -73,7 +73,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     if len(duration) and duration.max() > LONG_GAP_NS:
         seconds = duration.max() * 1e-9
         rows.notes.append(f"odometry has a gap of {seconds:.1f} s: one interval lasts as long")
-    claims = _claimed(rows, form, used)
+    claims = _covariances_of(rows, form, used)
     if form in (SPEEDS, STEERED):
         forward, yaw_rate = steps.T.copy() if len(steps) else np.zeros((2, 0))
         motions = numbers_in(rows.table, INCREMENTS, forms)[used]
@@ -124,7 +124,7 @@ def _drop_other_clocks(rows: Rows) -> None:
     )
 
 
-def _without_resets(
+def _omit_resets(
     rows: Rows,
     poses: Float[np.ndarray, "N 3"],
     steps: Float[np.ndarray, "M 3"],
@@ -154,14 +154,16 @@ def _without_resets(
     return np.where(reset[:, np.newaxis], rates * seconds[:, np.newaxis], steps)
 
 
-def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray, "N 3 3"] | None:
+def _covariances_of(
+    rows: Rows, form: tuple[str, ...], used: slice
+) -> Float[np.ndarray, "N 3 3"] | None:
     """Motion covariances of these rows, or None."""
     table = rows.table
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
     matrices = pose_covariances(table)
     given = ~np.isnan(matrices[:, 0, 0])
-    of_motions = given if form != STEERED else _filled(table, INCREMENTS)
+    of_motions = given if form != STEERED else _find_filled(table, INCREMENTS)
     for row in np.flatnonzero(given & ~of_motions)[:1].tolist():
         raise table.error(
             row,
@@ -178,7 +180,7 @@ def _claimed(rows: Rows, form: tuple[str, ...], used: slice) -> Float[np.ndarray
     return matrices[used]
 
 
-def _filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, " rows"]:
+def _find_filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, " rows"]:
     if not table.has(*columns):
         return np.zeros(len(table), np.bool_)
     return np.asarray(~np.isnan(table.known_numbers(*columns)).any(axis=1))

@@ -24,7 +24,7 @@ def kind_of(path: str | Path) -> Kind:
         with tables.open_data_set(str(path), UTIAS_MARKER):
             return "utias"
     except tables.MarkerError:
-        inner = _with_tables_within(Path(path))
+        inner = _find_tables_within(Path(path))
         if inner is not None:
             raise DatasetError(
                 f"{path}: the data set is in its folder {inner}: give that"
@@ -49,7 +49,7 @@ def _other_tables(place: Path) -> list[str]:
     return [each.relative_to(place).as_posix() for each in found]
 
 
-def _with_tables_within(place: Path) -> Path | None:
+def _find_tables_within(place: Path) -> Path | None:
     """First inner folder that is a data set of tables."""
     if not place.is_dir():
         return None

@@ -114,7 +114,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     labels = labels_of(
         _table(root, "labels.csv") if (root / "labels.csv").is_file() else None, len(detections)
     )
-    take = _of_car if form == CAR else _of_steps
+    take = _read_car if form == CAR else _read_steps
     intervals, seen = take(odometry, detections, labels)
     if not len(intervals.end_ns):
         raise odometry.fault("no odometry interval in its rows: there is nothing to run")
@@ -123,7 +123,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     outside = int(np.sum((seen.stamps_ns < start_ns) | (seen.stamps_ns > end_ns)))
     seen = seen.within(start_ns, end_ns)
     if world.identities == "known":
-        seen = _named(seen)
+        seen = _name_by_labels(seen)
     gps_ns, gps = _positions(root)
     notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
     if form == CAR:
@@ -145,7 +145,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     return whole.until(start_ns + round(world.duration_s * 1e9))
 
 
-def _of_car(
+def _read_car(
     odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
 ) -> tuple[Intervals, Detections]:
     """Convert a car's tables; odometry holds until the next row, the first also before its time."""
@@ -168,7 +168,7 @@ def _of_car(
     return intervals, scans_of(detections, seen_ns, *_columns(polar), labels, None, diameters)
 
 
-def _of_steps(
+def _read_steps(
     odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
 ) -> tuple[Intervals, Detections]:
     steps = _steps(odometry)
@@ -196,7 +196,7 @@ def _steps(table: CsvTable) -> Int64[np.ndarray, " rows"]:
     return table.numbers("step")[:, 0].astype(np.int64)
 
 
-def _named(seen: Detections) -> Detections:
+def _name_by_labels(seen: Detections) -> Detections:
     """Scans with labels as identities, for comparison; unlabelled detections are omitted."""
     message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
     chosen = seen.ids != NO_LABEL
@@ -258,8 +258,8 @@ def _piece(
     seen = whole.landmark_detections
     # A scan at an interval's end belongs to it; one at the first start to the first.
     mine = seen.within(begin_ns + (index > 0), end_ns)
-    truth_ns, truth = _within(whole.truth_ns, whole.truth, begin_ns, end_ns, back)
-    gps_ns, gps = _within(whole.positions_ns, whole.positions, begin_ns, end_ns, back)
+    truth_ns, truth = _cut_values(whole.truth_ns, whole.truth, begin_ns, end_ns, back)
+    gps_ns, gps = _cut_values(whole.positions_ns, whole.positions, begin_ns, end_ns, back)
     return RobotStream(
         robot=names[index],
         start_ns=zero_ns,
@@ -276,7 +276,7 @@ def _piece(
     )
 
 
-def _within(
+def _cut_values(
     stamps_ns: Int64[np.ndarray, " G"] | None,
     values: Float[np.ndarray, "G n"] | None,
     begin_ns: int,

@@ -27,7 +27,7 @@ def intervals_of(
     rows: Float[np.ndarray, "N 3"], delay_ns: int
 ) -> tuple[Intervals, tuple[str, ...]]:
     """Odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
-    rows, backward = _by_time(rows)
+    rows, backward = _sort_by_time(rows)
     stamps = nanoseconds(rows[:, 0]) + delay_ns
     duration = np.diff(stamps)
     lasting = duration > 0
@@ -55,7 +55,7 @@ def measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
 ) -> tuple[Scans, tuple[str, ...]]:
     """Convert measurement rows (t, barcode, range, bearing) to measurements by subject."""
-    rows, backward = _by_time(rows)
+    rows, backward = _sort_by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
     at = np.minimum(np.searchsorted(codes, rows[:, 1]), len(codes) - 1)
@@ -85,7 +85,7 @@ def truth_of(
     rows: Float[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
     """Unchanged ground truth rows (t, x, y, θ) by time."""
-    rows, backward = _by_time(rows)
+    rows, backward = _sort_by_time(rows)
     stamps = nanoseconds(rows[:, 0])
     notes = [
         count_note(backward, "ground truth row", "earlier than the row before: sorted by time")
@@ -120,7 +120,7 @@ def start_pose(
     return np.array([at[0], at[1], on_circle(np.array(at[2] + poses[middle, 2])).item()])
 
 
-def _by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
+def _sort_by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
     """Sort rows stably by the first column; also returns the number of backward steps."""
     backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward

@@ -67,7 +67,7 @@ class _Seat:
     def take(self, now_ns: int) -> bool:
         samples = self.link.arrived(self.bus.receive(0.0), now_ns)
         for sample in samples:
-            message = self.boundary.let_in(sample, partial(_opened, sample))
+            message = self.boundary.let_in(sample, partial(_open_sample, sample))
             if isinstance(message, list):
                 self.send(message)
             else:
@@ -76,7 +76,7 @@ class _Seat:
 
 
 @lru_cache(maxsize=SHARED)
-def _opened(sample: Sample) -> m.Message:
+def _open_sample(sample: Sample) -> m.Message:
     """Decode a sample once for all its receivers, which do not change it."""
     return opened(sample)[2]
 

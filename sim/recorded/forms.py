@@ -77,7 +77,7 @@ def landmarks_of(
     if not unnamed:
         return seen
     scans = [translate.scan_of(each) for each in unnamed]
-    known = {} if labels is None else _by_time(labels)
+    known = {} if labels is None else _index_by_time(labels)
     nothing = np.empty(0, np.uint32)
     own = [
         given if len(given) == len(scan.ids) else np.full(len(scan.ids), NO_LABEL, np.uint32)
@@ -100,7 +100,7 @@ def landmarks_of(
     return together(seen, hidden)
 
 
-def _by_time(labels: m.TruthLabels) -> Mapping[int, UInt32[np.ndarray, " R"]]:
+def _index_by_time(labels: m.TruthLabels) -> Mapping[int, UInt32[np.ndarray, " R"]]:
     ends = np.cumsum(ids(labels.counts, "counts").astype(np.int64))
     parts = np.split(ids(labels.labels, "labels").astype(np.uint32), ends[:-1])
     return dict(zip(stamps(labels.stamps, "stamps").tolist(), parts, strict=True))

@@ -31,11 +31,11 @@ def _with_the_map(
     if prior is None:
         return closed
     pending = submaps[max(prior.sequence + 1, 0) :]
-    fed = _fed(translate.prior_of(prior), pending, closed.local)
+    fed = _feed(translate.prior_of(prior), pending, closed.local)
     return replace(closed, local=fed, sightings=())  # its pose nodes are gone
 
 
-def _fed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
+def _feed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
     """As `with_prior`; the window alone once the covariance has become singular."""
     try:
         fed = with_prior(prior, pending, local)
@@ -53,11 +53,11 @@ def with_prior(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) 
     whole = prior.whole
     for each in pending:
         whole = joined(whole, each)
-    fed = joined(_seen_from_its_pose(whole, local.ids), local)
+    fed = joined(_express_in_its_pose(whole, local.ids), local)
     return LocalMap(fed.ids, fed.mean, fed.covariance)
 
 
-def _seen_from_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
+def _express_in_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
     """The landmarks `ids` of a map in the frame of its pose, which is then zero and certain.
 
     l' = R(θ)ᵀ (l − p), with its Jacobian.

@@ -42,7 +42,7 @@ def named_document(name: str) -> tuple[Fields, str]:
     """Document of a built-in scenario or user file, merged over its base; and its short name."""
     if name in builtin_names():
         return _builtin(name), name
-    return _based(own_document(name)), Path(name).stem
+    return _resolve_base(own_document(name)), Path(name).stem
 
 
 def own_document(name: str) -> Fields:
@@ -67,7 +67,7 @@ def own_document(name: str) -> Fields:
         text = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"can not be read as UTF-8 text: {error}") from None
-    document = _parsed(text)
+    document = _parse(text)
     world = document.get("world")
     if isinstance(world, dict) and isinstance(world.get("path"), str) and world["path"]:
         world["path"] = str(archive or Path(name).parent / world["path"])
@@ -107,7 +107,7 @@ def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
         at = f"robots[{i}]"
         _check_part(checked_table(robot, at), RobotConfig, at, {"id": "r1"})
     fields["robots"] = [
-        _merged({"id": f"r{i}"} | defaults, robot) for i, robot in enumerate(robots, 1)
+        _merge({"id": f"r{i}"} | defaults, robot) for i, robot in enumerate(robots, 1)
     ]
     _check_part(checked_table(fields.get("central", {}), "central"), CentralConfig, "central", {})
     return {"team": fields["name"]} | fields
@@ -142,19 +142,19 @@ def checked_count(count: object) -> int:
 
 
 def _builtin(name: str) -> Fields:
-    return _based(
-        _parsed(files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
+    return _resolve_base(
+        _parse(files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
     )
 
 
-def _parsed(text: str) -> Fields:
+def _parse(text: str) -> Fields:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"not valid TOML: {error}; texts stand in quotes") from None
 
 
-def _based(document: Fields) -> Fields:
+def _resolve_base(document: Fields) -> Fields:
     """Merge the document over its built-in base scenario."""
     if "base" not in document:
         return document
@@ -174,16 +174,16 @@ def _based(document: Fields) -> Fields:
         below.pop("world", None)  # its fields are another world's
     if "robot_count" in own:
         below.pop("robots", None)
-    return _merged(below, own)
+    return _merge(below, own)
 
 
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
+def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
     """Merge tables at every depth; other values are replaced."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)
         both = isinstance(old, dict) and isinstance(value, dict)
-        merged[key] = _merged(old, value) if both and old is not None else value
+        merged[key] = _merge(old, value) if both and old is not None else value
     return merged
 
 

@@ -78,7 +78,7 @@ def load(name_or_path: str | Path) -> Scenario:
     name = str(name_or_path)
     known = list(types_of(Scenario))
     try:
-        return _converted(resolved(*named_document(name), known))
+        return _convert(resolved(*named_document(name), known))
     except ScenarioError as error:
         raise ScenarioError(f"{name}: {error}") from error.__cause__
 
@@ -126,11 +126,11 @@ def with_options(
 
         robots = robot_count(world["path"])
     if robots is not None:
-        fields["robots"] = _counted(fields["robots"], robots)
+        fields["robots"] = _fit_count(fields["robots"], robots)
     if world["kind"] in ("unlabelled", "graph"):  # its log is cut into r1, r2, …
         numbered = enumerate(fields["robots"], start=1)
         fields["robots"] = [robot | {"id": f"r{number}"} for number, robot in numbered]
-    return _converted(fields)
+    return _convert(fields)
 
 
 def _profile_of(scenario: Scenario) -> AssociationProfile:
@@ -187,7 +187,7 @@ def loads(text: str) -> Scenario:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.DecodeError as error:
         raise ScenarioError(f"not a resolved scenario in JSON: {error}") from None
-    return _converted(with_current_names(fields))
+    return _convert(with_current_names(fields))
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
@@ -203,7 +203,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
     ]
 
 
-def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
+def _fit_count(robots: Sequence[Fields], count: int) -> list[Fields]:
     """Extend or cut robots to a count; further ones repeat the pattern."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
@@ -212,7 +212,7 @@ def _counted(robots: Sequence[Fields], count: int) -> list[Fields]:
     return [*robots[:count], *further]
 
 
-def _converted(fields: Fields) -> Scenario:
+def _convert(fields: Fields) -> Scenario:
     """Convert plain fields to a consistent scenario; raises ScenarioError."""
     check_world(checked_table(fields.get("world", {}), "world"))
     for choice, declared in (
@@ -223,12 +223,12 @@ def _converted(fields: Fields) -> Scenario:
         if choice in fields:
             check_fields(fields[choice], declared, choice)
     try:
-        return _filled(msgspec.convert(fields, Scenario))
+        return _fill_in(msgspec.convert(fields, Scenario))
     except msgspec.ValidationError as error:
         raise plain(error) from None
 
 
-def _filled(scenario: Scenario) -> Scenario:
+def _fill_in(scenario: Scenario) -> Scenario:
     """Copy seed, estimator and rule to robots and centre, and validate."""
     if (scenario.estimator, scenario.fusion) not in PAIRS:
         raise ScenarioError(

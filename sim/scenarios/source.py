@@ -30,7 +30,7 @@ from teamslam.team.pairs import NEEDS_MAP
 
 def streams_of(scenario: Scenario) -> WorldStreams:
     """Simulate the world or read its data set; raises DatasetError."""
-    streams = _with_identities(scenario)
+    streams = _make_streams(scenario)
     world = scenario.world
     if isinstance(world, SimulatedWorld):
         hiding = Hiding(world.tagged, world.missed, world.clutter, world.visible_to_m)
@@ -44,7 +44,7 @@ def streams_of(scenario: Scenario) -> WorldStreams:
     return with_hidden_identities(streams, Hiding(), scenario.seed) if hidden else streams
 
 
-def _with_identities(scenario: Scenario) -> WorldStreams:
+def _make_streams(scenario: Scenario) -> WorldStreams:
     if isinstance(scenario.world, SimulatedWorld):
         return simulated(scenario.world, scenario.robots, noise_seed(scenario))
     if isinstance(scenario.world, UnlabelledWorld):

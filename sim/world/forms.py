@@ -27,7 +27,7 @@ def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:
     ])  # fmt: skip
 
 
-def _turned(xy: Float[np.ndarray, "K 2"], angle: Column) -> Float[np.ndarray, "K 2"]:
+def _turn(xy: Float[np.ndarray, "K 2"], angle: Column) -> Float[np.ndarray, "K 2"]:
     c, s = core.cos(angle), core.sin(angle)
     return np.column_stack([c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]])
 
@@ -49,7 +49,7 @@ def measured_increments(
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
-    displacement = _turned(after[:, :2] - before[:, :2], -before[:, 2])
+    displacement = _turn(after[:, :2] - before[:, :2], -before[:, 2])
     kinds = (motion.forward, motion.lateral, motion.turn)
     sigmas = np.column_stack([deviation(kind, seconds, steps) for kind in kinds])
     shares = np.sqrt(1.0 - correlation**2)
@@ -57,9 +57,9 @@ def measured_increments(
     left = correlation * sigmas[:, 1] * normals[:, 2] + shares * left
     half = 0.5 * turn
     chord = np.divide(core.sin(half), half, out=np.ones_like(half), where=half != 0.0)
-    moved = chord[:, np.newaxis] * _turned(np.column_stack([ahead, left]), 0.5 * turn)
+    moved = chord[:, np.newaxis] * _turn(np.column_stack([ahead, left]), 0.5 * turn)
     measured_turn = true_turn - turn
-    measured = displacement - _turned(moved, measured_turn)
+    measured = displacement - _turn(moved, measured_turn)
     angle = np.mod(measured_turn + np.pi, 2.0 * np.pi) - np.pi
     C = np.zeros((len(turn), 3, 3))
     C[:, range(3), range(3)] = sigmas**2

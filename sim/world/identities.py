@@ -50,7 +50,7 @@ def _hidden(
     parts = [_rows(seen, message, detected & named, hidden=False)] if len(tagged) else []
     untagged = _rows(seen, message, detected & ~named, hidden=True)
     if hiding.clutter:
-        untagged = _with_clutter(untagged, hiding, rng)
+        untagged = _add_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
     # An empty scan stays a measurement of either kind.
     return replace(stream, landmark_detections=both)
@@ -107,7 +107,7 @@ def _of_ranges(
     return np.column_stack((rr, rb, bb))
 
 
-def _with_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> Detections:
+def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> Detections:
     counts = np.diff(seen.offsets)
     ratio = hiding.clutter / (1.0 - hiding.clutter)
     false = rng.poisson(ratio * counts)

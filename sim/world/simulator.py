@@ -251,7 +251,7 @@ def _observations(
     offsets = np.searchsorted(seen.steps, np.arange(len(at_ns) + 1))
     ids = (seen.points + 1).astype(np.uint32)
     if world.landmark_claims is not None:
-        return _with_claims(world, robot, seen, (at_ns, offsets, ids), seed)
+        return _add_claims(world, robot, seen, (at_ns, offsets, ids), seed)
     ranges, bearings = _read(world, robot.sensor, seen, seed, robot.id, "observations")
     if world.landmark_form == "points":
         points = np.column_stack([ranges * core.cos(bearings), ranges * core.sin(bearings)])
@@ -270,7 +270,7 @@ def _observations(
     )
 
 
-def _with_claims(
+def _add_claims(
     world: SimulatedWorld,
     robot: RobotConfig,
     seen: Visible,
@@ -327,7 +327,7 @@ def _sightings(
     robot = robots[index]
     none = np.zeros(0)
     columns = [(none.astype(np.int64), none.astype(np.uint32), none, none)]
-    for i in _within_reach(world, robot, drives, index):
+    for i in _find_within_reach(world, robot, drives, index):
         other = robots[i]
         if i != index:
             at = drives[i].poses[1:, np.newaxis, :2]
@@ -345,7 +345,7 @@ def _sightings(
     )
 
 
-def _within_reach(
+def _find_within_reach(
     world: SimulatedWorld, robot: RobotConfig, drives: Sequence[Drive], index: int
 ) -> list[int]:
     """Robots ever close enough, in x and in y, to be visible."""

@@ -181,7 +181,7 @@ def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> Grow
     for scale in _scales(batch.robust_c):
         left = iterations
         while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
-            found, used = _descended(batch, scale, left)
+            found, used = _descend(batch, scale, left)
             left -= max(used, 1)
             if used == 0:
                 break
@@ -202,9 +202,7 @@ def _scales(robust_c: float | None) -> list[float | None]:
     return [*scales, robust_c]
 
 
-def _descended(
-    batch: GrowingBatch, scale: float | None, iterations: int
-) -> tuple[GrowingBatch, int]:
+def _descend(batch: GrowingBatch, scale: float | None, iterations: int) -> tuple[GrowingBatch, int]:
     gtsam = load_gtsam()
     optimizer = optimizer_of(gtsam, batch.graph(scale), batch.values, iterations)
     try:

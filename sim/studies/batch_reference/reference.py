@@ -163,7 +163,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
         sigmas = run.scenario.central.bias_sigma
         graph = profile_graph(gtsam, chains, fillings[0], starts[0], robust_c, sigmas)
     else:
-        descend = _optimised
+        descend = _optimise
         graph = factor_graph(gtsam, chains, fillings[0], starts[0], robust_c)
     initials = [
         values_of(gtsam, poses, landmarks)
@@ -173,7 +173,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
         initials = [add_errors(gtsam, values, chains) for values in initials]
         initials = [min(initials, key=graph.error)]
     try:
-        optimum, figures = _solved(gtsam, graph, initials, descend)
+        optimum, figures = _solve(gtsam, graph, initials, descend)
     except RuntimeError as error:
         if isinstance(error, BatchReferenceError):
             raise
@@ -192,7 +192,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
     )
 
 
-def _solved(
+def _solve(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
     """Best optimum over all initial values, and its figures; raises BatchReferenceError."""
@@ -226,7 +226,7 @@ def _gtsam() -> Any:
         raise BatchReferenceError(str(error)) from None
 
 
-def _optimised(gtsam: Any, graph: Any, initial: Any) -> Any:
+def _optimise(gtsam: Any, graph: Any, initial: Any) -> Any:
     return optimizer_of(gtsam, graph, initial, ITERATIONS).optimize()
 
 

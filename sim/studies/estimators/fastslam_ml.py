@@ -65,11 +65,11 @@ def filter_step(
     s, c = core.sin_and_cos(state.poses[:, 2])
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
-    state = _with_room(replace(state, poses=poses), len(ranges))
+    state = _make_room(replace(state, poses=poses), len(ranges))
     scan = _Scan(state)
     for r, b in zip(ranges.tolist(), bearings.tolist(), strict=True):
         scan.take(r, b, sensor, gate)
-    return _resampled(scan.state(), resample_below, generator)
+    return _resample(scan.state(), resample_below, generator)
 
 
 class _Scan:
@@ -167,7 +167,7 @@ class _Scan:
         )
 
 
-def _with_room(state: FastSlamMl, more: int) -> FastSlamMl:
+def _make_room(state: FastSlamMl, more: int) -> FastSlamMl:
     places = state.means.shape[1]
     if int(state.counts.max()) + more <= places:
         return state
@@ -185,7 +185,7 @@ def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
     return np.asarray(weights / weights.sum())
 
 
-def _resampled(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
+def _resample(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
     weights, m = _weights(state), len(state.poses)
     if 1.0 / float(dense.product(weights, weights)) >= below * m:
         return state

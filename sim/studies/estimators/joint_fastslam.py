@@ -79,7 +79,7 @@ def filter_step(
     for turn in turns:
         index = state.robots.index(turn.robot)
         after, _ = fastslam.filter_step(
-            particles=_seen_by(state, index),
+            particles=_particles_of(state, index),
             increment=turn.increment,
             sensor=turn.sensor,
             ids=turn.ids,
@@ -104,15 +104,15 @@ def filter_step(
 
 def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
     """Mean and covariance of one robot's poses; raises ValueError for an unknown robot."""
-    return pose_moments(_seen_by(state, state.robots.index(robot)))
+    return pose_moments(_particles_of(state, state.robots.index(robot)))
 
 
 def landmark_gaussian(state: JointFastSlam) -> LandmarkGaussian:
     """Mixture of the particles' maps as one Gaussian."""
-    return landmark_moments(_seen_by(state, 0))
+    return landmark_moments(_particles_of(state, 0))
 
 
-def _seen_by(state: JointFastSlam, index: int) -> Particles:
+def _particles_of(state: JointFastSlam, index: int) -> Particles:
     return Particles(
         state.poses[index], state.log_weights, state.ids, state.means, state.covariances
     )

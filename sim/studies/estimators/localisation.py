@@ -86,7 +86,7 @@ def filter_step(
         cloud, _ = fastslam.resampled(cloud, generator)
     cloud = fastslam.propagated(cloud, increment, generator)
     mapped = np.isin(ids, state.ids)
-    log_weights = _weighed(
+    log_weights = _weigh(
         cloud.log_weights,
         cloud.poses,
         state.landmarks[np.searchsorted(state.ids, ids[mapped])],
@@ -131,7 +131,7 @@ def landmark_gaussian(state: Localisation) -> LandmarkGaussian:
     return LandmarkGaussian(state.ids, state.landmarks, np.zeros((n, n)))
 
 
-def _weighed(
+def _weigh(
     log_weights: Float[np.ndarray, " M"],
     poses: Float[np.ndarray, "M 3"],
     landmarks: Float[np.ndarray, "n 2"],

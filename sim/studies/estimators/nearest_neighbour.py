@@ -49,7 +49,7 @@ def filter_step(
     if not len(unnamed):
         slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
         return replace(state, slam=slam)
-    slam, given = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, gate)
+    slam, given = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, gate)
     slam = ekf_slam.filter_step(slam, Increment.identity(), sensor, given, ranges, bearings)
     return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
 
@@ -66,11 +66,11 @@ def innovation(
     UNNAMED on are rows of a scan.
     """
     if (ids >= UNNAMED).any():
-        _, ids = _moved_and_named(state.slam, increment, sensor, ids, ranges, bearings, GATE)
+        _, ids = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, GATE)
     return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)
 
 
-def _moved_and_named(
+def _move_and_name(
     slam: EkfSlam,
     increment: Increment,
     sensor: Sensor,
@@ -82,11 +82,11 @@ def _moved_and_named(
     slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
     unnamed = np.flatnonzero(ids >= UNNAMED)
     given = ids.copy()
-    given[unnamed] = _associated(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
+    given[unnamed] = _associate(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
     return slam, given
 
 
-def _associated(
+def _associate(
     slam: EkfSlam,
     sensor: Sensor,
     gate: float,

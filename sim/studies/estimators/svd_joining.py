@@ -169,14 +169,14 @@ def exchanged(
     if n < NEEDED:
         raise TooFewPointsError(n)
     a_from_b = procrustes(tie_a, tie_b, np.ones(n))
-    moved, G = _moved(a_from_b, tie_b)
+    moved, G = _move(a_from_b, tie_b)
     variance = 0.5 * float((core.squared(tie_a - moved)).sum()) / (2 * n - 3)
     of_motion = 2.0 * variance * information(dense.product(G.T, G), "two maps' points")
     common = np.isin(ids, a.ids) & np.isin(ids, b.ids)
     from_b = np.where(common, 0.5, np.isin(ids, b.ids))
     in_frame_a, slopes = np.zeros((len(ids), 2)), np.zeros((2 * len(ids), 3))
     rows = columns_of(of_b)
-    in_frame_a[of_b], slopes[rows] = _moved(a_from_b, b.means)
+    in_frame_a[of_b], slopes[rows] = _move(a_from_b, b.means)
     means = from_b[:, None] * in_frame_a
     means[of_a] += (1.0 - from_b[of_a])[:, None] * a.means
     E = np.repeat(from_b, 2)[:, None] * slopes
@@ -188,7 +188,7 @@ def exchanged(
     )
 
 
-def _moved(
+def _move(
     a_from_b: Pose, points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 3"]]:
     """R b + t and its derivative by (t, θ): [I, R b turned by 90°]."""
@@ -222,11 +222,11 @@ def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     a_from_b = procrustes(a.means[in_a], b.means[in_b], np.ones(len(in_a)))
     state = np.zeros(3 + 2 * len(ids))
     state[:3] = a_from_b
-    state[columns_b] = _moved(a_from_b, b.means)[0].ravel()
+    state[columns_b] = _move(a_from_b, b.means)[0].ravel()
     state[columns_a] = a.means.ravel()
     of_a, of_b = information(a.covariance, "a map"), information(b.covariance, "a map")
     for _ in range(ITERATIONS):
-        residual, J = _seen_from(state, columns_b)
+        residual, J = _express_from(state, columns_b)
         residual -= b.means.ravel()
         hessian = dense.product(dense.product(J.T, of_b), J)
         hessian[np.ix_(columns_a, columns_a)] += of_a
@@ -249,7 +249,7 @@ def columns_of(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 
-def _seen_from(
+def _express_from(
     state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
     """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""

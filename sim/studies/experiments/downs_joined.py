@@ -119,12 +119,12 @@ def _sample(samples: Sequence[Sample], evaluation: Evaluation) -> Figures:
         "means": [] if last is None else translate.landmarks_of(last)[1].tolist(),
         "blocks": [] if last is None else translate.landmark_blocks_of(last).tolist(),
         "landmarks": true_landmarks(samples)[1].tolist(),
-        "online": _thinned(estimated_poses(samples, (ch.OWN_POSE.key(name),))[0]),
-        "truth": _thinned(robot.truth),
+        "online": _thin(estimated_poses(samples, (ch.OWN_POSE.key(name),))[0]),
+        "truth": _thin(robot.truth),
     }
 
 
-def _thinned(path: Path) -> list[list[float]]:
+def _thin(path: Path) -> list[list[float]]:
     every = max(1, len(path.poses) // DRAWN_POINTS)
     points: list[list[float]] = path.poses[::every, :2].round(3).tolist()
     return points
@@ -146,7 +146,7 @@ def spherical_run(
         submaps = _submaps(samples, name)
         if not submaps:
             continue
-        state = _joined(name, _start(samples, name), submaps)
+        state = _join(name, _start(samples, name), submaps)
         found = svd_joining.landmark_gaussian(state)
         maps[name, 0] = found
         paths[name] = _path(name, state, submaps)
@@ -196,9 +196,7 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
     return np.zeros(3)
 
 
-def _joined(
-    robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
-) -> SubmapJoining:
+def _join(robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]) -> SubmapJoining:
     """All submaps joined at once: the limit of joining one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [

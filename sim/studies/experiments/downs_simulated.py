@@ -135,7 +135,7 @@ class SimulatedTable(NamedTuple):
             count = world.partition("-")[2]
             for method in self.methods:
                 for name, suffix in self.figures:
-                    values = list(_by_seed(world, method, name, options, results).values())
+                    values = list(_values_by_seed(world, method, name, options, results).values())
                     if values:
                         found[f"{count}, {method.name}{suffix}"] = values
         return found
@@ -144,7 +144,7 @@ class SimulatedTable(NamedTuple):
         found = {}
         for world in WORLDS:
             for pair in self.compared:
-                before, after = (_by_seed(world, m, STARTED, options, results) for m in pair)
+                before, after = (_values_by_seed(world, m, STARTED, options, results) for m in pair)
                 both = [(before[seed], after[seed]) for seed in before if seed in after]
                 if both:
                     name = f"{world.partition('-')[2]}, {pair[0].name} → {pair[1].name}"
@@ -205,7 +205,7 @@ def _task(world: str, method: Simulated, options: Options, seed: int) -> Task:
     return method.task(with_world(scenario, steps=QUICK_STEPS) if options.quick else scenario)
 
 
-def _by_seed(
+def _values_by_seed(
     world: str, method: Simulated, name: str, options: Options, results: Results
 ) -> dict[int, float]:
     found = {}

@@ -183,7 +183,7 @@ class _Submaps(NamedTuple):
         J[:, heading, 3 + heading], J[:, heading, 2] = 1.0, -1.0
         r = h - self.means
         r[:, heading] = _around(r[:, heading])
-        return _whitened(self, r, J)
+        return _whiten(self, r, J)
 
 
 class _Sightings(NamedTuple):
@@ -204,7 +204,7 @@ class _Sightings(NamedTuple):
         J = np.zeros((len(x), 2, 6))
         J[:, :, 3:5] = np.moveaxis(to, 2, 0)
         J[:, :, :2], J[:, 1, 2] = -J[:, :, 3:5], -1.0
-        return _whitened(self, r, J)
+        return _whiten(self, r, J)
 
 
 class _Priors(NamedTuple):
@@ -218,7 +218,7 @@ class _Priors(NamedTuple):
         """Coordinates less their means."""
         r = state[self.at] - self.means
         r[:, 2:] = _around(r[:, 2:])
-        return _whitened(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
+        return _whiten(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
 
 
 Kinds = list[_Submaps | _Sightings | _Priors]
@@ -233,7 +233,9 @@ def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
         sizes = np.array([3] * (1 + poses) + [2] * (count - poses))
         own = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         yield _Submaps(
-            np.array([_whitening(covariance_factor * c.local.covariance) for c, _ in submaps]),
+            np.array(
+                [_whitening_matrix(covariance_factor * c.local.covariance) for c, _ in submaps]
+            ),
             np.array([c.local.mean for c, _ in submaps]),
             np.repeat(first, sizes, axis=1) + own,
             first[:, 1:],
@@ -246,7 +248,7 @@ def _sightings(graph: Graph) -> Iterator[_Sightings]:
         sightings = [each for each, *_ in graph.sightings]
         first = graph.offset[np.array([nodes for _, *nodes in graph.sightings])]
         yield _Sightings(
-            np.array([_whitening(each.covariance) for each in sightings]),
+            np.array([_whitening_matrix(each.covariance) for each in sightings]),
             np.array([each.measurement for each in sightings]),
             (first[:, :, None] + np.arange(3)).reshape(-1, 6),
         )
@@ -260,7 +262,7 @@ def _priors(graph: Graph) -> Iterator[_Priors]:
         )
 
 
-def _whitened(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:
+def _whiten(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:
     return Whitened((kind.whitening @ r[:, :, None])[:, :, 0], kind.whitening @ J, kind.at)
 
 
@@ -271,7 +273,7 @@ def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values
     return step, float(step @ (gradient + D * step))
 
 
-def _whitening(covariance: Rows) -> Rows:
+def _whitening_matrix(covariance: Rows) -> Rows:
     """L⁻¹ with L Lᵀ = P."""
     L = np.linalg.cholesky(covariance)
     return np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))

@@ -74,7 +74,7 @@ def computed(
 ) -> list[Concluded]:
     """Outcomes of all plans; common tasks run once."""
     results, failures = compute_runs(tasks_by_name(plans), folder, jobs, progress, scheduler)
-    return [_concluded(plan, results, failures) for plan in plans]
+    return [_conclude(plan, results, failures) for plan in plans]
 
 
 def tasks_by_name(plans: Sequence[Plan]) -> dict[str, Task]:
@@ -107,7 +107,7 @@ def compute_runs(
     return Results(results), failures
 
 
-def _concluded(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:
+def _conclude(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:
     failed = {task.label: failures[task.name].error for task in plan.tasks if task.name in failures}
     outcome = plan.experiment.outcome(plan.options, results)
     kinds = kinds_of(plan.tasks)

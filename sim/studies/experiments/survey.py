@@ -99,7 +99,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         for world, of_world in figures.items()
     ]
     particles = {
-        str(count): _timed(over_seeds(results.of_all(_fastslam(count, options))))
+        str(count): _convert_times(over_seeds(results.of_all(_fastslam(count, options))))
         for count in PARTICLES
     }
     tables += [_table_2_1(figures["thesis"]), _table_2_2(figures["thesis"], particles)]
@@ -121,14 +121,14 @@ def _world(world: str, options: Options, results: Results) -> dict[str, Figures]
     for pair in PAIRS:
         runs = results.of_all(_runs(world, pair, options))
         if runs:
-            figures[named(*pair)] = _timed(over_seeds(runs))
+            figures[named(*pair)] = _convert_times(over_seeds(runs))
         batches = [run["batch"] for run in runs if "batch" in run]
         if batches:
             figures["batch"] = over_seeds(batches)
     return figures
 
 
-def _timed(figures: Figures) -> Figures:
+def _convert_times(figures: Figures) -> Figures:
     step, fusion = figures.get("seconds_per_step"), figures.get("seconds_per_fusion")
     return figures | {
         "us_per_step": None if step is None else 1e6 * step,
@@ -162,7 +162,7 @@ def _fastslam(particles: int, options: Options) -> list[Task]:
 def _table_2_1(figures: dict[str, Figures]) -> Table:
     rows = []
     for surveyed in SURVEYED:
-        found = _found(surveyed, figures)
+        found = _figures_of(surveyed, figures)
         measured = cells_of(
             found,
             (("nees", "", "{:.3g}"), ("online_pose_nees", "", "{:.3g}"),
@@ -189,7 +189,7 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
             surveyed.method,
             surveyed.pros,
             surveyed.cons,
-            *cells_of(_found(surveyed, figures), columns),
+            *cells_of(_figures_of(surveyed, figures), columns),
         )
         for surveyed in SURVEYED
     ]
@@ -204,7 +204,7 @@ def _table_2_2(figures: dict[str, Figures], particles: dict[str, Figures]) -> Ta
     )
 
 
-def _found(surveyed: SurveyedMethod, figures: dict[str, Figures]) -> Figures:
+def _figures_of(surveyed: SurveyedMethod, figures: dict[str, Figures]) -> Figures:
     if surveyed.method == BATCH:
         return figures.get("batch", {})
     return {} if surveyed.pair is None else figures.get(named(*surveyed.pair), {})

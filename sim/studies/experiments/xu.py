@@ -150,7 +150,7 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
         fusion=method.fusion,
     )
     if method.estimator != "hybrid":
-        scenario = _telling(scenario)
+        scenario = _tell_every_step(scenario)
     if method.particles is not None:
         scenario = with_particles(scenario, method.particles)
     if panel.noise is not None:
@@ -163,7 +163,7 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
     return curves_task(with_noise(as_used, 0.0, 0.0), as_used, label, late=late, shots=shots)
 
 
-def _telling(scenario: Scenario) -> Scenario:
+def _tell_every_step(scenario: Scenario) -> Scenario:
     """The scenario with a map at every step of a filter without windows."""
     central = msgspec.structs.replace(scenario.central, broadcast_s=STEP_S)
     scenario = with_robots(scenario, "front_end", window_s=STEP_S)

@@ -148,12 +148,12 @@ def _stages_task(options: Options, seed: int) -> Task:
 def _anywhere_task(options: Options, seed: int) -> Task:
     scenario = _alone(seed, ANYWHERE_PARTICLES)
     assert isinstance(scenario.world, SimulatedWorld)
-    leg = _beginning(scenario.world)
+    leg = _cut_first_leg(scenario.world)
     scenario = with_world(scenario, steps=ANYWHERE_STEPS[-1], paths=(leg,))
     return _task("anywhere_run", scenario, options, seed)
 
 
-def _beginning(world: SimulatedWorld) -> tuple[tuple[float, float], ...]:
+def _cut_first_leg(world: SimulatedWorld) -> tuple[tuple[float, float], ...]:
     """The first leg of robot 1, cut to a metre a step."""
     (x, y), (to_x, to_y) = world.paths[0][:2]
     part = ANYWHERE_STEPS[-1] / float(np.hypot(to_x - x, to_y - y))

@@ -79,7 +79,7 @@ class MapFigure(NamedTuple):
             run = results.of(self._drawn(method, reading, options))
             if run is None:
                 continue
-            label = _named(method, reading)
+            label = _name_of(method, reading)
             pictures += self._pictures(label, run, options.seeds[0])
             runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             curves = [each["map"] for each in runs if each["map"]["time_s"]]
@@ -125,7 +125,7 @@ def _run(method: Method, reading: Reading, seed: int, shots: tuple[int, ...] = (
     return curves_of(Panel(_READ[reading], (method,), {}, reading=reading), method, seed, shots)
 
 
-def _named(method: Method, reading: Reading) -> str:
+def _name_of(method: Method, reading: Reading) -> str:
     return method.name if "," in method.name else f"{method.name}, {_READ[reading]}"
 
 

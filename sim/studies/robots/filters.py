@@ -109,7 +109,7 @@ def _coded_initial_state(
     return hybrid_thesis_coded.started(pose, config.front_end.particles)
 
 
-def _coded_absorbed(
+def _absorb_coded(
     state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
 ) -> CodedState:
     return hybrid_thesis_coded.absorbed(state, ids, means, translate.blocks_of(covariance))
@@ -235,7 +235,7 @@ FILTERS: Mapping[Estimator, Filter] = {
         hybrid_thesis_coded.pose_gaussian,
         hybrid_thesis_coded.landmark_gaussian,
         _of_particles(lambda state: state.particles),
-        _coded_absorbed,
+        _absorb_coded,
         joint=False,
     ),
 }

@@ -48,7 +48,7 @@ class JointFastSlamCentre(MeasurementCentre):
         particles = self.config.particles
         self._state = joint_fastslam.initial_state(poses, particles, "fastslam1", RESAMPLE_BELOW)
         turns = [
-            _started(name, uncertain_start(pose, covariance), self.models[name].sensor)
+            _start_robot(name, uncertain_start(pose, covariance), self.models[name].sensor)
             for name, (pose, covariance) in starts.items()
             if covariance is not None
         ]
@@ -78,6 +78,6 @@ class JointFastSlamCentre(MeasurementCentre):
         return MapContent(joint_fastslam.landmark_gaussian(self._state))
 
 
-def _started(robot: str, start: Increment, sensor: Sensor) -> RobotStep:
+def _start_robot(robot: str, start: Increment, sensor: Sensor) -> RobotStep:
     nothing = np.empty(0)
     return RobotStep(robot, start, sensor, np.empty(0, np.uint32), nothing, nothing)

@@ -61,7 +61,7 @@ def covariance_intersection(
     """
 
     def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
-        return _intersected_pair(a, b, criterion)
+        return _intersect_pair(a, b, criterion)
 
     return _one_by_one(pair, maps)
 
@@ -95,12 +95,12 @@ def fused_totally(
             reasons.append(f"{robot}: its map is refused, a coordinate beyond {coordinate_m:g} m")
         else:
             accepted[robot] = each
-    fused = _tried(rule, list(accepted.values()))
+    fused = _apply_rule(rule, list(accepted.values()))
     if fused is not None:
         return fused, tuple(reasons)
     fused, taken = NO_LANDMARKS, list[LandmarkGaussian]()
     for robot, each in accepted.items():
-        more = _tried(rule, [*taken, each])
+        more = _apply_rule(rule, [*taken, each])
         if more is None:
             reasons.append(f"{robot}: its map is refused, with it the fusion has no result")
         else:
@@ -109,7 +109,7 @@ def fused_totally(
     return fused, tuple(reasons)
 
 
-def _tried(
+def _apply_rule(
     rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian], maps: Sequence[LandmarkGaussian]
 ) -> LandmarkGaussian | None:
     """The rule's result; None without a finite one."""
@@ -122,14 +122,14 @@ def _tried(
     return fused if finite else None
 
 
-def _shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
+def _find_shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.ndarray, " k"], ...]:
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     return columns_of(in_a), columns_of(in_b)
 
 
-def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
+def _carry(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
     """Add the landmarks of `a` that `fused` lacks, by regression on the others."""
-    in_a, in_fused = _shared(a, fused)
+    in_a, in_fused = _find_shared(a, fused)
     mean, covariance = carried_along(
         a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused
     )
@@ -142,7 +142,7 @@ def _carried(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
 
 
 def _kalman_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
-    in_a, in_b = _shared(a, b)
+    in_a, in_b = _find_shared(a, b)
     R = b.covariance[np.ix_(in_b, in_b)]
     innovation = information(a.covariance[np.ix_(in_a, in_a)] + R, "two maps' difference")
     gain = dense.product(a.covariance[:, in_a], innovation)
@@ -153,7 +153,7 @@ def _kalman_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
         dense.product(gain, R), gain.T
     )
     updated = LandmarkGaussian(a.ids, moved.reshape(-1, 2), 0.5 * (covariance + covariance.T))
-    return _carried(b, updated)
+    return _carry(b, updated)
 
 
 def _per_axis_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
@@ -174,8 +174,8 @@ def _per_axis_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian
     return LandmarkGaussian(ids, means, np.diag(variances.ravel()))
 
 
-def _intersected_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) -> LandmarkGaussian:
-    in_a, in_b = _shared(a, b)
+def _intersect_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) -> LandmarkGaussian:
+    in_a, in_b = _find_shared(a, b)
     common = NO_LANDMARKS
     if len(in_a):
         info_a = information(a.covariance[np.ix_(in_a, in_a)], "a map's common landmarks")
@@ -188,7 +188,7 @@ def _intersected_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) 
             + (1.0 - omega) * (dense.product(info_b, b.means.ravel()[in_b])),
         )
         common = LandmarkGaussian(a.ids[in_a[::2] // 2], mean.reshape(-1, 2), spread)
-    return _carried(b, _carried(a, common))
+    return _carry(b, _carry(a, common))
 
 
 def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:

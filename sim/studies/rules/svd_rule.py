@@ -149,7 +149,7 @@ class SvdFold(SubmapFold):
             if not refused:
                 local = translate.local_map_of(submap).without_nodes.without_biases
                 why = submap_beyond(local, self.config.bounds)
-                after = _joined_with(state, stream[0], local) if why is None else None
+                after = _join_with(state, stream[0], local) if why is None else None
                 if after is None:
                     words = why or "with it the map has no solution"
                     refused = f"submap {submap.sequence} of {named(stream)} refused: {words}"
@@ -166,7 +166,7 @@ class SvdCentre(CentralNode):
     fold_class = SvdFold
 
 
-def _joined_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
+def _join_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoining | None:
     try:
         with np.errstate(all="ignore"):
             after = svd_joining.filter_step(state, robot, local)
