@@ -89,8 +89,8 @@ class FactorGraph:
             if (before, after) not in links:
                 raise DatasetError(
                     f"{self.name}: no edge from pose {_show_key(before)} to pose "
-                    f"{_show_key(after)}: a robot's odometry links each pose to the next; number the "
-                    "poses in order, or cut the file there"
+                    f"{_show_key(after)}: a robot's odometry links each pose to the next; number "
+                    "the poses in order, or cut the file there"
                 )
         return ordered, [links[pair] for pair in pairwise(ordered)]
 
