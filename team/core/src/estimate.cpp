@@ -176,15 +176,15 @@ Numbers Estimate::prior_chi2() const {
   return found;
 }
 
-// Cauchy's for a robot's own bias, 1 for all others. Most sensors are as their configuration states, to
-// within the prior; one that is not is far off, and must not draw the other robots' biases away through
-// the common errors: a prior with the tails of Student's t of one degree of freedom. Markers do not
-// change; the error of a marker seen from one side only is distinguished from its landmark's position by
-// its prior alone.
+// Of Student's t of one degree of freedom for a robot's own bias, 1 for all others: −2 log p is
+// 2 log(1 + χ²), whose slope, the weight, is 2/(1 + χ²). Most sensors are as their configuration states,
+// to within the prior; one that is not is far off, and must not draw the other robots' biases away
+// through the common errors. Markers do not change; the error of a marker seen from one side only is
+// distinguished from its landmark's position by its prior alone.
 Numbers Estimate::prior_weights() const {
   Numbers found(graph_->priors.size(), 1.0);
   for (std::size_t k = 0; k < found.size(); k++)
-    if (graph_->priors[k].is_of_bias) found[k] = 1.0 / (1.0 + prior_terms()[k].chi2);
+    if (graph_->priors[k].is_of_bias) found[k] = 2.0 / (1.0 + prior_terms()[k].chi2);
   return found;
 }
 
@@ -216,7 +216,7 @@ double Estimate::cost_of_factors(const Marked& marked) const {
   const auto is_prior = [&](std::size_t k) { return marked.priors[k]; };
   double cost = sum(gates.size(), is_submap, [&](std::size_t f) { return robust_loss(chi2()[f], gates[f]); });
   cost += sum(of_priors.size(), is_prior, [&](std::size_t k) {
-    return graph_->priors[k].is_of_bias ? elementary::log(1.0 + of_priors[k]) : of_priors[k];
+    return graph_->priors[k].is_of_bias ? 2.0 * elementary::log(1.0 + of_priors[k]) : of_priors[k];
   });
   if (loss_.is_robust) {
     const auto& [own, gate] = landmark_chi2_and_gate();

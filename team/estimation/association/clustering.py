@@ -26,6 +26,12 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 RARE = 0.05
 """Significance level of the test for clutter."""
+ROUNDS = 5
+"""Most iterations of the share of clutter; it comes to rest in two or three."""
+UNSEEN = 100.0
+"""Looks at a place of clutter with one match, before the window's own are counted."""
+HIDDEN = 0.1
+"""Probability that a landmark in view is hidden up to some time of the window, or from it on."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +88,14 @@ def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssoc
     found = cluster_window(scans, settings)
     scans, names, window = found.scans, found.names, found.window
     landmark_of = _drop_uncertain(scans, found.landmark_of, window, settings)
-    confirmed = _mark_confirmed(landmark_of, names, settings)
-    clutter = _mark_clutter(scans, landmark_of, confirmed, window, settings)
+    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
+    looks = _mark_looks(scans, window) | _mark_seen(scans, landmark_of, len(names))
+    confirmed = _mark_confirmed(scans, landmark_of, looks, names, settings)
+    all_looks = looks.sum(axis=1)
+    rare = [
+        _is_rare(*each, settings) for each in zip(counts.tolist(), all_looks.tolist(), strict=True)
+    ]
+    clutter = np.append(np.array(rare, np.bool_) & ~confirmed, False)[landmark_of]
     remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, UNASSIGNED)
     landmark_of, names, _ = _renumber(remaining, names, window.landmarks)
     seen = _mark_seen(scans, landmark_of, len(names))
@@ -201,45 +213,70 @@ def _drop_uncertain(
     return np.where(sure | (scans.names != UNASSIGNED), landmark_of, UNASSIGNED)
 
 
+def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]:
+    """Mark the keyframes that observed each landmark's place.
+
+    A keyframe observes a place if it saw something at least as far off and the place lies between
+    the outermost bearings that it saw.
+    """
+    looks = np.zeros((len(window.landmarks), len(window.poses)), np.bool_)
+    bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
+    ranges = core.hypot(scans.points[:, 0], scans.points[:, 1])
+    bounds = scans.bounds
+    for k, pose in enumerate(window.poses):
+        own = slice(bounds[k], bounds[k + 1])
+        if own.start == own.stop:
+            continue
+        x, y = relative_to(np.broadcast_to(pose, (len(looks), 3)), window.landmarks).T
+        bearing = core.atan2(y, x)
+        looks[:, k] = (bearings[own].min() <= bearing) & (bearing <= bearings[own].max())
+        looks[:, k] &= core.hypot(x, y) <= ranges[own].max()
+    return looks
+
+
 def _mark_confirmed(
+    scans: Scans,
     landmark_of: Int64[np.ndarray, " N"],
+    looks: Bool[np.ndarray, "L K"],
     names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
 ) -> Bool[np.ndarray, " L"]:
-    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
-    return np.asarray((counts >= settings.least_seen) | (names != UNASSIGNED))
+    """Mark the landmarks with an identity, and those that are likelier real than clutter.
 
+    Behind its first detection, a real landmark is detected at each look with the probability p of
+    the sensor, and a place of clutter matches by chance with q. With c detections and m misses the
+    log odds that it is real are
 
-def _mark_clutter(
-    scans: Scans,
-    landmark_of: Int64[np.ndarray, " N"],
-    confirmed: Bool[np.ndarray, " L"],
-    window: SmoothedWindow,
-    settings: AssociationSettings,
-) -> Bool[np.ndarray, " N"]:
-    """Mark the detections of unconfirmed landmarks that have too few for a real one.
+        (c − 1) log(p/q) + m log((1 − p)/(1 − q)) + log(real ones/places of clutter),
 
-    A keyframe observes a place if it saw something at least as far off and the place lies between
-    the outermost bearings that it saw. A landmark with detection probability p that was observed v
-    times is clutter if so few detections have a probability below RARE.
+    the score by which trackers confirm a track. The misses before the first detection together
+    count at most log HIDDEN, as do those behind the last one. q and the last term are those of the
+    window's unconfirmed places.
     """
-    clutter = np.zeros(len(landmark_of), np.bool_)
-    scan_of = scans.keyframes
-    first = np.unique(scan_of, return_index=True)[1]
-    if not len(first):
-        return clutter
-    bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
-    farthest = np.maximum.reduceat(core.hypot(scans.points[:, 0], scans.points[:, 1]), first)
-    least, most = np.minimum.reduceat(bearings, first), np.maximum.reduceat(bearings, first)
-    poses = window.poses[scan_of[first]]
-    for landmark in np.nonzero(~confirmed)[0]:
-        members = np.nonzero(landmark_of == landmark)[0]
-        places = relative_to(poses, np.broadcast_to(window.landmarks[landmark], (len(poses), 2)))
-        bearing = core.atan2(places[:, 1], places[:, 0])
-        inside = (least <= bearing) & (bearing <= most)
-        looks = np.count_nonzero(inside & (core.hypot(places[:, 0], places[:, 1]) <= farthest))
-        clutter[members] = _is_rare(len(members), max(int(looks), len(members)), settings)
-    return clutter
+    named, p = names != UNASSIGNED, settings.detection_probability
+    seen = _mark_seen(scans, landmark_of, len(names))
+    counts = seen.sum(axis=1)
+    missed = looks & ~seen
+    is_before = np.cumsum(seen, axis=1) == 0
+    is_after = np.cumsum(seen[:, ::-1], axis=1)[:, ::-1] == 0
+    before, after = (missed & is_before).sum(axis=1), (missed & is_after).sum(axis=1)
+    within = missed.sum(axis=1) - before - after
+    may = (counts >= settings.least_seen) & ~named
+    confirmed = may
+    for _ in range(ROUNDS):
+        false = ~confirmed & ~named & (counts > 0)
+        chance = float((counts[false] - 1).sum() + 1)
+        q = min(chance / float((looks[false].sum(axis=1) - 1).sum() + UNSEEN), 0.5 * p)
+        miss = core.log((1.0 - p) / (1.0 - q))
+        score = core.log(p / q) * (counts - 1) + miss * within
+        for outside in (before, after):
+            score = score + np.maximum(miss * outside, core.log(HIDDEN))
+        score = score + core.log((confirmed.sum() + 1.0) / (false.sum() + 1.0))
+        last, confirmed = confirmed, may & (score > 0.0)
+        if np.array_equal(last, confirmed):
+            break
+    marked: Bool[np.ndarray, " L"] = confirmed | named
+    return marked
 
 
 def _is_rare(seen: int, looks: int, settings: AssociationSettings) -> bool:

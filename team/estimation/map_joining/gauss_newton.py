@@ -5,7 +5,8 @@ Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initia
 prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g that a sound factor does not exceed, and
 g (2 − g/χ²) beyond, whose slope, the weight, is (g/χ²)². A factor enters with a wide gate that
 narrows with each iteration since it was added, so that a true loop closure is not taken for an
-outlier before the chain has adapted to it. The prior of a robot's own bias has Cauchy's loss.
+outlier before the chain has adapted to it. The prior of a robot's own bias is Student's t of one
+degree of freedom, whose loss is 2 log(1 + χ²).
 
 Each landmark of a submap has a gate and a weight of its own as well, so that a mistaken landmark
 does not break the robot's chain. The weight enters as additional variance of that landmark alone.
@@ -41,6 +42,8 @@ STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
 tenth of the shift by condensing (docs/decisions/25).
 """
+LANDMARK_GATE = 13.8
+"""χ² of two numbers that a sound landmark exceeds with probability 10⁻³."""
 PLAIN = 1e9
 """Widening of gates beyond every χ²."""
 FULL_AGE = 1_000_000
@@ -60,7 +63,7 @@ class JoinSettings:
     solve ends when no unknown changes by more than step_tolerance [m, rad], or after
     max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
     alignment_heading_sigma: for the same, largest standard deviation [rad] of the heading from the
-    shape of the shared landmarks. bias_sigma: scale of the Cauchy prior on each error that a
+    shape of the shared landmarks. bias_sigma: scale of Student's t prior on each error that a
     robot's submaps share. common_bias_sigma: standard deviation of those that all robots share, in
     addition; "marker": the share of the range by which all robots measure one landmark too far.
     joined_ranges: whether errors of ranges are proportional to the range in the joined map
@@ -74,7 +77,7 @@ class JoinSettings:
     robust_start: float = 8.0
     robust_decay: float = 0.7
     submap_gate: float = 1.0
-    landmark_gate: float = 13.8
+    landmark_gate: float = LANDMARK_GATE
     covariance_factor: float = 1.0
     max_iterations: int = 50
     step_tolerance: float = 1e-6
@@ -329,9 +332,12 @@ def settled(island: Island) -> tuple[Island, int, float]:
 
 
 def _has_outliers(island: Island) -> bool:
-    """Whether a factor or a landmark of a submap is beyond its gate."""
+    """Whether a factor or a landmark of a submap is beyond its gate.
+
+    Priors have none: their loss is the same in both solves.
+    """
     at = island.estimate
-    weights = at.weights, at.landmark_weights, at.sighting_weights, at.prior_weights
+    weights = at.weights, at.landmark_weights, at.sighting_weights
     return any((each < 1.0).any() for each in weights)
 
 

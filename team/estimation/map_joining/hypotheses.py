@@ -399,6 +399,8 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     if node not in id_of or count < LEAST_SPOILT or count < SPOILT * len(nodes):
         return
     own = sights_of(island)[id_of[node]]
+    if count < STRAY * len(own.places):
+        return
     spoilt = [at for at, of in worst if of == node]
     found = resolved(without(island, spoilt))
     if found is None:

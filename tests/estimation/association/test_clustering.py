@@ -88,7 +88,7 @@ def test_a_window_of_separate_landmarks_is_associated_without_an_error(seed):
 
 def test_landmarks_nearer_than_the_noise_lower_the_precision():
     scans, labels = window(0, spacing=0.1)
-    assert pairs(associate_window(scans, SETTINGS).landmark_of, labels)[0] < 0.9
+    assert pairs(associate_window(scans, SETTINGS).landmark_of, labels)[0] < 0.95
 
 
 def test_one_scan_never_sees_a_landmark_twice():
@@ -102,13 +102,17 @@ def test_one_scan_never_sees_a_landmark_twice():
     assert (result.counts >= SETTINGS.least_seen).all()
 
 
-def test_a_detection_whose_place_is_observed_again_in_vain_is_clutter():
-    scans, labels = window(2, clutter=0.3)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_place_that_is_observed_again_in_vain_is_clutter_and_no_landmark(seed):
+    scans, labels = window(seed, clutter=0.45)
     result = associate_window(scans, SETTINGS)
     out = result.landmark_of == UNASSIGNED
     assert not result.clutter[~out].any()
-    assert result.clutter[labels == UNASSIGNED].mean() > 0.5
-    assert not result.clutter[labels != UNASSIGNED].any()
+    assert result.clutter[labels == UNASSIGNED].mean() > 0.85
+    assert result.clutter[labels != UNASSIGNED].mean() < 0.02
+    true = len(set(labels[labels != UNASSIGNED].tolist()))
+    assert len(result.counts) <= true + 1, "matches by chance confirm no landmark"
+    assert pairs(result.landmark_of, labels)[1] > 0.8
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.8])
