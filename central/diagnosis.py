@@ -55,10 +55,9 @@ class _SharedError(NamedTuple):
     remedy: str
 
 
+_CLOCK = "add {value:.3g} to its clock_offset_s"
 _ERRORS: Mapping[str, _SharedError] = {
-    "clock_offset": _SharedError(
-        "clock_offset", 0.02, " s", "late", "early", "add {value:.3g} to its clock_offset_s"
-    ),
+    "clock_offset": _SharedError("clock_offset", 0.02, " s", "late", "early", _CLOCK),
     "forward_scale": _SharedError(
         "odometry_scale",
         0.01,
@@ -170,6 +169,11 @@ def _shared_errors(biases: Sequence[BiasEstimate], scale: float) -> Iterator[m.D
                 evidence=(value / sigma) ** 2,
                 remedy=error.remedy.format(value=value, factor=1.0 + value),
             )
+
+
+def clock_remedy(late_s: float) -> str:
+    """Describe the remedy for detections that are stamped late by so much."""
+    return _CLOCK.format(value=late_s)
 
 
 def _of_cut(each: CarriedOff) -> m.Diagnosis:

@@ -23,7 +23,7 @@ import numpy as np
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import MapResult
-from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
@@ -116,7 +116,7 @@ def run(world: StressWorld) -> Outcome:
         scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
         samples = list(run_team(scenario, streams_of(scenario)))
     result = evaluate(samples)
-    causes = tuple(each.cause for each in final_map(samples).diagnosis)
+    causes = tuple(each.cause for each in result.diagnosis)
     if result.map is None or result.map.errors is None:
         return Outcome(np.nan, np.inf, np.nan, causes, bool(result.warnings))
     return Outcome(

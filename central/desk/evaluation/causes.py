@@ -30,7 +30,6 @@ _WARNINGS = (
     ("contradict each other", "robots_contradict"),
     ("not calibrated", "not_calibrated"),
     ("claim to be surer", "covariance_raised"),
-    ("clock", "clocks"),
     ("measurement times", "clocks"),
 )
 

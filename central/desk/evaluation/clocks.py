@@ -18,6 +18,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from teamslam.central.desk.names import in_order
+from teamslam.central.diagnosis import clock_remedy
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.odometry import moved, steered
@@ -113,17 +114,18 @@ class Late:
         return abs(self.offset_s) > max(LEAST_S, BEYOND_DOUBT * self.sigma_s)
 
 
-def clock_warning(robot: str, timed: Timed, config: RobotConfig) -> str | None:
-    """Warning about a robot with significantly different clocks, or None."""
+def clock_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis | None:
+    """Make the cause of a robot with significantly different clocks, or None."""
     found = lateness(timed, config)
     if found is None or not found.is_beyond_doubt:
         return None
-    late = "late against" if found.offset_s > 0.0 else "ahead of"
-    return (
-        f"{robot}: its detections are stamped {abs(found.offset_s):.2f} ± {found.sigma_s:.2f} s "
-        f"{late} its odometry: correct the detections' stamps, or set clock_offset_s = "
-        f"{config.clock_offset_s + found.offset_s:.2f}, which moves odometry and path to "
-        "their clock"
+    return m.Diagnosis(
+        cause="clock_offset",
+        robot=robot,
+        value=(found.offset_s,),
+        sigma=(found.sigma_s,),
+        evidence=(found.offset_s / found.sigma_s) ** 2,
+        remedy=clock_remedy(found.offset_s),
     )
 
 

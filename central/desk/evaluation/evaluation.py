@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from teamslam.central.desk.evaluation.association import association_result
-from teamslam.central.desk.evaluation.clocks import Timed, clock_warning, separate_times_warning
+from teamslam.central.desk.evaluation.clocks import Timed, clock_cause, separate_times_warning
 from teamslam.central.desk.evaluation.errors import (
     MapErrors,
     Path,
@@ -88,6 +88,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     }
     end = log.newest(ch.END, m.End)
     faults = log.of_all(ch.FAULT, m.Fault)
+    late, separate_times = _clocks(log)
     return Evaluation(
         scenario=scenario,
         map=fused,
@@ -115,13 +116,16 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         verdicts=verdicts_given(log),
         data_set=_data_set(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
-        clocks=_clocks(log),
+        separate_times=separate_times,
+        late=late,
         recorded_ns=log.first_ns,
     )
 
 
-def _clocks(log: Collected) -> tuple[str, ...]:
-    """Clock warnings of each robot, from its incarnation with most measurements."""
+def _clocks(log: Collected) -> tuple[tuple[m.Diagnosis, ...], tuple[str, ...]]:
+    """Return the late clocks, by each robot's incarnation with most measurements, and the warning
+    of times that do not overlap.
+    """
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -132,8 +136,8 @@ def _clocks(log: Collected) -> tuple[str, ...]:
         if span is not None:
             first, last = spans.get(robot, span)
             spans[robot] = min(first, span[0]), max(last, span[1])
-    found = (clock_warning(robot, longest[robot], configs[robot]) for robot in in_order(longest))
-    return tuple(filter(None, (*found, separate_times_warning(spans))))
+    found = (clock_cause(robot, longest[robot], configs[robot]) for robot in in_order(longest))
+    return tuple(filter(None, found)), tuple(filter(None, (separate_times_warning(spans),)))
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:

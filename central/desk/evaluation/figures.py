@@ -101,7 +101,6 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "map_covariance": None,
         "final_map_sha256": None,
         "gospa": None,
-        "diagnosis": [],
         "joined": [],
         "changes": [],
     }
@@ -112,7 +111,6 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
             "map_covariance": "joint" if fused.joint else "blocks",
             "final_map_sha256": None if evaluation.disagreement else fused.payload_sha256,
             "gospa": fused.gospa and asdict(fused.gospa),
-            "diagnosis": [to_object(each) for each in fused.diagnosis],
             "joined": list(fused.joined),
             "changes": [change_json(each) for each in fused.changes],
         }
@@ -120,6 +118,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         **_named(evaluation, _TEAM),
         **of_map,
         "data_set": evaluation.data_set or None,
+        "diagnosis": [to_object(each) for each in evaluation.diagnosis],
         "not_joined": absent_robots(states, "not joined"),
         "withdrawn": absent_robots(states, "withdrawn"),
         "warnings": warning_objects(evaluation.other_warnings),

@@ -112,9 +112,9 @@ class Evaluation:
     faults: number of messages set aside. unsound: number of invalid samples. arbitrary_frame: no
     mapped robot has a known initial pose, so only aligned errors are meaningful. decisions:
     closures and merges by unnamed landmarks. verdicts: an operator's, as text. states: of every
-    robot in the final map. data_set: folder or file name; empty for a simulated world. clocks:
-    clock offsets and separate measurement times, as text. recorded_ns: wall time of the first
-    message.
+    robot in the final map. data_set: folder or file name; empty for a simulated world.
+    separate_times: of measurements that do not overlap, as text. late: clock offsets by the
+    measurements alone. recorded_ns: wall time of the first message.
     """
 
     scenario: TeamConfig | None
@@ -136,15 +136,25 @@ class Evaluation:
     gps_median_m: float | None = None
     data_set: str = ""
     states: Mapping[str, RobotState] = field(default_factory=dict)
-    clocks: tuple[str, ...] = ()
+    separate_times: tuple[str, ...] = ()
+    late: tuple[m.Diagnosis, ...] = ()
     recorded_ns: int | None = None
+
+    @property
+    def diagnosis(self) -> tuple[m.Diagnosis, ...]:
+        """Causes of misfit: those of the map, and late clocks by the measurements alone of robots
+        whose clocks the map does not determine.
+        """
+        of_map = () if self.map is None else self.map.diagnosis
+        named = {each.robot for each in of_map if each.cause == "clock_offset"}
+        return (*of_map, *(each for each in self.late if each.robot not in named))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for every command that shows the result: robots missing from the map, causes of
-        misfit, the map's own warnings, clock offsets.
+        misfit, the map's own warnings, times that do not overlap.
         """
-        causes = () if self.map is None else map(describe, self.map.diagnosis)
+        causes = map(describe, self.diagnosis)
         return (*not_in_the_map(self.states), *causes, *self.other_warnings)
 
     @property
@@ -153,7 +163,7 @@ class Evaluation:
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
         lost = (f"{name} lost: {of.why}" for name, of in self.states.items() if of.state == "lost")
-        return (*lost, *of_map, *self.clocks)
+        return (*lost, *of_map, *self.separate_times)
 
     @property
     def title(self) -> str:

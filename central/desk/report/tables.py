@@ -165,9 +165,9 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows += _association_rows(evaluation)
     rows += [("changes", change_words(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
-    rows += [("cause of misfit", describe(each)) for each in fused.diagnosis]
+    rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
-    rows += [("note", words) for words in evaluation.clocks]
+    rows += [("note", words) for words in evaluation.separate_times]
     rows += [("verdict", words) for words in evaluation.verdicts]
     meetings = [t.messages for key, t in evaluation.channels.items() if key.endswith("/rendezvous")]
     if meetings:

@@ -58,13 +58,14 @@ def late(tmp_path_factory):
 
 def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(late):
     evaluation = evaluate(late)
-    (warning,) = evaluation.clocks
-    assert warning.startswith("r2: its detections are stamped 0.1")
-    assert " s late against its odometry: " in warning
-    assert "set clock_offset_s = 0.1" in warning
-    assert warning in evaluation.warnings
-    assert {"cause": "clocks", "text": warning} in to_json(evaluation)["warnings"]
-    assert ("note", warning) in team_rows(evaluation)
+    (late_clock,) = to_json(evaluation)["diagnosis"]
+    assert (late_clock["cause"], late_clock["robot"]) == ("clock_offset", "r2")
+    assert abs(late_clock["value"] - LATE_S) < 3.0 * late_clock["sigma"] < 0.06
+    text = late_clock["text"]
+    assert text.startswith("r2's camera clock is 0.1")
+    assert f"add {late_clock['value']:.3g} to its clock_offset_s" in text
+    assert evaluation.warnings.count(text) == 1
+    assert ("cause of misfit", text) in team_rows(evaluation)
 
 
 def test_the_offset_is_right_within_its_uncertainty_and_a_configured_one_is_deducted(late):
@@ -85,7 +86,7 @@ def test_a_wrong_mount_is_not_taken_for_a_late_clock(late):
 
 def test_clocks_that_are_right_are_not_mentioned(tmp_path):
     log = published(StressWorld(seed=3, robots=2), tmp_path)
-    assert evaluate(log).clocks == ()
+    assert evaluate(log).late == ()
     for robot in ("r1", "r2"):
         found = lateness(timed_of(log, robot), RobotConfig(robot))
         assert found is not None, "the world must be able to tell"
