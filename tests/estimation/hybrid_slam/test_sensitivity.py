@@ -461,9 +461,9 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
         state[at] = prior.mean[0] + by
         return replace(island, state=state)
 
-    assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
+    assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(2.0 / 101.0)
     plain = replace(shifted(10.0 * sigma), settings=replace(options, robust=False))
-    assert plain.estimate.prior_weights[k] == pytest.approx(1.0 / 101.0)
+    assert plain.estimate.prior_weights[k] == pytest.approx(2.0 / 101.0)
     graph, h = island.graph, 1e-4 * sigma
     counts = len(graph.submaps), len(graph.sightings), len(graph.priors)
     marks = [np.full(count, k == 2) for k, count in enumerate(counts)]
