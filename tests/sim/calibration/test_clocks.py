@@ -77,7 +77,8 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
         for robot, clock in zip(late.robots, clocks, strict=True)
     ]
     on_time = msgspec.structs.replace(late, robots=tuple(robots))
-    assert map_error(on_time) < 1.1 * map_error(right) < 0.3 * map_error(late)
+    # Self-calibration in the joined map corrects most of the late map's error by itself.
+    assert map_error(on_time) < 1.1 * map_error(right) < 0.5 * map_error(late)
     assert "clock_offset_s" in scenario_toml(found, late, ["late"])
 
 
