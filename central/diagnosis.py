@@ -27,7 +27,12 @@ from teamslam.team.estimation.map_joining.hypotheses import (
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
-from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, terms
+from teamslam.team.estimation.map_joining.marginals import (
+    Agreement,
+    BiasEstimate,
+    scatter_of,
+    terms,
+)
 from teamslam.team.wire import messages as m
 
 SIGMAS = 4.0
@@ -104,7 +109,7 @@ def diagnose(
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
-    shared = list(_shared_errors(biases, scale))
+    shared = list(_shared_errors(fold, biases, scale))
     found = [*shared, *_mirrored(fold, withdrawn), *map(_of_cut, carried)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
@@ -152,15 +157,23 @@ _REMEDIES: Mapping[str, str] = {
 }
 
 
-def _shared_errors(biases: Sequence[BiasEstimate], scale: float) -> Iterator[m.Diagnosis]:
+def _shared_errors(
+    fold: Fold, biases: Sequence[BiasEstimate], scale: float
+) -> Iterator[m.Diagnosis]:
     """Find errors that differ from the robot's configuration beyond doubt.
 
-    A covariance scale above 1 enlarges the standard deviations by its root. That of an error that
-    is found is larger by the error of its sensitivities, which vanishes with it.
+    Their standard deviation is the larger of two: the stated one by the root of a covariance scale
+    above 1, and that by the scatter of the submaps. Errors that change slowly look like a shared
+    one, but the submaps scatter about it. That of an error that is found is larger by the error of
+    its sensitivities, which vanishes with it.
     """
-    for (robot, _), bias, value, stated in biases:
+    for found in biases:
+        (robot, _), bias, value, stated = found
         error, sigma = _ERRORS.get(bias), stated * math.sqrt(max(scale, 1.0))
-        if error is not None and abs(value) > max(error.least, SIGMAS * sigma) and sigma > 0.0:
+        if error is None or sigma == 0.0 or abs(value) <= max(error.least, SIGMAS * sigma):
+            continue
+        sigma = max(sigma, scatter_of(fold, found))
+        if abs(value) > SIGMAS * sigma:
             yield m.Diagnosis(
                 cause=error.cause,
                 robot=robot,

@@ -72,6 +72,15 @@ def test_noise_that_is_stated_wrong_is_named_with_its_factor(tmp_path, noise, ca
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_errors_that_change_slowly_are_noise_and_no_error_that_the_submaps_share(tmp_path, seed):
+    """The stated sigmas leave the offset of a robot's bearings many of them from 0: the scatter of
+    its submaps shows that it is no constant.
+    """
+    (found,) = diagnosed(scenario(replace(TEAM, correlated_s=20.0, seed=seed), tmp_path))
+    assert found.cause == "noise_underestimated"
+
+
 def test_the_object_of_a_cause_has_a_number_or_the_two_of_a_motion():
     moved = m.Diagnosis(
         cause="landmark_moved", landmark=7, value=(2.0, 0.1), sigma=(0.1, 0.1), at_ns=10**9

@@ -63,7 +63,7 @@ JUMP_SIGMAS = 8.0
 RESOLVED = 1.5
 """Least size of an effect in standard deviations of one submap."""
 ASSIGNED = 2.0 * math.log(2.0)
-"""Cost of each free assignment of an observation to one of two places."""
+"""Cost of each free assignment of an observation to one of two places, by the covariance scale."""
 LEAST_SIDE = 2
 """Least number of submaps on each side of a split."""
 PROPOSED = 3
@@ -217,8 +217,11 @@ def change_of(sights: Sights) -> _Two | None:
     return _Two(np.arange(n) >= least + best, one - two[best])
 
 
-def clusters_of(sights: Sights) -> _Two | None:
-    """Find two places among a landmark's observations, whatever their order."""
+def clusters_of(sights: Sights, scale: float) -> _Two | None:
+    """Find two places among a landmark's observations, whatever their order.
+
+    scale: the covariance scale, by which the χ² that free assignments remove by chance is larger.
+    """
     n = len(sights.places)
     one = _chi2_about(sights, _centre(sights, np.ones(n, np.bool_)))
     gains = [float(np.maximum(one - _chi2_about(sights, at), 0.0).sum()) for at in sights.points]
@@ -231,7 +234,7 @@ def clusters_of(sights: Sights) -> _Two | None:
         if (nearer == second).all():
             break
         second = nearer
-    return _split_by(sights, second, ASSIGNED * n) if _is_shared(second) else None
+    return _split_by(sights, second, scale * ASSIGNED * n) if _is_shared(second) else None
 
 
 class _Solved(NamedTuple):
@@ -278,7 +281,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         if len(own.places) >= 2 * LEAST_SIDE:
             if (moved := change_of(own)) is not None:
                 proposals.append((moved.evidence, id_, MOVED, moved.second))
-            if (shared := clusters_of(own)) is not None:
+            if (shared := clusters_of(own, base.scale)) is not None:
                 proposals.append((shared.evidence, id_, SHARED, shared.second))
     proposals = [each for each in proposals if each[0] > base.scale * level]
     proposals.sort(key=lambda each: (-each[0], each[1], each[2]))
@@ -298,7 +301,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         own_sigma = math.sqrt(base.scale * float(np.median(own.spread[:, [0, 2]].max(axis=1))))
         if float(core.hypot(*shift)) < RESOLVED * own_sigma and base.scale > 1.0:
             continue
-        price = ASSIGNED * len(second) if cause == SHARED else 0.0
+        price = base.scale * ASSIGNED * len(second) if cause == SHARED else 0.0
         first = int(np.flatnonzero(second)[0])
         yield Hypothesis(
             cause,

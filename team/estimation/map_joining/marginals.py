@@ -3,6 +3,7 @@
 All values are in the frame of an island: the main one, or the one of a stream.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -28,6 +29,9 @@ from teamslam.team.shapes import Float, UInt32
 
 BELIEVED = 0.5
 """Least weight of a landmark in a submap for the submap to be believed about it."""
+
+STEP = 0.1
+"""Step of a derivative along a bias, in its standard deviations."""
 
 
 class LandmarkMap(NamedTuple):
@@ -139,6 +143,41 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
         sigma = deviation(covariance.sum())
         found.append(BiasEstimate(stream, bias, float(mean.sum()), sigma))
     return found
+
+
+def scatter_of(fold: Fold, of: BiasEstimate) -> float:
+    """Estimate the standard deviation of a bias from the scatter of what the submaps add to it.
+
+    With c = A⁻¹u, where u picks the bias, submap k moves the estimate by s_k = −c · ∇(w χ²_k)/2.
+    Errors that last longer than a window correlate the s_k of a stream: the variance is
+
+        Σ_streams Σ_l (1 − |l|/(L + 1)) Σ_k s_k s_{k+l},   L = ⌊4 (n/100)^(2/9)⌋,
+
+    with n submaps of the stream (Newey and West 1987, 1994). Independent errors with the submaps'
+    covariances give `of.sigma`. Condensed submaps are not counted.
+    """
+    key = of.stream, of.bias
+    island = next(each for each in fold.islands.values() if key in each.graph.biases)
+    graph, now = island.graph, island.estimate
+    nodes = [graph.biases[key]]
+    nodes += [node for bias, node in graph.common.items() if bias == of.bias]
+    c = island.posterior.inverse_columns(graph.offset[nodes]).sum(axis=1)
+    step = STEP / of.sigma * c
+    rise = (
+        island.moved(step, 0).estimate.counted_chi2 - island.moved(-step, 0).estimate.counted_chi2
+    )
+    moves = -0.25 * of.sigma / STEP * now.weights * rise
+    chains: dict[Stream, list[tuple[int, int]]] = {}
+    for k, each in enumerate(graph.submaps):
+        chains.setdefault(each.contribution.stream, []).append((each.contribution.sequence, k))
+    variance = 0.0
+    for _, chain in sorted(chains.items()):
+        s = moves[[k for _, k in sorted(chain)]]
+        lags = math.floor(4.0 * (len(s) / 100.0) ** (2.0 / 9.0))
+        for lag in range(min(lags, len(s) - 1) + 1):
+            share = (1.0 if lag == 0 else 2.0) * (1.0 - lag / (lags + 1.0))
+            variance += share * float((s[lag:] * s[: len(s) - lag]).sum())
+    return math.sqrt(max(variance, 0.0))
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
