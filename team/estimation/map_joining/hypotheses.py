@@ -64,6 +64,8 @@ RESOLVED = 1.5
 """Least size of an effect in standard deviations of one submap."""
 ASSIGNED = 2.0 * math.log(2.0)
 """Cost of each free assignment of an observation to one of two places, by the covariance scale."""
+AT_ONCE = 32
+"""Number of places about which a scan evaluates the observations at once."""
 LEAST_SIDE = 2
 """Least number of submaps on each side of a split."""
 PROPOSED = 3
@@ -155,8 +157,11 @@ class _Two(NamedTuple):
 
 
 def _chi2_about(sights: Sights, point: Values, own: slice = ALL) -> Values:
-    """Evaluate the χ² of each of some observations about a place, at most FAR."""
-    x, y = (sights.points[own] - point).T
+    """Evaluate the χ² of each of some observations about a place, or about each of k places (k × 1
+    × 2), at most FAR.
+    """
+    away = sights.points[own] - point
+    x, y = away[..., 0], away[..., 1]
     xx, xy, yy = sights.spread[own].T
     chi2: Values = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     bounded: Values = np.minimum(chi2, FAR)
@@ -207,11 +212,14 @@ def change_of(sights: Sights) -> _Two | None:
         return None
     before = np.column_stack([_running_medians(each) for each in sights.points.T])
     behind = np.column_stack([_running_medians(each[::-1])[::-1] for each in sights.points.T])
-    two = [
-        float(_chi2_about(sights, before[first - 1], slice(first)).sum())
-        + float(_chi2_about(sights, behind[first], slice(first, None)).sum())
-        for first in range(least, n - least + 1)
-    ]
+    two: list[float] = []
+    for at in range(least, n - least + 1, AT_ONCE):
+        stop = min(at + AT_ONCE, n - least + 1)
+        early = _chi2_about(sights, before[at - 1 : stop - 1, None], slice(stop - 1))
+        late = _chi2_about(sights, behind[at:stop, None], slice(at, None))
+        two += [
+            float(early[k, : at + k].sum()) + float(late[k, k:].sum()) for k in range(stop - at)
+        ]
     one = float(_chi2_about(sights, before[-1]).sum())
     best = int(np.argmax(one - np.array(two)))
     return _Two(np.arange(n) >= least + best, one - two[best])
@@ -224,8 +232,11 @@ def clusters_of(sights: Sights, scale: float) -> _Two | None:
     """
     n = len(sights.places)
     one = _chi2_about(sights, _centre(sights, np.ones(n, np.bool_)))
-    gains = [float(np.maximum(one - _chi2_about(sights, at), 0.0).sum()) for at in sights.points]
-    second = _chi2_about(sights, sights.points[int(np.argmax(gains))]) < one
+    gains = [
+        np.maximum(one - _chi2_about(sights, sights.points[k : k + AT_ONCE, None]), 0.0).sum(axis=1)
+        for k in range(0, n, AT_ONCE)
+    ]
+    second = _chi2_about(sights, sights.points[int(np.argmax(np.concatenate(gains)))]) < one
     for _ in range(ITERATIONS):
         if not _is_shared(second):
             return None
