@@ -10,8 +10,6 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from teamslam.central.carried_off import CarriedOff
 from teamslam.central.monitor import finding
 from teamslam.team import core
@@ -24,6 +22,7 @@ from teamslam.team.estimation.map_joining.hypotheses import (
     SHARED,
     Hypothesis,
     explain,
+    median,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
@@ -244,7 +243,7 @@ def _gain_of_reflection(fold: Fold, submap: Contribution, others: Collection[int
     u, v = (local - local.mean(axis=0)).T
     rotated = core.hypot((x * u + y * v).sum(), (y * u - x * v).sum())
     reflected = core.hypot((x * u - y * v).sum(), (y * u + x * v).sum())
-    variance = float(np.median(submap.factor.landmarks[own][:, [0, 2]]))
+    variance = float(median(submap.factor.landmarks[own][:, [0, 2]].ravel()))
     return float(2.0 * (reflected - rotated)) / variance
 
 

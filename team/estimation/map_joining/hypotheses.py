@@ -170,8 +170,14 @@ def _chi2_about(sights: Sights, point: Values, own: slice = ALL) -> Values:
 
 def _centre(sights: Sights, own: Bool[np.ndarray, " n"]) -> Values:
     """Median place of some observations [m]."""
-    centre: Values = np.median(sights.points[own], axis=0)
-    return centre
+    return median(sights.points[own])
+
+
+def median(values: Float[np.ndarray, "..."]) -> Values:
+    """Compute the median over the first axis, for a few values faster than `numpy.median`."""
+    ordered, n = np.sort(values, axis=0), len(values)
+    middle: Values = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+    return middle
 
 
 def _running_medians(values: Values) -> Values:
