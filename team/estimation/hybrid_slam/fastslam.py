@@ -4,8 +4,6 @@ p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor 
 particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -24,6 +22,7 @@ __all__ = [
     "Noise",
     "Particles",
     "Proposal",
+    "RefusedByName",
     "StepInfo",
     "at_poses",
     "effective_sample_size",
@@ -32,7 +31,6 @@ __all__ = [
     "normalise",
     "propagated",
     "propagated_and_updated",
-    "refused_by_name",
     "resampled",
     "systematic_parents",
 ]
@@ -69,15 +67,18 @@ def noise_of(sensor: Sensor) -> Noise:
     )
 
 
-@contextmanager
-def refused_by_name() -> Iterator[None]:
-    """Raise NotACovarianceError for what the core refuses."""
-    try:
-        yield
-    except core.MotionError as error:
-        raise NotACovarianceError("the motion", str(error)) from error
-    except core.NotFiniteError as error:
-        raise NotACovarianceError("the window", f"not finite: {error}") from error
+class RefusedByName:
+    """A context that raises NotACovarianceError for what the core refuses."""
+
+    def __enter__(self) -> None:
+        """Nothing has to be prepared."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Replace the core's error."""
+        if isinstance(error, core.MotionError):
+            raise NotACovarianceError("the motion", str(error)) from error
+        if isinstance(error, core.NotFiniteError):
+            raise NotACovarianceError("the window", f"not finite: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ def filter_step(
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
     noises = unclaimed(len(ids)) if own is None else own
     normals = generator.standard_normal((len(particles.poses), 3))
-    with refused_by_name():
+    with RefusedByName():
         window = core.Window.of_particles(
             *particles.arrays, noise_of(sensor), proposal == "fastslam2"
         )
