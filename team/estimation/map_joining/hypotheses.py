@@ -26,7 +26,12 @@ from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import covariance_scale
-from teamslam.team.estimation.map_joining.gauss_newton import Island, final_cost, joint_marginal
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    LANDMARK_GATE,
+    Island,
+    final_cost,
+    joint_marginal,
+)
 from teamslam.team.estimation.map_joining.marginals import terms
 from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
 from teamslam.team.estimation.se2 import compose, inverse, wrapped
@@ -50,8 +55,8 @@ SPOILT = 0.6
 FAR = 50.0
 """Most χ² of an observation in a scan: a wild one must not decide it."""
 STRAY = 0.1
-"""Least share of a landmark's observations at a second place. With fewer, misread ones are
-likelier: of markers that are misread easily up to 6 of 177 submaps are elsewhere (UTIAS set 2,
+"""Least share of a landmark's observations at a second place, unless they agree with each other:
+of markers that are misread easily up to 6 of 177 submaps are elsewhere, scattered (UTIAS set 2,
 landmark 15, whose place is right to 2 mm).
 """
 ITERATIONS = 8
@@ -62,8 +67,6 @@ JUMP_SIGMAS = 8.0
 """Least size of a jump of a robot: a submap with misread landmarks shows a jump of 4 to 6."""
 RESOLVED = 1.5
 """Least size of an effect in standard deviations of one submap."""
-ASSIGNED = 2.0 * math.log(2.0)
-"""Cost of each free assignment of an observation to one of two places, by the covariance scale."""
 AT_ONCE = 32
 """Number of places about which a scan evaluates the observations at once."""
 LEAST_SIDE = 2
@@ -156,7 +159,7 @@ class _Two(NamedTuple):
     evidence: float
 
 
-def _chi2_about(sights: Sights, point: Values, own: slice = ALL) -> Values:
+def _chi2_about(sights: Sights, point: Values, own: slice | Bool[np.ndarray, " n"] = ALL) -> Values:
     """Evaluate the χ² of each of some observations about a place, or about each of k places (k × 1
     × 2), at most FAR.
     """
@@ -195,10 +198,29 @@ def _least_side(n: int) -> int:
     return max(LEAST_SIDE, math.ceil(STRAY * n))
 
 
-def _is_shared(own: Bool[np.ndarray, " n"]) -> bool:
-    """Whether both sides have enough observations."""
-    least = _least_side(len(own))
-    return least <= int(own.sum()) <= len(own) - least
+def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
+    """Whether both places have enough observations: a share of STRAY, or two that agree with each
+    other and are most of those that are elsewhere. Misread ones are scattered.
+    """
+    few = second if 2 * int(second.sum()) <= len(second) else ~second
+    count = int(few.sum())
+    if count < LEAST_SIDE:
+        return False
+    if count >= _least_side(len(few)):
+        return True
+    elsewhere = _chi2_about(sights, _centre(sights, ~few)) > LANDMARK_GATE
+    agree = elsewhere & (_chi2_about(sights, _centre(sights, few)) < LANDMARK_GATE)
+    return int(agree.sum()) >= max(LEAST_SIDE, SPOILT * int(elsewhere.sum()))
+
+
+def _price(second: Bool[np.ndarray, " n"]) -> float:
+    """Return the cost, as χ², of a choice of k of n: 2 log((n + 1) n!/(k! (n − k)!)).
+
+    Every k is equally likely beforehand, and so is every choice with one k.
+    """
+    n, k = len(second), int(second.sum())
+    ratios = np.arange(n - k + 1.0, n + 1.0) / np.arange(1.0, k + 1.0)
+    return 2.0 * float(core.log(n + 1.0) + core.log(ratios).sum())
 
 
 def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _Two:
@@ -244,14 +266,14 @@ def clusters_of(sights: Sights, scale: float) -> _Two | None:
     ]
     second = _chi2_about(sights, sights.points[int(np.argmax(np.concatenate(gains)))]) < one
     for _ in range(ITERATIONS):
-        if not _is_shared(second):
+        if not second.any() or second.all():
             return None
         places = [_centre(sights, own) for own in (~second, second)]
         nearer = _chi2_about(sights, places[1]) < _chi2_about(sights, places[0])
         if (nearer == second).all():
             break
         second = nearer
-    return _split_by(sights, second, scale * ASSIGNED * n) if _is_shared(second) else None
+    return _split_by(sights, second, scale * _price(second)) if _is_shared(sights, second) else None
 
 
 class _Solved(NamedTuple):
@@ -290,6 +312,17 @@ def _begin_ns(island: Island, place: int) -> int:
     return next(ends, 0)
 
 
+def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, " n"]) -> bool:
+    """Whether another named landmark is at the second place: its number was misread there."""
+    graph, state = base.island.graph, base.island.state
+    gate = base.scale * LANDMARK_GATE
+    return any(
+        float(np.median(_chi2_about(own, state[graph.offset[node] :][:2], second))) < gate
+        for other, node in graph.landmarks.items()
+        if other != id_ and other < UNNAMED
+    )
+
+
 def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the most likely hypotheses of a landmark with two places."""
     sights = sights_of(base.island)
@@ -298,7 +331,8 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         if len(own.places) >= 2 * LEAST_SIDE:
             if (moved := change_of(own)) is not None:
                 proposals.append((moved.evidence, id_, MOVED, moved.second))
-            if (shared := clusters_of(own, base.scale)) is not None:
+            shared = clusters_of(own, base.scale)
+            if shared is not None and not _is_misread(base, id_, own, shared.second):
                 proposals.append((shared.evidence, id_, SHARED, shared.second))
     proposals = [each for each in proposals if each[0] > base.scale * level]
     proposals.sort(key=lambda each: (-each[0], each[1], each[2]))
@@ -318,7 +352,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         own_sigma = math.sqrt(base.scale * float(np.median(own.spread[:, [0, 2]].max(axis=1))))
         if float(core.hypot(*shift)) < RESOLVED * own_sigma and base.scale > 1.0:
             continue
-        price = base.scale * ASSIGNED * len(second) if cause == SHARED else 0.0
+        price = base.scale * _price(second) if cause == SHARED else 0.0
         first = int(np.flatnonzero(second)[0])
         yield Hypothesis(
             cause,
