@@ -39,6 +39,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64
 
 Values = Float[np.ndarray, " _"]
+Costs = Float[np.ndarray, "..."]
 Places = Int64[np.ndarray, " n"]
 Covariance = Float[np.ndarray, "k k"]
 
@@ -159,15 +160,17 @@ class _Two(NamedTuple):
     evidence: float
 
 
-def _chi2_about(sights: Sights, point: Values, own: slice | Bool[np.ndarray, " n"] = ALL) -> Values:
+def _chi2_about(
+    sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
+) -> Costs:
     """Evaluate the χ² of each of some observations about a place, or about each of k places (k × 1
     × 2), at most FAR.
     """
     away = sights.points[own] - point
     x, y = away[..., 0], away[..., 1]
     xx, xy, yy = sights.spread[own].T
-    chi2: Values = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-    bounded: Values = np.minimum(chi2, FAR)
+    chi2: Costs = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+    bounded: Costs = np.minimum(chi2, FAR)
     return bounded
 
 
