@@ -1,5 +1,6 @@
 """Saved maps and the fold: save its final map, and list what has changed since earlier days."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 
@@ -23,6 +24,9 @@ from teamslam.team.estimation.map_joining.saved_maps import (
 )
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
+
+LEAST_SUBMAPS = 2
+"""Submaps that place a landmark elsewhere, for it to have moved while its former place is empty."""
 
 
 class NothingToSaveError(ValueError):
@@ -91,7 +95,9 @@ def _counts(
 def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange, ...]:
     """List the state of each landmark against the saved maps in the main island, by number.
 
-    One that several maps have counts as the one that changed most.
+    One that several maps have counts as the one that changed most. A landmark that one submap
+    places elsewhere, while none sees it at its former place beyond chance, is gone: a single wrong
+    number does not move it.
     """
     if fold.main_key is None:
         return ()
@@ -102,16 +108,21 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     island, found = fold.main, dict[int, m.LandmarkChange]()
     limit = chi2_limit(2, FALSE_ALARM)
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
-    own = {
+    own = Counter(
         node
         for each in island.graph.submaps
         if not is_map(each.contribution.stream)
         for node in each.landmarks.tolist()
-    }
+    )
+    condensed = set() if graph.condensed is None else {*graph.condensed.nodes.tolist()}
+    former: dict[int, int] = {}
     old: set[int] = {id_ for stream, id_ in graph.former if not is_survey(stream)}
     for saved in earlier:
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
         for each in displacements(island, saved):
+            node = graph.landmarks[each.landmark]
+            if each.is_apart and own[node] < LEAST_SUBMAPS and node not in condensed:
+                former[each.landmark] = graph.former[saved.contribution.stream, each.landmark]
             before = found.get(each.landmark)
             if before is None or before.chi2 < each.chi2:
                 found[each.landmark] = m.LandmarkChange(
@@ -123,7 +134,10 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
                     chi2=max(each.chi2, 0.0),
                 )
     unseen = sorted(id_ for id_ in old & {*shown} if island.graph.landmarks.get(id_) not in own)
-    for id_, absence in zip(unseen, absences(island, points_of(island, unseen)), strict=True):
+    lost = [*unseen, *former]
+    at = graph.offset[[*former.values()]].astype(np.intp)
+    places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
+    for id_, absence in zip(lost, absences(island, np.concatenate(places)), strict=True):
         if absence.chance < FALSE_ALARM:
             found[id_] = m.LandmarkChange(landmark=id_, state="gone", expected=absence.expected)
     for id_ in {*shown} - old:

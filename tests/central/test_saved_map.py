@@ -135,6 +135,23 @@ def test_a_landmark_that_is_not_seen_again_is_gone_and_is_not_saved_again():
     assert 15 not in ids(saved.ids, "ids")
 
 
+def test_one_misread_number_does_not_move_a_landmark_that_is_gone():
+    _, _, streams = second_day(moved=((15, (-900.0, -900.0)),))
+    first, *rest = streams.streams
+    seen = first.landmark_detections
+    wrong = seen.ids.copy()
+    wrong[len(wrong) // 2] = 15
+    misread = dataclasses.replace(first, landmark_detections=dataclasses.replace(seen, ids=wrong))
+    day_of = msgspec.structs.replace(load("thesis-b"), seed=1001)
+    world = dataclasses.replace(streams, streams=(misread, *rest))
+    samples, centre, _ = day(0, [first_day()[1]], scenario=day_of, streams=world)
+    fused = final_map(samples)
+    assert 15 in ids(fused.ids, "ids"), "the misread number is in the map"
+    assert {number: each.state for number, each in changed(fused).items()} == {15: "gone"}
+    saved = centre.maps.fold.save_map("later")
+    assert 15 not in ids(saved.ids, "ids")
+
+
 def test_a_running_centre_saves_the_map_of_its_present_set():
     """The final map of that set, without effect on the running fold; a day counts once."""
     samples, centre, _ = day(1)
