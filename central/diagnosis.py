@@ -8,6 +8,7 @@ reflection. The covariance scale is judged last, beside all accepted causes.
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from statistics import median
 from typing import NamedTuple
 
 from teamslam.central.carried_off import CarriedOff
@@ -22,7 +23,6 @@ from teamslam.team.estimation.map_joining.hypotheses import (
     SHARED,
     Hypothesis,
     explain,
-    median,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
@@ -243,7 +243,7 @@ def _gain_of_reflection(fold: Fold, submap: Contribution, others: Collection[int
     u, v = (local - local.mean(axis=0)).T
     rotated = core.hypot((x * u + y * v).sum(), (y * u - x * v).sum())
     reflected = core.hypot((x * u - y * v).sum(), (y * u + x * v).sum())
-    variance = float(median(submap.factor.landmarks[own][:, [0, 2]].ravel()))
+    variance = median(submap.factor.landmarks[own][:, [0, 2]].ravel().tolist())
     return float(2.0 * (reflected - rotated)) / variance
 
 
