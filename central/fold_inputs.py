@@ -11,7 +11,8 @@ import msgspec
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.members import Members
-from teamslam.central.survey import survey_of
+from teamslam.central.survey import station, survey_of
+from teamslam.team.config import GNSS
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
     Contribution,
@@ -44,6 +45,7 @@ class FoldInputs:
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
+        self._has_station = False
         if config.surveyed:
             survey, start = survey_of(config.surveyed)
             self.add_start(start)
@@ -54,12 +56,19 @@ class FoldInputs:
         self._starts[(start.robot, start.incarnation)] = start
 
     def add_submap(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """Add a submap with the inter-robot measurements from it, all named by `digest`; return its
-        tick.
+        """Add a submap with the inter-robot measurements from it, all named by `digest`; return the
+        first tick that this changes.
+
+        The first fix adds the station, before all of the team's time.
         """
         tick = self._members.add(submap, digest, sightings)
         self.robots.add(submap.robot)
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
+        if not self._has_station and any(each.teammate == GNSS for each in sightings):
+            self._has_station = True
+            added, start = station()
+            self.add_start(start)
+            tick = min(tick, self._members.add(added, digest_of(encoded(added)), ()))
         return tick
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:

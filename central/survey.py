@@ -10,8 +10,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from teamslam.central.config import SurveyedLandmark
-from teamslam.team.config import SURVEY
-from teamslam.team.estimation.contribution import SURVEYED, InitialPoseFactor, is_map, named
+from teamslam.team.config import GNSS, SURVEY
+from teamslam.team.estimation.contribution import (
+    STATION,
+    SURVEYED,
+    InitialPoseFactor,
+    is_map,
+    is_survey,
+    named,
+)
+from teamslam.team.estimation.inter_robot import STATION_POSE
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
 from teamslam.team.saved_map import member_of
@@ -41,6 +49,12 @@ def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPose
     return submap, InitialPoseFactor(*SURVEYED, np.array([*origin, 0.0]))
 
 
+def station() -> tuple[Submap, InitialPoseFactor]:
+    """Make the station of fixes, a submap without landmarks, and its exact start."""
+    submap = member_of(GNSS, b"", np.zeros(0), np.zeros((0, 0)), b"", config=DIGEST)
+    return submap, InitialPoseFactor(*STATION, STATION_POSE)
+
+
 def survey_warnings(fold: Fold) -> Iterator[str]:
     """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance, and saved
     maps that contain a survey already.
@@ -48,7 +62,7 @@ def survey_warnings(fold: Fold) -> Iterator[str]:
     if not fold.contributions:
         return
     for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):
-        if stream != SURVEYED:
+        if not is_survey(stream):
             yield (
                 f"{named(stream)} contains a survey, which central.surveyed counts a second time: "
                 "leave that out"

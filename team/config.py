@@ -29,6 +29,8 @@ MAP = "map-"
 SURVEY = MAP + "survey"
 """The member of the set that has the surveyed landmarks."""
 SURVEY_FRAME = SURVEY + "/0"
+GNSS = MAP + "gnss"
+"""The member of the set from whose start fixes of robots' positions are measured."""
 """The frame that its start fixes."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
@@ -311,6 +313,17 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Most landmarks of a submap; a window closes early with half as many."""
 
 
+class Gnss(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A receiver of absolute positions (fixes), in the frame of the survey.
+
+    antenna: (ahead [m], left [m]) on the robot. sigma_m: standard deviation of a fix without a
+    covariance, of an error that is independent from one pose node to the next.
+    """
+
+    antenna: tuple[float, float] = (0.0, 0.0)
+    sigma_m: Annotated[float, Meta(gt=0.0, le=1e6)] = 3.0
+
+
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything that a robot's estimate depends on beside its measurements."""
 
@@ -318,6 +331,7 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     motion: MotionModel = MotionModel()
     sensor: Sensor = Sensor()
     front_end: FrontEnd = FrontEnd()
+    gnss: Gnss = Gnss()
     estimator: Estimator = "hybrid"
     fusion: FusionRule = "join"
     exchange_s: NonNegative = 0.0

@@ -92,7 +92,9 @@ def _robots(message: m.Message) -> Iterator[str]:
     """The robots that a message claims for the team."""
     match message:
         case m.SightingFactor():
-            yield from (message.robot, message.teammate)
+            yield message.robot
+            if not message.teammate.startswith(MAP):
+                yield message.teammate
         case m.End():
             yield from (stream.robot for stream in message.streams)
         case m.Withdrawal() if not message.robot.startswith(MAP):

@@ -9,7 +9,7 @@ import numpy as np
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
-from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
@@ -237,6 +237,7 @@ def sighting_message(
         bearing=float(sighting.measurement[1]),
         covariance=from_floats(packed(sighting.covariance)),
         measurements=measurements,
+        point=from_floats(sighting.point) if sighting.point.any() else b"",
     )
 
 
@@ -250,7 +251,15 @@ def sighting_of(message: m.SightingFactor) -> InterRobotFactor:
         message.teammate,
         np.array([message.range, message.bearing]),
         unpacked(floats(message.covariance, "covariance"), 2),
+        floats(message.point, "point").astype(np.float64) if message.point else BASE,
     )
+
+
+def fix_of(message: m.Fix, config: RobotConfig) -> CarriedPoint:
+    """Read the position [m] and the covariance [m²] of a fix."""
+    own = message.covariance
+    P = unpacked(floats(own, "covariance"), 2) if own else config.gnss.sigma_m**2 * np.eye(2)
+    return CarriedPoint(floats(message.position, "position").astype(np.float64), P)
 
 
 def contribution_of(message: m.Submap) -> Contribution:

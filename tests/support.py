@@ -501,6 +501,14 @@ def examples() -> Iterator[m.Message]:
         notes=("gap of 3 s",),
     )
     yield m.StreamHead(stamp_ns=9_000, robot="alpha", incarnation=1, measurements=200, state="open")
+    yield m.Fix(
+        stamp_ns=9_000,
+        robot="alpha",
+        incarnation=1,
+        number=7,
+        position=from_floats([3.0, 4.0]),
+        covariance=from_floats([4.0, 0.0, 4.0]),
+    )
     yield build.team_end(reason="the batteries are empty")
     yield build.status(
         stamp_ns=9_000,

@@ -8,6 +8,7 @@ r1/observations.csv   t_s,landmark with range_m,bearing_rad (with c_rr,c_rb,c_bb
 r1/detections.csv     t_s,range_m,bearing_rad without identities, and r1/labels.csv for scoring
                       (`teamslam.sim.datasets.detections_table`)                   (optional)
 r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
+r1/fixes.csv          t_s,x_m,y_m, with c_xx,c_xy,c_yy: absolute positions  (optional)
 r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
 r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
 landmarks.csv         landmark,x_m,y_m: the true ones                     (optional)
@@ -42,6 +43,7 @@ TABLES = {
         *rows.POINT_COVARIANCE,
     ),
     "sightings": ("t_s", "teammate", *rows.POLAR, *rows.POINTS),
+    "fixes": ("t_s", *rows.POINTS, *rows.POINT_COVARIANCE),
     "start": ("t_s", *rows.POSES, *POSE_COVARIANCE),
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
@@ -50,6 +52,7 @@ REQUIRED = {
     "odometry": ("t_s",),
     "observations": ("t_s", "landmark"),
     "sightings": ("t_s", "teammate"),
+    "fixes": ("t_s", *rows.POINTS),
     "start": rows.POSES,
     "truth": ("t_s", *rows.POSES),
     "landmarks": ("landmark", *rows.POINTS),
@@ -99,9 +102,9 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
 
 
 def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
-    odometry, observed, sighted, truth, start = (
+    odometry, observed, sighted, fixed, truth, start = (
         _table(place, kind, robot)
-        for kind in ("odometry", "observations", "sightings", "truth", "start")
+        for kind in ("odometry", "observations", "sightings", "fixes", "truth", "start")
     )
     intervals, notes = intervals_of(odometry, clocks[robot])
     driven = None
@@ -117,6 +120,8 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
     teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
+    notes += more
+    fixes, more = rows.fixes_of(fixed, driven)
     notes += more
     saw = len(seen.stamps_ns) or len(teammates.stamps_ns) or unnamed is not None
     if driven is None and not saw:
@@ -140,6 +145,9 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
         truth_ns=truth_ns if len(poses) else None,
         truth=poses if len(poses) else None,
         notes=tuple(notes),
+        fixes_ns=fixes.stamps_ns,
+        fixes=fixes.positions,
+        fix_covariances=fixes.covariances,
         clock_offset_ns=clocks[robot],
     )
 

@@ -4,6 +4,7 @@ Unused rows are counted in notes, with reason and first line.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -215,6 +216,38 @@ def _own(
     unclaimed = np.isnan(claimed[:, 0])
     rows.note(unclaimed, "without a covariance, as others have: the sensor's noise holds for it")
     return claimed
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """Absolute positions [m] by time; covariances: (xx, xy, yy), None: not stated."""
+
+    stamps_ns: Int64[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    positions: Float[np.ndarray, "F 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+    covariances: Float[np.ndarray, "F 3"] | None = None
+
+    def until(self, last_ns: int) -> "Fixes":
+        """Fixes up to this time."""
+        n = int(np.searchsorted(self.stamps_ns, last_ns, side="right"))
+        stated = None if self.covariances is None else self.covariances[:n]
+        return Fixes(self.stamps_ns[:n], self.positions[:n], stated)
+
+
+def fixes_of(table: CsvTable | None, driven: tuple[int, int] | None) -> tuple[Fixes, list[str]]:
+    """Absolute positions within the time of the odometry, and notes; raises DatasetError."""
+    if table is None or driven is None:
+        return Fixes(), []
+    rows = Rows(table, "fix")
+    _check_clock(rows, driven)
+    rows.drop(rows.stamps_ns < driven[0], EARLY)
+    rows.drop(rows.stamps_ns > driven[1], LATE)
+    stated = None
+    if any(rows.table.has(column) for column in POINT_COVARIANCE):
+        stated = rows.table.numbers(*POINT_COVARIANCE)
+        bad = ~((stated[:, 0] > 0.0) & (stated[:, 0] * stated[:, 2] > stated[:, 1] ** 2))
+        if bad.any():
+            raise rows.table.error(int(np.argmax(bad)), "c_xx", NOT_A_COVARIANCE)
+    return Fixes(rows.stamps_ns, rows.table.numbers(*POINTS), stated), rows.notes
 
 
 def truth_of(

@@ -19,6 +19,7 @@ _CHANNEL_OF_KIND = {
     s.ODOMETRY: ch.ODOMETRY,
     s.OBSERVATIONS: ch.OBSERVATIONS,
     s.SIGHTINGS: ch.SIGHTINGS,
+    s.FIXES: ch.FIXES,
 }
 
 
@@ -71,6 +72,10 @@ class Source:
             return _observations(stream.observations(index), name)
         if kind == s.SIGHTINGS:
             return _sightings(stream.sightings(index), name)
+        if kind == s.FIXES:
+            position, covariance = stream.fix(index)
+            stated = b"" if covariance is None else from_floats(covariance)
+            return m.Fix(**name, position=from_floats(position), covariance=stated)
         return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:

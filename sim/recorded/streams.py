@@ -111,6 +111,8 @@ def _stream(
     odometry = [each for each in measurements if isinstance(each, m.AnyOdometry)]
     seen = [each for each in measurements if isinstance(each, m.AnyScan | m.Detections)]
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]
+    fixes = [each for each in measurements if isinstance(each, m.Fix)]
+    stated = [floats(each.covariance, "covariance") for each in fixes]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = intervals_of(robot, odometry, clock_offset_s)
     mixed = (forms_of(odometry), forms_of(seen))
@@ -125,6 +127,9 @@ def _stream(
         landmark_detections=landmarks_of(seen, labels),
         teammate_detections=_detections(sighted, [_indices(each, robots) for each in sighted]),
         teammates=robots,
+        fixes_ns=np.array([each.stamp_ns for each in fixes], np.int64),
+        fixes=np.array([floats(each.position, "position") for each in fixes]).reshape(-1, 2),
+        fix_covariances=np.array(stated) if fixes and all(map(len, stated)) else None,
         truth_ns=np.concatenate(times) if times else None,
         truth=np.concatenate(poses) if poses else None,
         notes=tuple(

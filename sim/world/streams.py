@@ -16,11 +16,12 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt8, UInt32
 START = 0
 OBSERVATIONS = 1
 SIGHTINGS = 2
-ODOMETRY = 3
+FIXES = 3
+ODOMETRY = 4
 NO_LABEL = 2**32 - 1
 """Identity of clutter, or of an unknown landmark."""
 
-KIND_NAMES = ("start pose", "observations", "sightings", "odometry")
+KIND_NAMES = ("start pose", "observations", "sightings", "fixes", "odometry")
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ class RobotStream:
     start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
     (x, y, θ) in the team's frame at truth_ns. notes: repairs and missing data. clock_offset_ns:
     stamps are team time; published odometry stamps read this much less. positions: by another
-    sensor, such as GPS, at positions_ns in its own frame.
+    sensor, such as GPS, at positions_ns in its own frame, for scoring. fixes: measured positions
+    [m] in the survey's frame at fixes_ns; fix_covariances: (xx, xy, yy), None: not stated.
 
     Raises ValueError for a measurement before the initial pose, or non-contiguous odometry.
     """
@@ -189,6 +191,9 @@ class RobotStream:
     clock_offset_ns: int = 0
     positions_ns: Int64[np.ndarray, " G"] | None = None
     positions: Float[np.ndarray, "G 2"] | None = None
+    fixes_ns: Int64[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    fixes: Float[np.ndarray, "F 2"] = field(default_factory=lambda: np.zeros((0, 2)))
+    fix_covariances: Float[np.ndarray, "F 3"] | None = None
     kinds: UInt8[np.ndarray, " N"] = field(init=False)
     stamps_ns: Int64[np.ndarray, " N"] = field(init=False)
     rows: Int64[np.ndarray, " N"] = field(init=False)
@@ -199,10 +204,11 @@ class RobotStream:
             np.array([self.start_ns]),
             self.landmark_detections.stamps_ns,
             self.teammate_detections.stamps_ns,
+            self.fixes_ns,
             intervals.end_ns,
         )
         stamps = np.concatenate(parts)
-        kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in parts])
+        kinds = np.repeat(np.arange(5, dtype=np.uint8), [len(part) for part in parts])
         rows = np.concatenate([np.arange(len(part), dtype=np.int64) for part in parts])
         if stamps.min() < self.start_ns:
             raise ValueError(
@@ -280,6 +286,11 @@ class RobotStream:
         names = tuple(self.teammates[i] for i in seen.ids[at])
         stamp_ns = int(self.stamps_ns[counter])
         return SightingMeasurement(stamp_ns, names, seen.ranges[at], seen.bearings[at])
+
+    def fix(self, counter: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "3"] | None]:
+        """Position of this counter, and its covariance if stated."""
+        row = self._row(counter, FIXES)
+        return self.fixes[row], None if self.fix_covariances is None else self.fix_covariances[row]
 
     def _row(self, counter: int, kind: int) -> int:
         found = int(self.kinds[counter])

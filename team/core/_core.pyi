@@ -300,9 +300,10 @@ class SubmapFactor:
 
 LARGEST_RATIO: float
 
-def linearise_sighting(observer: NDArray[numpy.float64], teammate: NDArray[numpy.float64], measurement: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+def linearise_sighting(observer: NDArray[numpy.float64], teammate: NDArray[numpy.float64], measurement: NDArray[numpy.float64], point: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
-    Compute the residual of an inter-robot measurement (range, bearing), and its Jacobian over both poses.
+    Compute the residual of an inter-robot measurement (range, bearing) of a teammate's point, and its Jacobian
+    over both poses.
     """
 
 class Quadratic:
@@ -336,7 +337,7 @@ class SubmapGraph:
     Raises ValueError where a factor does not fit its nodes.
     """
 
-    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[int, NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
+    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[int, NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
 
     @property
     def pattern(self) -> Pattern:

@@ -276,6 +276,16 @@ class Driver:
         seen = measured.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
 
+    def fix(
+        self, t: float | Decimal, x: float, y: float, covariance: ArrayLike | None = None
+    ) -> None:
+        """Add an absolute position of the antenna at t: (x, y) [m] in the frame of the survey.
+
+        covariance: 2 × 2 [m²]; None: `gnss.sigma_m` of the robot's configuration.
+        """
+        stamp_ns = measured.stamp_of(t, "fix")
+        self._see(j.SIGHTINGS, measured.fix(self.robot, stamp_ns, (x, y), covariance))
+
     # State.
 
     @property

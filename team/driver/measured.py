@@ -170,6 +170,31 @@ def sightings(
     )
 
 
+def fix(
+    robot: str, stamp_ns: int, position: tuple[float, float], covariance: ArrayLike | None
+) -> m.Fix:
+    """Build an absolute position [m], with its covariance (2 × 2) if stated."""
+    what = f"fix at {1e-9 * stamp_ns:.3f} s"
+    stated = b""
+    if covariance is not None:
+        P = np.asarray(covariance, dtype=np.float64)
+        if P.shape != (2, 2):
+            raise MeasurementError(f"{what}: its covariance is not 2 × 2")
+        definite(P[np.newaxis], what)
+        stated = from_floats([P[0, 0], P[0, 1], P[1, 1]])
+    return sound(
+        m.Fix(
+            stamp_ns=stamp_ns,
+            robot=robot,
+            incarnation=0,
+            number=0,
+            position=from_floats([_number(x, f"a position of {what}") for x in position]),
+            covariance=stated,
+        ),
+        what,
+    )
+
+
 def square(covariance: ArrayLike | None, what: str) -> bytes:
     """Encode a 3 × 3 covariance; None: empty."""
     if covariance is None:

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import MAP, SURVEY, Bias
+from teamslam.team.config import GNSS, MAP, SURVEY, Bias
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.shapes import Bool, Float, UInt32
@@ -41,9 +41,13 @@ SURVEYED: Stream = (SURVEY, 0)
 """The stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
 
 
+STATION: Stream = (GNSS, 0)
+"""The stream whose exactly known start measures the robots' fixes; it has no landmarks."""
+
+
 def is_survey(stream: Stream) -> bool:
-    """Whether a stream has the surveyed landmarks."""
-    return stream == SURVEYED
+    """Whether a stream has the surveyed landmarks, or is the station of the fixes."""
+    return stream in (SURVEYED, STATION)
 
 
 PART = 1 << 64
@@ -71,6 +75,8 @@ def first_of(stream: Stream) -> int:
 
 def named(stream: Stream) -> str:
     """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
+    if stream == STATION:
+        return "the fixes"
     if is_survey(stream):
         return "the surveyed landmarks"
     if is_map(stream):

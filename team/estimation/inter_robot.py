@@ -1,19 +1,22 @@
 """A teammate seen from a pose node: a range-bearing factor between two pose nodes of two robots.
 
+A fix of a robot's position (GNSS) is one, too: the station S, a pose that is known exactly and far
+away, measures the antenna, a point of the robot at its pose node.
+
 The observed point is carried to the observer's pose node by the observer's odometry T ∘ Exp(xi), xi
 ~ N(0, C): p' = T Exp(xi) p to an earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance
 grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import Sensor
+from teamslam.team.config import GNSS, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.gaussian import information
@@ -21,6 +24,9 @@ from teamslam.team.estimation.models import NEAREST_M, Increment, noise
 from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
 from teamslam.team.shapes import Float
 
+STATION_POSE = np.array([0.0, -1e5, 0.0])
+"""Pose of the station in the frame of the survey: so far away that (range, bearing) is linear."""
+BASE = np.zeros(2)
 SightingKey: TypeAlias = tuple[int, str, int, str]
 """(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""
 
@@ -31,7 +37,8 @@ class InterRobotFactor:
     incarnation).
 
     measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
-    covariance: of the measurement, [m², m·rad, rad²].
+    covariance: of the measurement, [m², m·rad, rad²]. A fix has the teammate GNSS and is measured
+    from the station; point: the antenna in the frame of the robot's pose node [m].
     """
 
     robot: str
@@ -41,10 +48,16 @@ class InterRobotFactor:
     teammate: str
     measurement: Float[np.ndarray, "2"]
     covariance: Float[np.ndarray, "2 2"]
+    point: Float[np.ndarray, "2"] = field(default_factory=lambda: BASE)
+
+    @property
+    def is_fix(self) -> bool:
+        """Whether the station measures the robot."""
+        return self.teammate == GNSS
 
     @property
     def stream(self) -> Stream:
-        """(robot, incarnation) of the observer."""
+        """(robot, incarnation) of the observer, or of the robot that a fix places."""
         return (self.robot, self.incarnation)
 
     @property
@@ -57,6 +70,17 @@ class InterRobotFactor:
         """The inverse covariance. Raises NotACovarianceError that names the measurement."""
         what = f"a sighting of {self.teammate} by {named(self.stream)}"
         return information(self.covariance, what)
+
+
+def from_station(
+    position: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """Convert a position [m] in the survey's frame to the station's (range, bearing), J C Jᵀ."""
+    x, y = position - STATION_POSE[:2]
+    distance = core.hypot(x, y)
+    J = np.array([[x, y], [-y / distance, x / distance]]) / distance
+    spread = dense.product(dense.product(J, covariance), J.T)
+    return np.array([distance, core.atan2(y, x)]), 0.5 * (spread + spread.T)
 
 
 class CarriedPoint(NamedTuple):

@@ -59,6 +59,8 @@ def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
     """Give the reason why an inter-robot measurement is refused, if any."""
+    if sighting.is_fix:
+        return _far(sighting.measurement[:1], bounds.coordinate_m, "of the station")
     why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 

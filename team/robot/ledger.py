@@ -47,7 +47,7 @@ class Ledger:
         disposition = used or self.used
         if rejected is not None:
             disposition = rejected.disposition
-        elif type(measurement) is m.Sightings:
+        elif isinstance(measurement, m.Sightings | m.Fix):
             self._sighted.add(number)
             disposition = IN_SIGHTING
         elif not isinstance(measurement, NO_SCAN):

@@ -214,6 +214,9 @@ class Mapper:
                 return self._observe_landmarks(measurement, is_near)
             case m.Sightings():
                 return self._observe_teammates(measurement, is_near)
+            case m.Fix():
+                rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
+                return rejected or self.fix(measurement)
             case _:
                 return None
 
@@ -362,6 +365,11 @@ class Mapper:
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
         """Take inter-robot measurements; returns the reason if they are rejected."""
         return self._slam.sight(measurement.stamp_ns, measurement.number, looks)
+
+    def fix(self, measurement: m.Fix) -> Rejection | None:
+        """Take a fix of the antenna's position; returns the reason if it is rejected."""
+        position = translate.fix_of(measurement, self.config)
+        return self._slam.fix(measurement.stamp_ns, measurement.number, position)
 
     @property
     def associates(self) -> bool:

@@ -61,6 +61,7 @@ class MessageWriter:
             each.teammate,
             each.measurement,
             each.covariance,
+            each.point,
         )
         return translate.sighting_message(sighting, self.config, each.measurements)
 

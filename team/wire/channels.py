@@ -113,7 +113,9 @@ OBSERVATIONS = Channel(name="observations", template="source/{robot}/observation
                        meaning="landmarks: range and bearing or points, with or without identities")  # fmt: skip
 SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream", recorded=True,
                     recomputable=False, meaning="range and bearing to teammates")  # fmt: skip
-SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS)
+FIXES = Channel(name="fixes", template="source/{robot}/fixes", message=m.Fix, rate="0-10 Hz", delivery="stream", recorded=True,
+                recomputable=False, meaning="absolute positions, as by GNSS")  # fmt: skip
+SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS, FIXES)
 HEAD = Channel(name="head", template="source/{robot}/head", message=m.StreamHead, rate="1 Hz", delivery="latest", recorded=True, recomputable=False,
                meaning="a driver's count of measurements, and the state of its stream")  # fmt: skip
 

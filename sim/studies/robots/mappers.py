@@ -186,6 +186,10 @@ class StreamMapper(ExchangingMapper):
         """Reject inter-robot measurements."""
         return Rejection.NO_TEAMMATES
 
+    def fix(self, measurement: m.Fix) -> Rejection | None:
+        """Reject absolute positions."""
+        return Rejection.NO_TEAMMATES
+
     @property
     def associates(self) -> bool:
         """Whether the estimator accepts detections without identities."""

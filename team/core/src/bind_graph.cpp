@@ -16,7 +16,7 @@ using IndexArray = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb
 using Marks = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Changed = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using SubmapFactor = std::tuple<std::shared_ptr<Submap>, IndexArray>;
-using Sighting = std::tuple<std::int64_t, std::int64_t, Numbers, Table>;
+using Sighting = std::tuple<std::int64_t, std::int64_t, Numbers, Table, Numbers>;
 using Prior = std::tuple<std::int64_t, Numbers, Table, bool>;
 
 template <class T>
@@ -72,10 +72,10 @@ graph::Indices members_of(const Submap& submap, const Numbers& state, const Inde
 }
 
 graph::Sighting made_sighting(const Sighting& from) {
-  const auto& [observer, teammate, measurement, information] = from;
-  check(measurement.size() == 2 && information.shape(0) == 2 && information.shape(1) == 2,
-        "an inter-robot measurement is a range and a bearing");
-  graph::Sighting made{observer, teammate, {measurement(0), measurement(1)}, {}};
+  const auto& [observer, teammate, measurement, information, point] = from;
+  check(measurement.size() == 2 && information.shape(0) == 2 && information.shape(1) == 2 && point.size() == 2,
+        "an inter-robot measurement is a range and a bearing of a point");
+  graph::Sighting made{observer, teammate, {measurement(0), measurement(1)}, {}, {point(0), point(1)}};
   for (std::size_t i = 0; i < 4; i++) made.information[i / 2][i % 2] = information(i / 2, i % 2);
   return made;
 }
@@ -164,15 +164,16 @@ void bind_graph(nb::module_& m) {
   m.attr("LARGEST_RATIO") = graph::LARGEST_RATIO;
 
   m.def("linearise_sighting",
-        [](const Triple& observer, const Triple& teammate, const Numbers& measurement) {
-          check(measurement.size() == 2, "an inter-robot measurement is a range and a bearing");
-          const graph::Sighting sighting{0, 0, {measurement(0), measurement(1)}, {}};
+        [](const Triple& observer, const Triple& teammate, const Numbers& measurement, const Numbers& point) {
+          check(measurement.size() == 2 && point.size() == 2, "an inter-robot measurement is a range and a bearing of a point");
+          const graph::Sighting sighting{0, 0, {measurement(0), measurement(1)}, {}, {point(0), point(1)}};
           const auto at = sighting.linear(observer.data(), teammate.data());
           return std::tuple(made_numbers({at.residual, at.residual + 2}),
                             made<double, nb::ndim<2>>({at.jacobian[0], at.jacobian[0] + 12}, {2, 6}));
         },
-        "observer"_a, "teammate"_a, "measurement"_a,
-        "Compute the residual of an inter-robot measurement (range, bearing), and its Jacobian over both poses.");
+        "observer"_a, "teammate"_a, "measurement"_a, "point"_a,
+        "Compute the residual of an inter-robot measurement (range, bearing) of a teammate's point, and its Jacobian\n"
+        "over both poses.");
 
   nb::class_<Quadratic>(m, "Quadratic",
                         "Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,\n"

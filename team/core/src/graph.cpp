@@ -37,7 +37,9 @@ std::vector<std::size_t> starts_of_landmarks(const std::vector<Joined>& submaps)
 
 Sighting::Linear Sighting::linear(const double* a, const double* b) const {
   Linear at{};
-  const double x = b[0] - a[0], y = b[1] - a[1];
+  const auto [s, c] = elementary::sin_cos(b[2]);
+  const double lx = c * point[0] - s * point[1], ly = s * point[0] + c * point[1];
+  const double x = b[0] + lx - a[0], y = b[1] + ly - a[1];
   const double distance = pack::max(pack::sqrt(x * x + y * y), models::NEAREST_M);
   at.residual[0] = measurement[0] - distance;
   at.residual[1] = se2::wrapped(measurement[1] - (elementary::atan2(y, x) - a[2]));
@@ -49,6 +51,7 @@ Sighting::Linear Sighting::linear(const double* a, const double* b) const {
   at.jacobian[1][2] = 1.0;
   for (auto& row : at.jacobian)
     for (std::size_t j = 0; j < 2; j++) row[3 + j] = -row[j];
+  for (auto& row : at.jacobian) row[5] = row[4] * lx - row[3] * ly;
   return at;
 }
 

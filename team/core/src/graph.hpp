@@ -18,12 +18,12 @@ struct Joined {
   std::vector<Index> nodes, at = {};
 };
 
-// A range [m] and a bearing [rad] that an observer at pose a measures to a teammate at pose b. With
-// v = p_b − p_a and ρ = ‖v‖
+// A range [m] and a bearing [rad] that an observer at pose a measures to the point l of a teammate at pose
+// b. With v = p_b + R(θ_b) l − p_a and ρ = ‖v‖
 //
 //     r = z − (ρ, wrap(atan2(v_y, v_x) − θ_a)) ~ N(0, R),
 //
-// ∂r/∂p_b = −[v/ρ; (−v_y, v_x)/ρ²], ∂r/∂p_a = −∂r/∂p_b, ∂r/∂θ_a = (0, 1); θ_b does not matter.
+// ∂r/∂p_b = −[v/ρ; (−v_y, v_x)/ρ²], ∂r/∂p_a = −∂r/∂p_b, ∂r/∂θ_a = (0, 1), ∂r/∂θ_b = ∂r/∂p_b R′(θ_b) l.
 struct Sighting {
   struct Linear {
     double residual[2];
@@ -32,6 +32,7 @@ struct Sighting {
 
   Index observer, teammate;  // nodes
   double measurement[2], information[2][2];
+  double point[2] = {};  // l
 
   Linear linear(const double* observer_pose, const double* teammate_pose) const;
   // rᵀR⁻¹r.

@@ -22,6 +22,7 @@ from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
@@ -47,7 +48,7 @@ class HybridSlam:
         front = config.front_end
         with_nodes = front.node_s > 0.0 and config.fusion == "join"
         self._config, self._incarnation = config, incarnation
-        self._grid = PoseGrid(config.sensor, front) if with_nodes else None
+        self._grid = PoseGrid(config.sensor, front, config.gnss.antenna) if with_nodes else None
         self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
         self._window_ns = _nanoseconds(front.window_s)
         self._standing_ns = _nanoseconds(front.standing_s)
@@ -79,6 +80,14 @@ class HybridSlam:
         if self._start_ns is None:
             return Rejection.OLDER
         return self._grid.observe(stamp_ns, measurement, looks)
+
+    def fix(self, stamp_ns: int, measurement: int, position: CarriedPoint) -> Rejection | None:
+        """Take a fix of the antenna's position; returns the reason if it is rejected."""
+        if self._grid is None:
+            return Rejection.NO_NODES
+        if self._start_ns is None:
+            return Rejection.OLDER
+        return self._grid.fix(stamp_ns, measurement, position)
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> ClosedWindow | None:
         """Take one odometry interval; returns the window that it closes, if any."""

@@ -4,19 +4,22 @@ them.
 A robot does not know when it is observed, so all robots place nodes at the same times, the
 multiples of node_s. An inter-robot measurement belongs to the nearest grid time, if that lies in
 the open window and within sighting_s. The observer's odometry carries it to that node; several
-measurements of one teammate at one node are reduced to one.
+measurements of one teammate at one node are reduced to one. Of fixes the one nearest to a node in
+time is used; the odometry carries the antenna to it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import FrontEnd, Sensor
+from teamslam.team.config import GNSS, FrontEnd, Sensor
 from teamslam.team.estimation.inter_robot import (
+    BASE,
     CarriedPoint,
     carried_back,
     carried_on,
+    from_station,
     of_base,
     point_seen,
     reduced,
@@ -43,17 +46,19 @@ class NodeSighting:
     measurement: Float[np.ndarray, "2"]
     covariance: Float[np.ndarray, "2 2"]
     measurements: tuple[int, ...]
+    point: Float[np.ndarray, "2"] = field(default_factory=lambda: BASE)
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """A teammate observed in message `counter`."""
+    """A teammate observed in message `counter`, or the antenna with its fix."""
 
     stamp_ns: int
     counter: int
     teammate: str
     seen: CarriedPoint
     node_ns: int
+    fix: CarriedPoint | None = None
 
 
 class PoseGrid:
@@ -62,8 +67,12 @@ class PoseGrid:
     next_ns: team time of the next node or inter-robot measurement; NEVER_NS where there is none.
     """
 
-    def __init__(self, sensor: Sensor, front_end: FrontEnd) -> None:
+    def __init__(
+        self, sensor: Sensor, front_end: FrontEnd, antenna: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         self._sensor = sensor
+        self._antenna = CarriedPoint(np.array(antenna), np.zeros((2, 2)))
+        self._fixes: dict[int, tuple[_Look, CarriedPoint]] = {}
         self._grid_ns = round(front_end.node_s * 1e9)
         self._near_ns = round(front_end.sighting_s * 1e9)
         self._window_ns = round(front_end.window_s * 1e9)
@@ -79,7 +88,7 @@ class PoseGrid:
         self._begin_ns = stamp_ns
         self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
         self._last_ns = stamp_ns + self._window_ns
-        self._uncovered, self._ahead, self._at_node = [], [], {}
+        self._uncovered, self._ahead, self._at_node, self._fixes = [], [], {}, {}
         self._find_next()
 
     def go_on(self, stamp_ns: int) -> None:
@@ -93,10 +102,10 @@ class PoseGrid:
         all are rejected.
         """
         teammates, ranges, bearings = looks
-        node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
-        away_ns = abs(stamp_ns - node_ns)
-        if away_ns > self._near_ns or not self._begin_ns < node_ns <= self._last_ns:
+        node_ns = self._node_near(stamp_ns)
+        if node_ns is None:
             return Rejection.NO_NODE
+        away_ns = abs(stamp_ns - node_ns)
         mask, distances, directions = scanned(self._sensor, ranges, bearings)
         distances = distances - self._sensor.marker_range_offset
         mask &= distances > 0.0
@@ -109,6 +118,22 @@ class PoseGrid:
             self._uncovered.append(look)
         self._find_next()
         return None if mask.any() else Rejection.SENSOR_LIMITS
+
+    def fix(self, stamp_ns: int, counter: int, position: CarriedPoint) -> Rejection | None:
+        """Keep a fix until odometry covers its time; returns the reason if it is rejected."""
+        node_ns = self._node_near(stamp_ns)
+        if node_ns is None:
+            return Rejection.NO_NODE
+        look = _Look(stamp_ns, counter, GNSS, self._antenna, node_ns, position)
+        self._uncovered.append(look)
+        self._find_next()
+        return None
+
+    def _node_near(self, stamp_ns: int) -> int | None:
+        """Return the window's grid time within sighting_s, if there is one."""
+        node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
+        is_near = abs(stamp_ns - node_ns) <= self._near_ns
+        return node_ns if is_near and self._begin_ns < node_ns <= self._last_ns else None
 
     def _find_next(self) -> None:
         look_ns = self._uncovered[0].stamp_ns if self._uncovered else NEVER_NS
@@ -137,10 +162,11 @@ class PoseGrid:
         return True
 
     def sightings(self) -> tuple[NodeSighting, ...]:
-        """The window's inter-robot measurements, by node and teammate, without those that
-        reached no node.
+        """The window's inter-robot measurements and fixes, by node and teammate, without those
+        that reached no node.
         """
-        return tuple(
+        fixes = tuple(_fix_at(*self._fixes[node_ns]) for node_ns in sorted(self._fixes))
+        return fixes + tuple(
             NodeSighting(
                 node_ns,
                 teammate,
@@ -151,5 +177,21 @@ class PoseGrid:
         )
 
     def _keep(self, look: _Look, at_node: CarriedPoint) -> None:
+        if look.fix is not None:
+            kept = self._fixes.get(look.node_ns)
+            away_ns = abs(look.stamp_ns - look.node_ns)
+            if kept is None or away_ns < abs(kept[0].stamp_ns - look.node_ns):
+                self._fixes[look.node_ns] = look, at_node
+            return
         key = (look.node_ns, look.teammate)
         self._at_node.setdefault(key, []).append((look.counter, at_node))
+
+
+def _fix_at(look: _Look, antenna: CarriedPoint) -> NodeSighting:
+    """Make the fix of a pose node; the antenna's uncertainty counts in every direction, since the
+    heading is not known.
+    """
+    assert look.fix is not None
+    spread = look.fix.covariance + np.trace(antenna.covariance) * np.eye(2)
+    measured = from_station(look.fix.point, spread)
+    return NodeSighting(look.node_ns, GNSS, *measured, (look.counter,), antenna.point)

@@ -16,8 +16,9 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining import alignment
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from teamslam.team.estimation.map_joining.submap_graph import Graph, pose_node
+from teamslam.team.estimation.map_joining.submap_graph import Graph, observer_of, teammate_of
 from teamslam.team.estimation.models import located
+from teamslam.team.estimation.se2 import transformed
 from teamslam.team.shapes import Float
 
 JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
@@ -35,7 +36,8 @@ class SharedPoint(NamedTuple):
     """One point: its node in the main island and in the other, and the measurement that ties them.
 
     seen: the inter-robot measurement; None for a shared landmark. from_main: the observer is in the
-    main island, whose node is then the observer's.
+    main island, whose node is then the observer's. The measured point is at `seen.point` of the
+    teammate.
     """
 
     main: int
@@ -52,8 +54,7 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
     found = [SharedPoint(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
     for each in sightings:
         for observers, seen, from_main in ((main, other, True), (other, main, False)):
-            observer = observers.poses.get((each.stream, each.stamp_ns))
-            teammate = pose_node(seen, each.teammate, each.stamp_ns)
+            observer, teammate = observer_of(observers, each), teammate_of(seen, each)
             if observer is not None and teammate is not None:
                 nodes = (observer, teammate) if from_main else (teammate, observer)
                 found.append(SharedPoint(*nodes, each, from_main))
@@ -66,25 +67,31 @@ def aligned_by(
     """Align the other island with the main one; None where the points do not suffice."""
     if len(tied) < alignment.NEEDED:
         return None
-    in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
-    in_other = _points(other, [(t.other, None if t.from_main else t.seen) for t in tied])
+    in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
+    in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
     return alignment.aligned(*in_main, *in_other)
 
 
-def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None]]) -> JointPoints:
-    """Return the positions of nodes, or of the teammates measured from them, with joint
-    covariance.
+def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, bool]]) -> JointPoints:
+    """Return the positions of nodes, of the teammates measured from them, or of their own measured
+    points, with joint covariance.
+
+    at: node, measurement, and whether the node is the observer's.
     """
-    mean, covariance = joint_marginal(island, [node for node, _ in at])
+    mean, covariance = joint_marginal(island, [node for node, _, _ in at])
     points = np.empty((len(at), 2))
     J = np.zeros((2 * len(at), len(mean)))
     noise = np.zeros((2 * len(at), 2 * len(at)))
     begin = 0
-    for k, (node, seen) in enumerate(at):
+    for k, (node, seen, is_observer) in enumerate(at):
         rows, value = slice(2 * k, 2 * k + 2), mean[begin:]
         J[rows, begin : begin + 2] = np.eye(2)
         points[k] = value[:2]
-        if seen is not None:
+        if seen is not None and not is_observer and seen.is_fix:
+            points[k] = transformed(value[:3], seen.point)
+            x, y = points[k] - value[:2]
+            J[rows, begin + 2] = -y, x
+        elif seen is not None and is_observer:
             distance, bearing = float(seen.measurement[0]), float(seen.measurement[1])
             points[k] = located(value[:3], distance, bearing)
             x, y = points[k] - value[:2]
@@ -108,8 +115,8 @@ def headings_that_fit(
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []
-    in_main = _points(main, [(t.main, t.seen if t.from_main else None) for t in tied])
-    in_other = _points(other, [(t.other, None if t.from_main else t.seen) for t in tied])
+    in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
+    in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
     grid = [2.0 * math.pi * k / HEADINGS - math.pi for k in range(HEADINGS)]
     found = [alignment.at_heading(*in_main, *in_other, heading) for heading in grid]
     costs = [chi2 for _, chi2 in found]

@@ -60,8 +60,12 @@ class Displacement(NamedTuple):
 
 
 def maps_of(graph: Graph) -> list[Joined]:
-    """List the saved maps of an island, by name."""
-    found = (each for each in graph.submaps if is_map(each.contribution.stream))
+    """List the saved maps of an island, by name, without the station of fixes."""
+    found = (
+        each
+        for each in graph.submaps
+        if is_map(each.contribution.stream) and len(each.contribution.local.ids)
+    )
     return sorted(found, key=lambda each: each.contribution.stream)
 
 

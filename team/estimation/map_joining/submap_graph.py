@@ -18,6 +18,7 @@ from teamslam.team import core
 from teamslam.team.config import UNNAMED, Bias
 from teamslam.team.estimation.contribution import (
     RANGE_POWER,
+    STATION,
     Contribution,
     InitialPoseFactor,
     Key,
@@ -183,7 +184,7 @@ class Graph:
             self.offset,
             self.fixed,
             [(each.factor, each.nodes) for each in self.submaps],
-            [(a, b, each.measurement, each.information) for each, a, b in self.sightings],
+            [(a, b, x.measurement, x.information, x.point) for x, a, b in self.sightings],
             [(*each, own) for each, own in zip(self.priors, of_bias, strict=True)],
             None if self.condensed is None else self.condensed.quadratic,
         )
@@ -527,9 +528,22 @@ def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
 
 def encounter_of(graph: Graph, sighting: InterRobotFactor) -> Encounter | None:
     """Make the inter-robot measurement between its pose nodes; None while the graph lacks one."""
-    observer = graph.poses.get((sighting.stream, sighting.stamp_ns))
-    teammate = pose_node(graph, sighting.teammate, sighting.stamp_ns)
+    observer, teammate = observer_of(graph, sighting), teammate_of(graph, sighting)
     return None if observer is None or teammate is None else Encounter(sighting, observer, teammate)
+
+
+def observer_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
+    """Return the node of the pose that measures: of a fix the station's; None if not in here."""
+    if sighting.is_fix:
+        return graph.streams[STATION][0] if STATION in graph.streams else None
+    return graph.poses.get((sighting.stream, sighting.stamp_ns))
+
+
+def teammate_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
+    """Return the node of the pose that is measured, None if it is not in this graph."""
+    if sighting.is_fix:
+        return graph.poses.get((sighting.stream, sighting.stamp_ns))
+    return pose_node(graph, sighting.teammate, sighting.stamp_ns)
 
 
 def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:

@@ -46,6 +46,7 @@ from teamslam.team.wire.messages.measurements import AnyOdometry as AnyOdometry
 from teamslam.team.wire.messages.measurements import AnyScan as AnyScan
 from teamslam.team.wire.messages.measurements import Detections as Detections
 from teamslam.team.wire.messages.measurements import End as End
+from teamslam.team.wire.messages.measurements import Fix as Fix
 from teamslam.team.wire.messages.measurements import Increment as Increment
 from teamslam.team.wire.messages.measurements import InitialPose as InitialPose
 from teamslam.team.wire.messages.measurements import Measurement as Measurement

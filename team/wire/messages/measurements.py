@@ -180,6 +180,21 @@ class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
         check_angles(self.bearings, "bearings", len(self.teammates))
 
 
+class Fix(Measurement, frozen=True, kw_only=True, tag="fix/1"):
+    """Position of the robot's antenna at stamp_ns in the frame of the survey, as by GNSS.
+
+    position: 2 floats (x, y) [m]. covariance: 3 floats (xx, xy, yy); empty: `gnss.sigma_m`.
+    """
+
+    position: Floats
+    covariance: Floats = b""
+
+    def check(self) -> None:  # noqa: D102
+        check_finite(self.position, "position", 2)
+        if self.covariance:
+            check_blocks(self.covariance, 1, "covariance")
+
+
 class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """End of a robot's stream: its measurements are numbered 0 … measurements − 1."""
 

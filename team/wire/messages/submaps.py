@@ -3,10 +3,11 @@
 import math
 from itertools import pairwise
 
-from teamslam.team.config import UNNAMED
+from teamslam.team.config import GNSS, MAP, UNNAMED
 from teamslam.team.core import check_ascending, check_finite, check_packed_covariance
 from teamslam.team.wire.arrays import Floats, Ids, Stamps, derivatives, ids, stamps
 from teamslam.team.wire.messages.base import (
+    Author,
     Bias,
     Count,
     Digest,
@@ -126,20 +127,26 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
 
     range [m] and bearing [rad] of the teammate's pose node at the same stamp; covariance: packed 2
     × 2 (range, bearing). measurements: counters of the inter-robot measurements in it, ascending;
-    with the submap's odometry and configuration they are its inputs.
+    with the submap's odometry and configuration they are its inputs. A fix of the robot's position
+    has the teammate `map-gnss`; range and bearing are those of the antenna from the pose (0, −10⁵,
+    0) in the survey's frame, and point, 2 floats (none: the base), is the antenna in the node's.
     """
 
     robot: Name
     incarnation: Count
     sequence: Count
     config: Digest
-    teammate: Name
+    teammate: Author
     range: Real
     bearing: Real
     covariance: Floats
     measurements: tuple[Count, ...]
+    point: Floats = b""
 
     def check(self) -> None:  # noqa: D102
+        check_finite(self.point, "point", 2 if self.point else 0)
+        if self.teammate.startswith(MAP) and self.teammate != GNSS:
+            raise ValueError("out of bounds: the teammate is a saved map")
         check_packed_covariance(self.covariance, 2, "covariance")
         if self.range <= 0.0 or abs(self.bearing) > math.pi:
             raise ValueError("out of bounds: the range is not positive or the bearing not an angle")

@@ -30,23 +30,26 @@ EXACTLY = JoinSettings(step_tolerance=1e-11)
 poses = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
 
 
-def residual(observer, teammate, measurement):
-    to = seen_from(observer, teammate[0] + 1j * teammate[1])
+def residual(observer, teammate, measurement, point=0.0):
+    at = teammate[0] + 1j * teammate[1] + point * np.exp(1j * teammate[2])
+    to = seen_from(observer, at)
     return np.array([measurement[0] - abs(to), wrap(measurement[1] - np.angle(to))])
 
 
 @settings(deadline=None, max_examples=60)
-@given(poses, poses, st.floats(0.1, 30.0), st.floats(-3.1, 3.1))
-def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distance, bearing):
-    if np.hypot(*(b - a)[:2]) < 0.1:
+@given(poses, poses, st.floats(0.1, 30.0), st.floats(-3.1, 3.1), st.sampled_from([0.0, 1.5 - 0.4j]))
+def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distance, bearing, point):
+    if np.hypot(*(b - a)[:2]) < 0.1 + 2.0 * abs(point):
         return
     measurement = np.array([distance, bearing])
-    r, jacobian = linearise_sighting(a, b, measurement)
-    np.testing.assert_allclose(wrap(r - residual(a, b, measurement)), 0.0, atol=1e-9)
+    r, jacobian = linearise_sighting(a, b, measurement, np.array([point.real, point.imag]))
+    np.testing.assert_allclose(wrap(r - residual(a, b, measurement, point)), 0.0, atol=1e-9)
     h = 1e-6
     both = np.concatenate([a, b])
     for k, shift in enumerate(h * np.eye(6)):
-        up, down = (residual((both + s)[:3], (both + s)[3:], measurement) for s in (shift, -shift))
+        up, down = (
+            residual((both + s)[:3], (both + s)[3:], measurement, point) for s in (shift, -shift)
+        )
         difference = np.array([(up - down)[0], wrap((up - down)[1])]) / (2.0 * h)
         np.testing.assert_allclose(jacobian[:, k], difference, rtol=1e-4, atol=1e-4)
 
