@@ -13,9 +13,11 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining import alignment
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
 from teamslam.team.estimation.map_joining.submap_graph import Graph, observer_of, teammate_of
 from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import transformed
@@ -59,6 +61,25 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
                 nodes = (observer, teammate) if from_main else (teammate, observer)
                 found.append(SharedPoint(*nodes, each, from_main))
     return found
+
+
+def without_jumps(
+    main: Island, other: Island, tied: Sequence[SharedPoint]
+) -> tuple[list[SharedPoint], list[InterRobotFactor]]:
+    """Separate the fixes that no rigid motion places together with most of the others; the robust
+    loss discounts them once the islands are one.
+    """
+    fixes = [each for each in tied if each.seen is not None and each.seen.is_fix]
+    if len(fixes) <= LEAST_AGREEING:
+        return list(tied), []
+    in_main = _points(main, [(t.main, t.seen, t.from_main) for t in fixes])
+    in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in fixes])
+    limit = chi2_limit(2, 1.0 - main.settings.alignment_confidence)
+    agree = agreeing(*in_main, *in_other, limit).tolist()
+    jumps = [each for each, is_one in zip(fixes, agree, strict=True) if not is_one]
+    seen = [each.seen for each in jumps if each.seen is not None]
+    dropped = {id(each) for each in jumps}
+    return [each for each in tied if id(each) not in dropped], seen
 
 
 def aligned_by(

@@ -30,6 +30,7 @@ from teamslam.team.estimation.map_joining.island_ties import (
     aligned_by,
     headings_that_fit,
     ties,
+    without_jumps,
 )
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
 from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
@@ -89,7 +90,8 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     if isinstance(apart, Waits):
         return apart
     main, other = apart
-    tied = ties(main.graph, other.graph, waiting)
+    tied, jumps = without_jumps(main, other, ties(main.graph, other.graph, waiting))
+    waiting = [each for each in waiting if each not in jumps]
     seen = sum(tie.seen is not None for tie in tied)
     shared = SharedPoints(len(tied) - seen, seen)
     found = aligned_by(main, other, tied)
@@ -108,6 +110,7 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
         return Waits(why, after_search=True)
     if not is_solvable(search.best.island):
         return Waits(f"{shared}, with which the map has no solution", after_search=True)
+    left = tuple(sorted((*left, *jumps), key=lambda each: each.key))
     return Merge(search.best, left, _words(other, shared, search, rise))
 
 
