@@ -226,12 +226,6 @@ class Fixes:
     positions: Float[np.ndarray, "F 2"] = field(default_factory=lambda: np.zeros((0, 2)))
     covariances: Float[np.ndarray, "F 3"] | None = None
 
-    def until(self, last_ns: int) -> "Fixes":
-        """Fixes up to this time."""
-        n = int(np.searchsorted(self.stamps_ns, last_ns, side="right"))
-        stated = None if self.covariances is None else self.covariances[:n]
-        return Fixes(self.stamps_ns[:n], self.positions[:n], stated)
-
 
 def fixes_of(table: CsvTable | None, driven: tuple[int, int] | None) -> tuple[Fixes, list[str]]:
     """Absolute positions within the time of the odometry, and notes; raises DatasetError."""

@@ -238,11 +238,16 @@ class RobotStream:
         if truth_ns is not None and truth is not None:
             poses = int(np.searchsorted(truth_ns, end_ns)) + 1
             truth_ns, truth = truth_ns[:poses], truth[:poses]
+        fixes = int(np.searchsorted(self.fixes_ns, last_ns, side="right"))
+        stated = self.fix_covariances
         return replace(
             self,
             intervals=intervals,
             landmark_detections=self.landmark_detections.within(self.start_ns, last_ns),
             teammate_detections=self.teammate_detections.within(self.start_ns, last_ns),
+            fixes_ns=self.fixes_ns[:fixes],
+            fixes=self.fixes[:fixes],
+            fix_covariances=None if stated is None else stated[:fixes],
             truth_ns=truth_ns,
             truth=truth,
         )
