@@ -29,9 +29,9 @@ MAP = "map-"
 SURVEY = MAP + "survey"
 """The member of the set that has the surveyed landmarks."""
 SURVEY_FRAME = SURVEY + "/0"
-GNSS = MAP + "gnss"
-"""The member of the set from whose start fixes of robots' positions are measured."""
 """The frame that its start fixes."""
+GNSS = MAP + "gnss"
+"""The member of the set from whose start the fixes of robots' positions are measured."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
 """The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry

@@ -121,7 +121,7 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
         notes.append("no observations: only its odometry is given")
     teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
     notes += more
-    fixes, more = rows.fixes_of(fixed, driven)
+    fixes_ns, fixes, more = rows.fixes_of(fixed, driven)
     notes += more
     saw = len(seen.stamps_ns) or len(teammates.stamps_ns) or unnamed is not None
     if driven is None and not saw:
@@ -145,9 +145,8 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
         truth_ns=truth_ns if len(poses) else None,
         truth=poses if len(poses) else None,
         notes=tuple(notes),
-        fixes_ns=fixes.stamps_ns,
-        fixes=fixes.positions,
-        fix_covariances=fixes.covariances,
+        fixes_ns=fixes_ns,
+        fixes=fixes,
         clock_offset_ns=clocks[robot],
     )
 

@@ -4,7 +4,6 @@ Unused rows are counted in notes, with reason and first line.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -218,30 +217,38 @@ def _own(
     return claimed
 
 
-@dataclass(frozen=True)
-class Fixes:
-    """Absolute positions [m] by time; covariances: (xx, xy, yy), None: not stated."""
-
-    stamps_ns: Int64[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    positions: Float[np.ndarray, "F 2"] = field(default_factory=lambda: np.zeros((0, 2)))
-    covariances: Float[np.ndarray, "F 3"] | None = None
-
-
-def fixes_of(table: CsvTable | None, driven: tuple[int, int] | None) -> tuple[Fixes, list[str]]:
-    """Absolute positions within the time of the odometry, and notes; raises DatasetError."""
-    if table is None or driven is None:
-        return Fixes(), []
-    rows = Rows(table, "fix")
-    _check_clock(rows, driven)
-    rows.drop(rows.stamps_ns < driven[0], EARLY)
-    rows.drop(rows.stamps_ns > driven[1], LATE)
-    stated = None
+def fixes_of(
+    table: CsvTable | None, driven: tuple[int, int] | None
+) -> tuple[Int64[np.ndarray, " F"], Float[np.ndarray, "F 5"], list[str]]:
+    """Times, absolute positions with covariances (x, y, xx, xy, yy; NaN where not stated), and
+    notes; raises DatasetError.
+    """
+    if table is None:
+        return np.empty(0, np.int64), np.empty((0, 5)), []
+    rows = Rows(table, "position")
+    if driven is None:
+        rows.drop(np.ones(len(table), np.bool_), "there is no odometry")
+    else:
+        _check_clock(rows, driven)
+        rows.drop(rows.stamps_ns < driven[0], "before its first odometry")
+        rows.drop(rows.stamps_ns > driven[1], LATE)
+    stated = np.full((len(rows.table), 3), np.nan)
     if any(rows.table.has(column) for column in POINT_COVARIANCE):
-        stated = rows.table.numbers(*POINT_COVARIANCE)
-        bad = ~((stated[:, 0] > 0.0) & (stated[:, 0] * stated[:, 2] > stated[:, 1] ** 2))
-        if bad.any():
-            raise rows.table.error(int(np.argmax(bad)), "c_xx", NOT_A_COVARIANCE)
-    return Fixes(rows.stamps_ns, rows.table.numbers(*POINTS), stated), rows.notes
+        missing = ", ".join(column for column in POINT_COVARIANCE if not rows.table.has(column))
+        if missing:
+            raise table.fault(
+                f"a covariance has all of {','.join(POINT_COVARIANCE)}: {missing} missing"
+            )
+        stated = covariances_of(rows.table, POINT_COVARIANCE)
+        xx, xy, yy = stated.T
+        for row in np.flatnonzero(~np.isnan(xx) & ~((xx > 0.0) & (xx * yy > xy * xy)))[:1].tolist():
+            raise rows.table.error(
+                row,
+                "c_xx",
+                "its covariance is not positive definite; leave its cells empty where none is "
+                "known, and gnss.sigma_m holds",
+            )
+    return rows.stamps_ns, np.hstack((rows.table.numbers(*POINTS), stated)), rows.notes
 
 
 def truth_of(

@@ -51,6 +51,10 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
     if len(teammates.ids):
         names = [stream.teammates[i] for i in teammates.ids]
         write_table(place / "sightings.csv", *_measured(teammates, "teammate", names))
+    if len(stream.fixes):
+        at = zip(stream.fixes_ns.tolist(), cells_of(stream.fixes), strict=True)
+        columns = ("t_s", *POINTS, *POINT_COVARIANCE)
+        write_table(place / "fixes.csv", columns, ((seconds(t), *row) for t, row in at))
     if stream.start is not None:
         covariance = stream.start.covariance
         columns, row = [*POSES], stream.start.pose.tolist()

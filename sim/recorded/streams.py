@@ -17,6 +17,7 @@ from teamslam.sim.world.streams import (
 )
 from teamslam.team import translate
 from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
@@ -112,7 +113,6 @@ def _stream(
     seen = [each for each in measurements if isinstance(each, m.AnyScan | m.Detections)]
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]
     fixes = [each for each in measurements if isinstance(each, m.Fix)]
-    stated = [floats(each.covariance, "covariance") for each in fixes]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = intervals_of(robot, odometry, clock_offset_s)
     mixed = (forms_of(odometry), forms_of(seen))
@@ -128,8 +128,7 @@ def _stream(
         teammate_detections=_detections(sighted, [_indices(each, robots) for each in sighted]),
         teammates=robots,
         fixes_ns=np.array([each.stamp_ns for each in fixes], np.int64),
-        fixes=np.array([floats(each.position, "position") for each in fixes]).reshape(-1, 2),
-        fix_covariances=np.array(stated) if fixes and all(map(len, stated)) else None,
+        fixes=np.array([_fix(each) for each in fixes]).reshape(-1, 5),
         truth_ns=np.concatenate(times) if times else None,
         truth=np.concatenate(poses) if poses else None,
         notes=tuple(
@@ -140,6 +139,11 @@ def _stream(
 
 def _indices(sighting: m.Sightings, robots: tuple[str, ...]) -> np.ndarray:
     return np.array([robots.index(name) for name in sighting.teammates], dtype=np.uint32)
+
+
+def _fix(fix: m.Fix) -> Float[np.ndarray, "5"]:
+    covariance = floats(fix.covariance, "covariance") if fix.covariance else np.full(3, np.nan)
+    return np.concatenate([floats(fix.position, "position"), covariance])
 
 
 def _detections(messages: Sequence[m.Sightings], names: Sequence[np.ndarray]) -> Detections:

@@ -173,7 +173,8 @@ class RobotStream:
     (x, y, θ) in the team's frame at truth_ns. notes: repairs and missing data. clock_offset_ns:
     stamps are team time; published odometry stamps read this much less. positions: by another
     sensor, such as GPS, at positions_ns in its own frame, for scoring. fixes: measured positions
-    [m] in the survey's frame at fixes_ns; fix_covariances: (xx, xy, yy), None: not stated.
+    (x, y) [m] in the survey's frame at fixes_ns, with their covariances (xx, xy, yy) [m²], NaN
+    where not stated.
 
     Raises ValueError for a measurement before the initial pose, or non-contiguous odometry.
     """
@@ -192,8 +193,7 @@ class RobotStream:
     positions_ns: Int64[np.ndarray, " G"] | None = None
     positions: Float[np.ndarray, "G 2"] | None = None
     fixes_ns: Int64[np.ndarray, " F"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    fixes: Float[np.ndarray, "F 2"] = field(default_factory=lambda: np.zeros((0, 2)))
-    fix_covariances: Float[np.ndarray, "F 3"] | None = None
+    fixes: Float[np.ndarray, "F 5"] = field(default_factory=lambda: np.zeros((0, 5)))
     kinds: UInt8[np.ndarray, " N"] = field(init=False)
     stamps_ns: Int64[np.ndarray, " N"] = field(init=False)
     rows: Int64[np.ndarray, " N"] = field(init=False)
@@ -239,7 +239,6 @@ class RobotStream:
             poses = int(np.searchsorted(truth_ns, end_ns)) + 1
             truth_ns, truth = truth_ns[:poses], truth[:poses]
         fixes = int(np.searchsorted(self.fixes_ns, last_ns, side="right"))
-        stated = self.fix_covariances
         return replace(
             self,
             intervals=intervals,
@@ -247,7 +246,6 @@ class RobotStream:
             teammate_detections=self.teammate_detections.within(self.start_ns, last_ns),
             fixes_ns=self.fixes_ns[:fixes],
             fixes=self.fixes[:fixes],
-            fix_covariances=None if stated is None else stated[:fixes],
             truth_ns=truth_ns,
             truth=truth,
         )
@@ -295,7 +293,8 @@ class RobotStream:
     def fix(self, counter: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "3"] | None]:
         """Position of this counter, and its covariance if stated."""
         row = self._row(counter, FIXES)
-        return self.fixes[row], None if self.fix_covariances is None else self.fix_covariances[row]
+        covariance = self.fixes[row, 2:]
+        return self.fixes[row, :2], None if np.isnan(covariance).any() else covariance
 
     def _row(self, counter: int, kind: int) -> int:
         found = int(self.kinds[counter])

@@ -32,6 +32,7 @@ def with_fixes(stream, seed, origin, jumps):
     (ahead, left), noise = ANTENNA, np.random.default_rng(seed).normal(0, SIGMA_M, (len(at), 2))
     fixes = np.column_stack([x + c * ahead - s * left, y + s * ahead + c * left]) + noise + origin
     fixes[list(jumps)] += [15.0, 0.0]
+    fixes = np.hstack([fixes, np.full((len(at), 3), np.nan)])
     return dataclasses.replace(stream, fixes_ns=stream.truth_ns[at], fixes=fixes)
 
 

@@ -116,6 +116,9 @@ REFUSED = [
     (lambda r: r.observe_points(10.1, [1], [[1.0, 0.0]], [[[1.0, 0.0], [0.5, 1.0]]]), "symmetric"),
     (lambda r: r.sight(10.1, ["r1"], [1.0], [0.0]), "can not see itself"),
     (lambda r: r.sight(10.1, ["R 2"], [1.0], [0.0]), "is no robot's name"),
+    (lambda r: r.fix(10.1, 1.0, float("nan")), "fix at 10.100 s"),
+    (lambda r: r.fix(10.1, 1.0, 2.0, [1.0, 1.0]), "fix at 10.100 s: its covariance is not 2 × 2"),
+    (lambda r: r.fix(10.1, 1.0, 2.0, [[1.0, 2.0], [2.0, 1.0]]), "symmetric and positive definite"),
     (lambda r: r.odometry_pose(9.5, 0.0, 0.0, 0.0), "time goes back"),
 ]
 

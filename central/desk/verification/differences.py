@@ -38,6 +38,7 @@ _FLOATS = (
     "start",
     "start_covariance",
     "crosses",
+    "point",
 )
 ARRAYS = frozenset({*_IDS, *_FLOATS})
 """Fields compared number by number."""

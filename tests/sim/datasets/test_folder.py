@@ -17,6 +17,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.config import FolderWorld
+from teamslam.sim.world.streams import FIXES as FIXES_KIND
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
 from teamslam.team.config import RobotConfig
 from tests import teams
@@ -55,6 +56,7 @@ def same(a: object, b: object) -> bool:
 
 
 SPEEDS = "t_s,forward_m_s,yaw_rate_rad_s\n0,1,0.1\n1,2,0.2\n3,0,0\n"
+FIXES = "t_s,x_m,y_m,c_xx,c_xy,c_yy\n1,1.5,-2,4,0.5,3\n2,0.1,7,,,\n"
 SEEN = "t_s,landmark,range_m,bearing_rad\n1,7,2.5,0.5\n1,3,1.5,-0.5\n2,7,2.4,0.4\n"
 
 
@@ -317,6 +319,12 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path):
         ("observations", SEEN + "3,door,1,0\n", "give each landmark a number"),
         ("observations", SEEN + "2024-05-01T12:00:00Z,7,1,0\n", "times are in seconds, since 1970"),
         ("landmarks", "landmark,x_m,y_m\n4,0,0\n4,1,1\n", "landmarks.csv, line 3, column landmark"),
+        ("fixes", "t_s,x_m\n1,1\n", "r1/fixes.csv, line 1: no column y_m"),
+        ("fixes", "t_s,x_m,y_m\n1,1,x\n", "line 2, column y_m: 'x' is not a number"),
+        ("fixes", "t_s,x_m,y_m\n99,1,1\n", "line 2, column t_s: its times, 99.000 to 99.000 s"),
+        ("fixes", "t_s,x_m,y_m,c_xx\n1,1,1,1\n", "line 1: a covariance has all of c_xx,c_xy,c_yy:"),
+        ("fixes", FIXES + "2,1,1,1,,\n", "line 4, column c_xy: no number here"),
+        ("fixes", FIXES + "2,1,1,1,2,1\n", "line 4, column c_xx: its covariance is not positive"),
     ],
 )
 def test_damage_names_file_line_column_and_remedy(tmp_path, table, text, words):
@@ -325,6 +333,25 @@ def test_damage_names_file_line_column_and_remedy(tmp_path, table, text, words):
              if table not in ("odometry", "observations")
              else data_set(data_set(tmp_path, odometry=SPEEDS), **{table: text}))  # fmt: skip
     assert words in str(error.value)
+
+
+def test_fixes_are_read_within_the_odometry_and_keep_their_bits(tmp_path):
+    text = FIXES + "-1,9,9,,,\n3,5,6,,,\n7,9,9,,,\n"
+    stream = only(data_set(tmp_path / "a", odometry=SPEEDS, fixes=text))
+    assert stream.fixes_ns.tolist() == [1 * 10**9, 2 * 10**9, 3 * 10**9]
+    assert stream.fixes[:, :2].tolist() == [[1.5, -2.0], [0.1, 7.0], [5.0, 6.0]]
+    numbers = np.flatnonzero(stream.kinds == FIXES_KIND).tolist()
+    stated = [stream.fix(number)[1] for number in numbers]
+    assert stated[0].tolist() == [4.0, 0.5, 3.0]
+    assert stated[1:] == [None, None]
+    assert [note for note in stream.notes if "fixes.csv" in note and "position" in note] == [
+        "1 position earlier than the row before: sorted by time (r1/fixes.csv, at line 4)",
+        "1 position dropped: before its first odometry (r1/fixes.csv, at line 4)",
+        "1 position dropped: after its last odometry, where its motion is not known "
+        "(r1/fixes.csv, at line 6)",
+    ]
+    write_folder(WorldStreams((stream,), np.empty(0, np.uint32), None, "test"), tmp_path / "b")
+    assert same(only(tmp_path / "b"), stream)
 
 
 def test_only_a_part_is_read_when_asked(tmp_path):
