@@ -1,5 +1,6 @@
 """Import CSV files with foreign column names, and trajectories."""
 
+import re
 from collections.abc import Collection, Sequence
 from math import atan2
 from pathlib import Path
@@ -58,8 +59,26 @@ def import_files(
             notes.append(f"no {', '.join(lacking)}: no {kind}")
             continue
         notes += _take(kind, table, files, tables, used)
-    notes += [f"{name}: not used: the map does not name it" for name in files if name not in used]
+    unused = [name for name in files if name not in used]
+    if "odometry" in chosen:
+        _refuse_second_robot(chosen["odometry"].files, used, unused)
+    notes += [f"{name}: not used: the map does not name it" for name in unused]
     return tables, notes
+
+
+def _refuse_second_robot(endings: Sequence[str], used: set[str], unused: Sequence[str]) -> None:
+    """Raise DatasetError for an unused file that is called as the odometry, after another prefix:
+    `jackal_odometry.csv` beside `husky_odometry.csv`.
+    """
+    rest = {re.split("[_-]", n, maxsplit=1)[-1] for n in used if n.endswith(tuple(endings))}
+    for name in unused:
+        prefix, *behind = re.split("[_-]", name, maxsplit=1)
+        if behind and behind[0] in rest:
+            raise DatasetError(
+                f"{name}: odometry of a second robot, {prefix}, which the map does not name. Put "
+                "the files of each robot into a folder of its name, and import the folder above; "
+                "or import the files of one robot, with --robot"
+            )
 
 
 def _by_names(files: dict[str, CsvTable], command: str) -> Map:

@@ -202,6 +202,23 @@ def test_csv_files_with_other_names_come_by_a_map(tmp_path):
     assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == ([7], [2.5], [-0.5])
 
 
+def test_files_of_a_second_robot_are_refused_with_the_remedy(tmp_path):
+    text = MAP
+    for name, of in {"wheels.csv": WHEELS, "trees.csv": TREES, "labels.csv": LABELS}.items():
+        (tmp_path / f"ann_{name}").write_text(of)
+        text = text.replace(f'"{name}"', f'"ann_{name}"')
+    assert "ann_wheels.csv" in text
+    (tmp_path / "columns.toml").write_text(text)
+    (tmp_path / "bob_wheels.csv").write_text(WHEELS)
+    given = [*sorted(tmp_path.glob("*.csv")), "-o", tmp_path / "set"]
+    result = run(*given, "--columns", tmp_path / "columns.toml")
+    assert isinstance(result.exception, DatasetError)
+    said = str(result.exception)
+    assert said.startswith("bob_wheels.csv: odometry of a second robot, bob")
+    assert "folder of its name" in said
+    assert not (tmp_path / "set").exists()
+
+
 @pytest.mark.parametrize(("unit", "a_second"), [("ns", 10**9), ("us", 10**6), ("ms", 1000)])
 def test_unix_times_of_any_unit_and_names_with_a_prefix_are_proposed_and_read_exactly(
     tmp_path, unit, a_second
