@@ -20,7 +20,7 @@ LIBRARIES = Path(core.__file__).parent
 """Elsewhere than the sources where a wheel is tested."""
 PROGRAMS = {
     "bits": (
-        "8c51871c169fc457 1aae4b5d600f414a",
+        "8c51871c169fc457 238a4106659bd483",
         (
             *("window", "particles", "innovation", "along_path", "moments", "dense", "gaussian"),
             *("arrow", "consensus", "sensitivity", "motion"),
@@ -34,9 +34,7 @@ PROGRAMS = {
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
     "bits_odometry": ("fba0d664d0eb528d", ("motion", "odometry", "reduction")),
 }
-"""Hashes of all results of a program in this folder, equal to the bits of the Numba kernels before
-them; and the core's sources that it takes.
-"""
+"""Hashes of all results of a program in this folder, and the core's sources that it takes."""
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")
 COMPILED = pytest.mark.skipif(
     core.level != "checked", reason="compiling these programs takes minutes: make check-core"
