@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from random import Random
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def peak_mib() -> float:
 @cache
 def drawn(kind: type[m.Message], count: int) -> list[Sample]:
     """Extreme messages of a class in a session of a robot that has begun; a tenth are mutated."""
-    rng = np.random.default_rng(sorted(m.BY_TAG).index(m.tag_of(kind)))
+    rng = np.random.default_rng(crc32(m.tag_of(kind).encode()))  # a new class changes no other's
     flips = Random(7)
     found: list[Sample] = []
     for k, (channel, name, payload) in enumerate(samples(rng, kind, count)):
@@ -89,7 +90,7 @@ def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door():
             except WireError:
                 continue
         passed[m.tag_of(kind)] = sound / len(drawn(kind, COUNT))
-    assert min(passed.values()) > 0.1, passed  # a fix is two arrays, each extreme in most draws
+    assert min(passed.values()) > 0.2, passed
 
 
 @pytest.mark.parametrize("kind", CARRIED, ids=m.tag_of)
