@@ -14,7 +14,7 @@ from teamslam.team.estimation.map_joining.condensing import Limits
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
-from tests.estimation.association.unnamed_worlds import circle, drive, wrong
+from tests.estimation.association.unnamed_worlds import circle, drive, ring, wrong
 
 PROFILE = AssociationProfile(recent=3, near=0.1, closure_pairs=5, audited=3, llr_loose=30.0)
 CONFIG = CentralConfig(tick_s=10.0, association=PROFILE)
@@ -25,10 +25,8 @@ SMALL = Limits(begin=24, lag=3)
 def world():
     """Laps of a ring; the second lap closes on the first when most of that is condensed."""
     rng = np.random.default_rng(5)
-    angle = 2.0 * np.pi * (np.arange(32) + 0.6 * rng.uniform(size=32)) / 32
-    r = rng.uniform(17.0, 23.0, 32)
-    landmarks = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-    submaps, truth = drive("r1", circle((0.0, 0.0), 20.0, 72, 2.0), landmarks, rng, reach=9.0)
+    path = circle((0.0, 0.0), 20.0, 72, 2.0)
+    submaps, truth = drive("r1", path, ring(rng, 32), rng, reach=9.0)
     return [message(each.sequence, each.end_ns, each.local) for each in submaps], truth
 
 

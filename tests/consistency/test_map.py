@@ -29,45 +29,16 @@ from tests.estimation.submap_world import correlated, seen_from, solved, team, w
 RUNS = 200
 
 
-def consistency(options):
-    """Mean map NEES per degree of freedom and mean joint cost per degree of freedom."""
+def consistency(runs):
+    """Mean NEES of the map and mean joint cost, each per degree of freedom, with it.
+
+    runs: pairs of a fold and the true landmarks.
+    """
     errors = cost = dof = joint = 0.0
-    for seed in range(RUNS):
-        world = team(seed, robots=2, submaps=5, landmarks=4)
-        fold = solved(joined(world.submaps, world.starts, options, tick=10), options)
+    for fold, landmarks in runs:
         found = landmark_map(fold)
-        truth = world.landmarks[found.ids]
-        errors += nees((found.means - truth).ravel(), found.covariance)
-        dof += found.means.size
-        agreement = joint_cost(fold)
-        cost += agreement.chi2
-        joint += agreement.dof
-    return errors / dof, round(dof), cost / joint, round(joint)
-
-
-def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
-    ratio, dof, cost, joint = consistency(JoinSettings())
-    low, high = chi2_interval(dof, 0.999, 1)
-    assert low < ratio < high
-    least, most = chi2_interval(joint, 0.999, 1)
-    assert least < cost < most
-    twice, _, _, _ = consistency(JoinSettings(covariance_factor=0.5))
-    assert twice > high
-
-
-def consistency_inter_robot(change):
-    """Mean NEES of map and last poses, mean joint cost; each per degree of freedom, with it."""
-    errors = cost = 0.0
-    dof = joint = 0.0
-    for seed in range(RUNS):
-        world = meeting(seed, robots=2, submaps=3, landmarks=2, reach=7.0)
-        sightings = [replace(each, covariance=change * each.covariance) for each in world.sightings]
-        fold = joined_with(world.submaps, world.starts, sightings, JoinSettings(), 100)
-        fold = solved(fold, JoinSettings())
-        found = landmark_map(fold)
-        truth = world.landmarks[found.ids]
         if len(found.ids):
-            errors += nees((found.means - truth).ravel(), found.covariance)
+            errors += nees((found.means - landmarks[found.ids]).ravel(), found.covariance)
             dof += found.means.size
         agreement = joint_cost(fold)
         cost += agreement.chi2
@@ -75,13 +46,40 @@ def consistency_inter_robot(change):
     return errors / dof, round(dof), cost / joint, round(joint)
 
 
-def test_a_map_with_sightings_is_consistent_and_one_that_counts_each_fourfold_is_not():
-    ratio, dof, cost, joint = consistency_inter_robot(1.0)
+def teams(options):
+    for seed in range(RUNS):
+        world = team(seed, robots=2, submaps=5, landmarks=4)
+        yield (
+            solved(joined(world.submaps, world.starts, options, tick=10), options),
+            world.landmarks,
+        )
+
+
+def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
+    ratio, dof, cost, joint = consistency(teams(JoinSettings()))
     low, high = chi2_interval(dof, 0.999, 1)
     assert low < ratio < high
     least, most = chi2_interval(joint, 0.999, 1)
     assert least < cost < most
-    _, _, cost_of_mutant, _ = consistency_inter_robot(0.25)
+    twice, _, _, _ = consistency(teams(JoinSettings(covariance_factor=0.5)))
+    assert twice > high
+
+
+def meetings(change):
+    for seed in range(RUNS):
+        world = meeting(seed, robots=2, submaps=3, landmarks=2, reach=7.0)
+        sightings = [replace(each, covariance=change * each.covariance) for each in world.sightings]
+        fold = joined_with(world.submaps, world.starts, sightings, JoinSettings(), 100)
+        yield solved(fold, JoinSettings()), world.landmarks
+
+
+def test_a_map_with_sightings_is_consistent_and_one_that_counts_each_fourfold_is_not():
+    ratio, dof, cost, joint = consistency(meetings(1.0))
+    low, high = chi2_interval(dof, 0.999, 1)
+    assert low < ratio < high
+    least, most = chi2_interval(joint, 0.999, 1)
+    assert least < cost < most
+    _, _, cost_of_mutant, _ = consistency(meetings(0.25))
     assert cost_of_mutant > most
 
 

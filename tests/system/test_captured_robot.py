@@ -4,6 +4,7 @@ Attacks of `../shared/repro` on a whole team of processes with keys: the map sta
 to which nothing happens, no process ends, and the logs stay small.
 """
 
+import asyncio
 import json
 import os
 import signal
@@ -87,7 +88,7 @@ async def test_a_captured_robot_changes_no_bit_of_the_map(team: Processes, *, ce
         router = await team.pid("router")
         os.kill(router, signal.SIGSTOP)
         try:
-            time.sleep(STOP_S)
+            await asyncio.sleep(STOP_S)
         finally:
             os.kill(router, signal.SIGCONT)
     assert await launch.ended() == 0, launch.said()

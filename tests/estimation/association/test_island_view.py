@@ -1,4 +1,4 @@
-"""What islands see of each other: views, votes for a motion, numbers of landmarks."""
+"""Views of islands, their votes for a relative motion, and the numbers of their landmarks."""
 
 from itertools import permutations
 

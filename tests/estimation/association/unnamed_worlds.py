@@ -64,6 +64,13 @@ def circle(
     return np.column_stack([x, y, (angle + np.pi / 2 + np.pi) % (2 * np.pi) - np.pi])
 
 
+def ring(rng: np.random.Generator, count: int) -> Float[np.ndarray, "k 2"]:
+    """Landmarks about a circle of 20 m, irregular in angle and radius."""
+    angle = 2.0 * np.pi * (np.arange(count) + 0.6 * rng.uniform(size=count)) / count
+    r = rng.uniform(17.0, 23.0, count)
+    return np.column_stack([r * np.cos(angle), r * np.sin(angle)])
+
+
 def wrong(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
     """Members whose set has more of another true landmark."""
     count = 0

@@ -33,6 +33,7 @@ from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,
     duplicates,
+    ring,
     wrong,
 )
 from tests.estimation.sighting_world import joined_with, meeting
@@ -201,10 +202,8 @@ LAPS = 5
 def laps():
     """Laps of one robot on a ring: the full fold and the bounded one, submap after submap."""
     rng = np.random.default_rng(5)
-    angle = 2.0 * np.pi * (np.arange(60) + 0.6 * rng.uniform(size=60)) / 60
-    r = rng.uniform(17.0, 23.0, 60)
-    world = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
-    submaps, truth = drive("r1", circle((0.0, 0.0), 20.0, 24 * LAPS, LAPS), world, rng)
+    path = circle((0.0, 0.0), 20.0, 24 * LAPS, LAPS)
+    submaps, truth = drive("r1", path, ring(rng, 60), rng)
     full = bounded = EMPTY_FOLD
     for submap in submaps:
         full = fold_tick(full, Tick([submap]), SETTINGS)
