@@ -108,12 +108,13 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     island, found = fold.main, dict[int, m.LandmarkChange]()
     limit = chi2_limit(2, FALSE_ALARM)
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
-    own = Counter(
+    own = {
         node
         for each in island.graph.submaps
         if not is_map(each.contribution.stream)
         for node in each.landmarks.tolist()
-    )
+    }
+    placed = Counter(node for each in graph.submaps for node in each.landmarks.tolist())
     condensed = set() if graph.condensed is None else {*graph.condensed.nodes.tolist()}
     former: dict[int, int] = {}
     old: set[int] = {id_ for stream, id_ in graph.former if not is_survey(stream)}
@@ -121,7 +122,7 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
         for each in displacements(island, saved):
             node = graph.landmarks[each.landmark]
-            if each.is_apart and own[node] < LEAST_SUBMAPS and node not in condensed:
+            if each.is_apart and placed[node] < LEAST_SUBMAPS and node not in condensed:
                 former[each.landmark] = graph.former[saved.contribution.stream, each.landmark]
             before = found.get(each.landmark)
             if before is None or before.chi2 < each.chi2:

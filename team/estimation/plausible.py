@@ -60,7 +60,12 @@ def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
     """Give the reason why an inter-robot measurement is refused, if any."""
     if sighting.is_fix:
-        return _far(sighting.measurement[:1], bounds.coordinate_m, "of the station")
+        distance_m = sighting.measurement[:1]
+        why = _far(distance_m, bounds.coordinate_m, "of the station")
+        why = why or _far(sighting.point, bounds.extent_m, "of its pose node")
+        metres = np.array([1.0, distance_m[0]])  # per unit of range, and of bearing
+        P = sighting.covariance * metres * metres[:, None]
+        return why or _spread(P, np.zeros(2, np.bool_), bounds)
     why = _far(sighting.measurement[:1], bounds.extent_m, "of its observer")
     return why or _spread(sighting.covariance, np.array([False, True]), bounds)
 

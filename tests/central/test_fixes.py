@@ -12,7 +12,9 @@ from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team.config import GNSS, SURVEY_FRAME, Gnss
+from teamslam.team.config import GNSS, SURVEY_FRAME, Bounds, Gnss
+from teamslam.team.estimation.plausible import sighting_beyond
+from teamslam.team.translate import sighting_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
@@ -91,6 +93,22 @@ def test_coordinates_of_a_national_grid_are_used_as_they_are():
     samples, streams = day(3, origin=tuple(UTM))
     plain = errors(final_map(day(3)[0]), streams)
     assert errors(final_map(samples), streams, UTM) == pytest.approx(plain, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({}, None),
+        ({"point": np.array([1e9, 0.0])}, "of its pose node"),
+        ({"covariance": 1e-30 * np.eye(2)}, "a sigma of"),
+        ({"covariance": 1e30 * np.eye(2)}, "a sigma of"),
+    ],
+)
+def test_a_fix_beyond_the_bounds_is_refused(changed, why):
+    factors = (opened(s)[2] for s in day(3)[0])
+    first = next(x for x in factors if isinstance(x, m.SightingFactor) and x.teammate == GNSS)
+    found = sighting_beyond(dataclasses.replace(sighting_of(first), **changed), Bounds())
+    assert (found is None) if why is None else (found is not None and why in found)
 
 
 def test_maps_with_fixes_are_recomputed_from_the_log():

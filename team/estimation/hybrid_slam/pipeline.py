@@ -77,7 +77,7 @@ class HybridSlam:
         """Take inter-robot measurements; returns the reason if they are rejected."""
         if self._grid is None:
             return Rejection.NO_NODES
-        if self._start_ns is None:
+        if self._is_late(stamp_ns):
             return Rejection.OLDER
         return self._grid.observe(stamp_ns, measurement, looks)
 
@@ -85,9 +85,14 @@ class HybridSlam:
         """Take a fix of the antenna's position; returns the reason if it is rejected."""
         if self._grid is None:
             return Rejection.NO_NODES
-        if self._start_ns is None:
+        if self._is_late(stamp_ns):
             return Rejection.OLDER
         return self._grid.fix(stamp_ns, measurement, position)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Whether odometry has passed this time, or has not begun."""
+        now_ns = self._segmenter.now_ns
+        return self._start_ns is None or (now_ns is not None and stamp_ns < now_ns)
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> ClosedWindow | None:
         """Take one odometry interval; returns the window that it closes, if any."""

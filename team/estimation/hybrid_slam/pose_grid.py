@@ -8,6 +8,7 @@ measurements of one teammate at one node are reduced to one. Of fixes the one ne
 time is used; the odometry carries the antenna to it.
 """
 
+from bisect import insort
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,7 +116,7 @@ class PoseGrid:
             if self._sensor.is_mounted:
                 seen = of_base(seen, np.array(self._sensor.mount))
             look = _Look(stamp_ns, counter, teammates[k], seen, node_ns)
-            self._uncovered.append(look)
+            insort(self._uncovered, look, key=_stamp_of)
         self._find_next()
         return None if mask.any() else Rejection.SENSOR_LIMITS
 
@@ -125,7 +126,7 @@ class PoseGrid:
         if node_ns is None:
             return Rejection.NO_NODE
         look = _Look(stamp_ns, counter, GNSS, self._antenna, node_ns, position)
-        self._uncovered.append(look)
+        insort(self._uncovered, look, key=_stamp_of)
         self._find_next()
         return None
 
@@ -185,6 +186,10 @@ class PoseGrid:
             return
         key = (look.node_ns, look.teammate)
         self._at_node.setdefault(key, []).append((look.counter, at_node))
+
+
+def _stamp_of(look: _Look) -> int:
+    return look.stamp_ns
 
 
 def _fix_at(look: _Look, antenna: CarriedPoint) -> NodeSighting:

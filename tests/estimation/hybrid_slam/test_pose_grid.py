@@ -13,6 +13,7 @@ from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
+from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.rejection import Rejection
@@ -171,6 +172,31 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
         [(1_500_000_000, (2,)), (3 * SECOND, (3,))],
         [(4_500_000_000, (5,)), (6 * SECOND, (6,))],
     ]
+
+
+def test_a_slam_rejects_what_odometry_has_passed():
+    slam = HybridSlam(config(front_end=msgspec.structs.replace(config().front_end, node_s=1.5)), 1)
+    position = CarriedPoint(np.zeros(2), np.eye(2))
+    assert slam.fix(SECOND, 1, position) == slam.sight(SECOND, 1, look()) == Rejection.OLDER
+    for k in (1, 2):
+        slam.drive(OdometryInterval(k * SECOND, SECOND, 0.5, 0.1))
+    late_ns = 1_600_000_000
+    assert slam.fix(late_ns, 2, position) == slam.sight(late_ns, 2, look()) == Rejection.OLDER
+    assert slam.fix(2 * SECOND, 3, position) is None
+
+
+def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
+    """Two sensors with different latencies, before odometry has covered either time."""
+    found = []
+    for order in ((1_800_000_000, 2_500_000_000), (2_500_000_000, 1_800_000_000)):
+        grid, segmenter = initial_state()
+        for stamp_ns in order:
+            grid.observe(stamp_ns, stamp_ns // 10**8, look())
+        drive(segmenter, 6.0)
+        found.append(grid.sightings())
+    (one,), (other,) = found
+    assert one.measurements == other.measurements == (18, 25)
+    assert one.measurement == pytest.approx(other.measurement, abs=1e-12)
 
 
 def test_a_slam_without_nodes_does_not_use_sightings():
