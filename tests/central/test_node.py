@@ -393,3 +393,44 @@ def test_watermark_and_end_are_those_of_a_look_at_every_robot():
             assert concluded == whole
             ended += whole
     assert ended
+
+
+FEEDBACK = CentralConfig(fusion="kalman-per-axis")
+
+
+def estimate(robot, number):
+    return build.map_estimate(
+        stamp_ns=number, robot=robot, sequence=number, exchange=number, joint=False, means=b""
+    )
+
+
+def exchanges(centre):
+    return [fused.exchange for fused in centre.maps]
+
+
+def test_under_feedback_a_round_waits_for_every_live_robot():
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1))
+    assert exchanges(centre) == []
+    centre.hears(estimate("r2", 1))
+    assert exchanges(centre) == [1]
+
+
+@pytest.mark.parametrize("news", [given_up("r2"), done("r2", 0)])
+def test_under_feedback_a_robot_that_is_given_up_or_ends_early_is_waited_for_no_longer(news):
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1))
+    centre.hears(news)
+    assert exchanges(centre) == [1]
+    centre.hears(estimate("r1", 2), END, done("r1", 0))
+    assert exchanges(centre) == [1, 2]
+    assert centre.final.exchange == 2
+
+
+def test_under_feedback_all_open_rounds_are_fused_before_the_end():
+    centre = joined(config=FEEDBACK)
+    centre.hears(estimate("r1", 1), estimate("r1", 2), END, done("r1", 0))
+    assert exchanges(centre) == []
+    centre.hears(done("r2", 0))
+    assert exchanges(centre) == [1, 2]
+    assert centre.final.exchange == 2

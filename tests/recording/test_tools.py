@@ -519,3 +519,13 @@ def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):
         rows = rows_of(path)
         assert len(rows) == count
         assert list(rows[0])[:3] == ["key", "counter", "wall_ns"]
+
+
+@pytest.mark.parametrize("bounds", [(6.0, None), (None, 0.0), (2.01, 2.02)])
+def test_a_cut_with_nothing_in_it_is_refused(tmp_path, bounds):
+    log = recorded(tmp_path / "log.mcap", [s for s in drive("alpha", 6) if "config" not in s.key])
+    with pytest.raises(
+        LogError, match=r"nothing of it is in this cut; its measurements are .* 5\.900"
+    ):
+        cut(log, tmp_path / "a.mcap", *bounds)
+    assert not (tmp_path / "a.mcap").exists()

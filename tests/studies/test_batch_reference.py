@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from teamslam.central.desk.evaluation.errors import Path
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
     Scan,
+    anchored,
     chains_of,
 )
 from teamslam.sim.scenarios.scenario import Scenario
@@ -22,7 +24,7 @@ from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_grap
 from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
 from teamslam.team.estimation.models import increment_of
-from teamslam.team.estimation.se2 import compose, exponential
+from teamslam.team.estimation.se2 import between, compose, exponential
 from teamslam.team.wire import channels as ch
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
 
@@ -125,3 +127,23 @@ def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(BatchReferenceError, match=r"pip install '?gtsam"):
         batch_map([])
+
+
+def test_every_filling_holds_the_anchors():
+    of = scenario()
+    chain = chains_of(world_log(of), of)[0]
+    stream = streams(of).streams[0]
+    assert stream.truth is not None
+    anchors = Path(chain.stamps_ns[::5], stream.truth[::5])
+    fillings = anchored(chain, anchors)
+    for poses in fillings:
+        for pose, anchor in zip(poses[::5], stream.truth[::5], strict=True):
+            np.testing.assert_allclose(between(anchor, pose), 0.0, atol=1e-9)
+    onward, back, _ = fillings
+    odometry = chain.dead_reckoned
+    for i in range(20):
+        moved = between(odometry[i], odometry[i + 1])
+        if i % 5 != 4:
+            np.testing.assert_allclose(between(onward[i], onward[i + 1]), moved, atol=1e-9)
+        if i % 5 != 0:
+            np.testing.assert_allclose(between(back[i], back[i + 1]), moved, atol=1e-9)

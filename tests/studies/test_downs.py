@@ -84,6 +84,7 @@ def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_f
     pair = downs_minima.common(_map(points, 0.1), _map(turned, 0.2))
     turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     assert downs_minima.minima(downs_minima.profile(pair, turns)) == 1
+    assert downs_minima.minima(np.cos(2.0 * turns)) == 2
     closed = procrustes(points, turned, np.ones(4))
     np.testing.assert_allclose(downs_minima.evolved(pair, 1), closed, atol=1e-4)
     alike, weighted = (

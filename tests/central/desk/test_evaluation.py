@@ -540,3 +540,15 @@ def test_a_run_on_a_data_set_is_titled_with_its_name():
     assert title_of(run) == "my_set"
     assert to_json(run)["data_set"] == "my_set"
     assert title_of(evaluate(joined_log(of, 0.1))) == "small, seed 1: hybrid + join"
+
+
+def test_truth_is_not_extrapolated():
+    truth = path([1.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    _, known = interpolate_truth(truth, stamps(0.999, 1.0, 2.0, 2.001))
+    assert known.tolist() == [False, True, True, False]
+
+
+def test_without_truth_nothing_is_known():
+    nowhere = Path(np.empty(0, np.int64), np.empty((0, 3)))
+    assert not interpolate_truth(nowhere, stamps(0.0, 1.0))[1].any()
+    assert pose_errors(path([0.0], [[0.0, 0.0, 0.0]]), np.eye(3)[np.newaxis], nowhere) is None
