@@ -1,4 +1,4 @@
-"""Where robots were carried off, or slipped by metres, at seams where the fold cut their streams.
+"""Describe the seams at which the fold cut a stream: its robot was carried off or slipped.
 
 Without landmark names the fold cuts a stream where its view changes at once (`continuity`). With
 names it needs no cut: the robust loss discounts the one submap in which the robot was carried off,

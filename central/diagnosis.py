@@ -161,10 +161,10 @@ def _shared_errors(
 ) -> Iterator[m.Diagnosis]:
     """Find errors that differ from the robot's configuration beyond doubt.
 
-    Their standard deviation is the larger of two: the stated one by the root of a covariance scale
-    above 1, and that by the scatter of the submaps. Errors that change slowly look like a shared
-    one, but the submaps scatter about it. That of an error that is found is larger by the error of
-    its sensitivities, which vanishes with it.
+    Their standard deviation is the larger of two: the stated one times the root of a covariance
+    scale above 1, and that from the scatter of the submaps. Errors that change slowly look like a
+    shared one, but the submaps scatter about it. The standard deviation of a large error grows by
+    the error of its sensitivities, which vanishes with it.
     """
     for found in biases:
         (robot, _), bias, value, stated = found

@@ -47,9 +47,7 @@ class FoldInputs:
         self._tick_with: dict[tuple[str, int, int], int] = {}
         self._has_station = False
         if config.surveyed:
-            survey, start = survey_of(config.surveyed)
-            self.add_start(start)
-            self._members.add(survey, digest_of(encoded(survey)), ())
+            self._add_known(*survey_of(config.surveyed))
 
     def add_start(self, start: InitialPoseFactor) -> None:
         """Add a stream's initial pose, before its first submap."""
@@ -66,10 +64,13 @@ class FoldInputs:
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         if not self._has_station and any(each.teammate == GNSS for each in sightings):
             self._has_station = True
-            added, start = station()
-            self.add_start(start)
-            tick = min(tick, self._members.add(added, digest_of(encoded(added)), ()))
+            tick = min(tick, self._add_known(*station()))
         return tick
+
+    def _add_known(self, submap: Submap, start: InitialPoseFactor) -> int:
+        """Add a submap of the configuration with its start; return its tick."""
+        self.add_start(start)
+        return self._members.add(submap, digest_of(encoded(submap)), ())
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
         """Replace the verdicts; return the first tick with both landmarks of a changed one, else

@@ -56,8 +56,8 @@ def station() -> tuple[Submap, InitialPoseFactor]:
 
 
 def survey_warnings(fold: Fold) -> Iterator[str]:
-    """Word the surveyed landmarks that the rest of the map has elsewhere, beyond chance, and saved
-    maps that contain a survey already.
+    """Warn of surveyed landmarks that the rest of the map places elsewhere beyond chance, and of
+    saved maps that already contain a survey.
     """
     if not fold.contributions:
         return

@@ -3,9 +3,10 @@
 A robot's disagreement is the largest of three figures, all near or below 1 where its covariances
 are right, each counted where it is beyond chance: its share of the joint cost per degree of
 freedom, which the robust loss bounds; the unweighted χ²/dof that most of its submaps exceed, the
-newest ones if it has few; and that which most of the newest inter-robot measurements by it or of it
-exceed. The robust loss discounts a minority, which is no reason to lose the robot. One that claims
-to stand still has submaps that fit the map, but is not where the others measure it.
+newest ones if it has few; and that which most of the newest inter-robot measurements exceed that
+have it as observer or teammate. The robust loss discounts a minority, which is no reason to lose
+the robot. A robot whose odometry reports no motion has submaps that fit the map, but the others
+measure it elsewhere.
 
 One wrong robot distorts the map and makes others disagree, too; one with overconfident covariances,
 or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement:
@@ -104,7 +105,7 @@ def disagreement(
     """Return the disagreement of each robot that can be judged.
 
     chance: a cost that a sound robot exceeds with a probability above e^−chance is no disagreement.
-    least: number of submaps of a robot that are judged.
+    least: fewest submaps from which a robot is judged.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, _ in agreement.submaps:

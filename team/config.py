@@ -31,7 +31,7 @@ SURVEY = MAP + "survey"
 SURVEY_FRAME = SURVEY + "/0"
 """The frame that its start fixes."""
 GNSS = MAP + "gnss"
-"""The member of the set from whose start the fixes of robots' positions are measured."""
+"""The member of the set that is the station of the fixes."""
 BIASES: tuple[Bias, ...] = get_args(Bias)
 CALIBRATED: tuple[Bias, ...] = ("bearing", "clock_offset", "forward_scale", "range_offset")
 """The biases of a team whose ranges are its measure of length: with `range_scale` as well, odometry

@@ -42,7 +42,7 @@ SURVEYED: Stream = (SURVEY, 0)
 
 
 STATION: Stream = (GNSS, 0)
-"""The stream whose exactly known start measures the robots' fixes; it has no landmarks."""
+"""Stream of the station from which fixes are measured: an exact pose without landmarks."""
 
 
 def is_survey(stream: Stream) -> bool:

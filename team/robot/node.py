@@ -189,7 +189,7 @@ class RobotNode:
         refused = absurd(message)
         if refused is not None:
             return refused
-        if isinstance(message, m.Measurement):  # most messages are
+        if isinstance(message, m.Measurement):  # first: most messages are measurements
             own = message.robot == self.robot
             return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
         match message:
@@ -286,7 +286,7 @@ class RobotNode:
     def _publish(self) -> list[Outgoing]:
         """Take the messages of `out` that every receiver accepts; others are withheld and named.
 
-        Of a map what rounding has spoilt is left out.
+        Landmarks that rounding has made unsound are removed from a map.
         """
         sound = []
         for each in self.out:

@@ -36,11 +36,12 @@ def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
 
 
 def _fixes(log: Collected, robot: str) -> Fixes | None:
-    for message in log.messages(ch.TRUTH_POSITIONS, m.TruthPositions, robot):
-        places = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
-        at_ns = stamps(message.stamps, "stamps").astype(np.int64)
-        return (at_ns, places) if len(at_ns) > 1 else None
-    return None
+    message = next(iter(log.messages(ch.TRUTH_POSITIONS, m.TruthPositions, robot)), None)
+    if message is None:
+        return None
+    places = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
+    at_ns = stamps(message.stamps, "stamps").astype(np.int64)
+    return (at_ns, places) if len(at_ns) > 1 else None
 
 
 def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: float) -> float | None:

@@ -19,8 +19,8 @@ class Run:
     """A run from its log.
 
     provenance: log metadata. ledger: result of `verify-ledger`; None if not requested, or without
-    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested. command: that
-    makes the report.
+    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested. command: the
+    command line that made the report.
     """
 
     evaluation: Evaluation

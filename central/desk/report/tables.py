@@ -551,8 +551,8 @@ _DECISION = (
 )
 DECISION_NOTE = (
     "LLR: log-likelihood ratio of the pairs; absent: landmarks that one side has where the other "
-    "looked and has none, which speak against; share: of the landmarks there, matched ones. What "
-    "waits failed the test that is named; what is undone was taken back by a later one."
+    "looked and has none, which speak against; share: of the landmarks there, matched ones. A "
+    "decision that waits failed the named test; an undone one was reversed by a later one."
 )
 DECISIONS = 200
 """Most decisions in the table; report.json has all."""

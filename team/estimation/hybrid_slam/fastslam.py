@@ -19,10 +19,10 @@ from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.shapes import Float, Int64, UInt32
 
 __all__ = [
+    "CoreErrors",
     "Noise",
     "Particles",
     "Proposal",
-    "RefusedByName",
     "StepInfo",
     "at_poses",
     "effective_sample_size",
@@ -67,14 +67,14 @@ def noise_of(sensor: Sensor) -> Noise:
     )
 
 
-class RefusedByName:
-    """A context that raises NotACovarianceError for what the core refuses."""
+class CoreErrors:
+    """A context that raises the core's errors as NotACovarianceError."""
 
     def __enter__(self) -> None:
-        """Nothing has to be prepared."""
+        """Do nothing."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Replace the core's error."""
+        """Convert MotionError and NotFiniteError."""
         if isinstance(error, core.MotionError):
             raise NotACovarianceError("the motion", str(error)) from error
         if isinstance(error, core.NotFiniteError):
@@ -189,7 +189,7 @@ def filter_step(
     """As `propagated_and_updated` without resampling; returns also the log evidence."""
     noises = unclaimed(len(ids)) if own is None else own
     normals = generator.standard_normal((len(particles.poses), 3))
-    with RefusedByName():
+    with CoreErrors():
         window = core.Window.of_particles(
             *particles.arrays, noise_of(sensor), proposal == "fastslam2"
         )

@@ -13,7 +13,7 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import cholesky_factor, whitened
-from teamslam.team.estimation.hybrid_slam.fastslam import Particles, RefusedByName, noise_of
+from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
 from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import compose, tangent, wrapped
@@ -72,7 +72,7 @@ def innovation(
     calibration, own are the noises that they claim. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
-    with RefusedByName():
+    with CoreErrors():
         window = core.Window.of_particles(*particles.arrays, noise_of(sensor))
     noises = unclaimed(len(ids)) if own is None else own
     return innovation_of(window, increment, (ids, ranges, bearings, noises))
@@ -80,7 +80,7 @@ def innovation(
 
 def innovation_of(window: core.Window, increment: Increment, seen: Seen) -> Innovation:
     """Compute `innovation` of a keyframe's measurements by the particles of a window."""
-    with RefusedByName():
+    with CoreErrors():
         squared, error, S = window.innovation(increment.mean, increment.covariance, *seen)
     return _judged(squared, error, S) if len(error) else NOTHING
 

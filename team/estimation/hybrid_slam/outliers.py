@@ -6,7 +6,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
-from teamslam.team.estimation.hybrid_slam.fastslam import RefusedByName, noise_of
+from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, noise_of
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.shapes import Bool
 
@@ -62,7 +62,7 @@ class OutlierGate:
         """Add a keyframe; return whether all measurements accepted before it stay accepted."""
         self._all.append(keyframe)
         self._begins.append(self._begins[-1] + len(keyframe.ids))
-        with RefusedByName():
+        with CoreErrors():
             self._consensus.add(
                 keyframe.increment.mean,
                 keyframe.increment.covariance,

@@ -4,8 +4,8 @@ them.
 A robot does not know when it is observed, so all robots place nodes at the same times, the
 multiples of node_s. An inter-robot measurement belongs to the nearest grid time, if that lies in
 the open window and within sighting_s. The observer's odometry carries it to that node; several
-measurements of one teammate at one node are reduced to one. Of fixes the one nearest to a node in
-time is used; the odometry carries the antenna to it.
+measurements of one teammate at one node are reduced to one. At each node only the fix nearest in
+time is used; the odometry carries the antenna to the node.
 """
 
 from bisect import insort
@@ -193,8 +193,8 @@ def _stamp_of(look: _Look) -> int:
 
 
 def _fix_at(look: _Look, antenna: CarriedPoint) -> NodeSighting:
-    """Make the fix of a pose node; the antenna's uncertainty counts in every direction, since the
-    heading is not known.
+    """Make the measurement of a node's fix. The heading is unknown, so the antenna's total variance
+    is added in every direction.
     """
     assert look.fix is not None
     spread = look.fix.covariance + np.trace(antenna.covariance) * np.eye(2)

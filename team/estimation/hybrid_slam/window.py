@@ -15,7 +15,7 @@ from teamslam.team import core
 from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, NotACovarianceError
-from teamslam.team.estimation.hybrid_slam.fastslam import Particles, RefusedByName, noise_of
+from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
 from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
@@ -121,7 +121,7 @@ def advance(
     is_thin = window.effective < window.front_end.resample_below * count
     uniform = random.uniform() if is_thin else None
     normals = random.normals(count, 3)
-    with RefusedByName():
+    with CoreErrors():
         step = window.core.advance(
             increment.mean, increment.covariance, *seen, uniform, normals, forward
         )
@@ -146,7 +146,7 @@ def move(
     It never resamples: the weights of the last measurements stay as they are.
     """
     normals = random.normals(window.front_end.particles, 3)
-    with RefusedByName():
+    with CoreErrors():
         window.core.move(increment.mean, increment.covariance, normals, forward)
 
 

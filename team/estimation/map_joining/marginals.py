@@ -146,7 +146,7 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
 
 
 def scatter_of(fold: Fold, of: BiasEstimate) -> float:
-    """Estimate the standard deviation of a bias from the scatter of what the submaps add to it.
+    """Estimate the standard deviation of a bias from the scatter of the submaps' contributions.
 
     With c = A⁻¹u, where u picks the bias, submap k moves the estimate by s_k = −c · ∇(w χ²_k)/2.
     Errors that last longer than a window correlate the s_k of a stream: the variance is

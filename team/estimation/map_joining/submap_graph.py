@@ -533,14 +533,14 @@ def encounter_of(graph: Graph, sighting: InterRobotFactor) -> Encounter | None:
 
 
 def observer_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
-    """Return the node of the pose that measures: of a fix the station's; None if not in here."""
+    """Return the observer's node, the station's for a fix; None if the graph lacks it."""
     if sighting.is_fix:
         return graph.streams[STATION][0] if STATION in graph.streams else None
     return graph.poses.get((sighting.stream, sighting.stamp_ns))
 
 
 def teammate_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
-    """Return the node of the pose that is measured, None if it is not in this graph."""
+    """Return the node of the measured pose; None if the graph lacks it."""
     if sighting.is_fix:
         return graph.poses.get((sighting.stream, sighting.stamp_ns))
     return pose_node(graph, sighting.teammate, sighting.stamp_ns)
