@@ -7,6 +7,7 @@ r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -130,28 +131,20 @@ def split(seen: Detections) -> tuple[Detections, Detections | None]:
     """Separate named scans from unnamed ones (or None)."""
     if seen.hidden is None or not seen.hidden.any():
         return seen, None
-    return _where(seen, ~seen.hidden), _where(seen, seen.hidden)
+    named, unnamed = (seen.take(np.flatnonzero(each)) for each in (~seen.hidden, seen.hidden))
+    return _without_empty(named), _without_empty(unnamed)
 
 
-def _where(seen: Detections, chosen: np.ndarray) -> Detections:
-    rows = np.repeat(chosen, np.diff(seen.offsets))
-    counts = np.diff(seen.offsets)[chosen]
-    return Detections(
-        stamps_ns=seen.stamps_ns[chosen],
-        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        ids=seen.ids[rows],
-        ranges=seen.ranges[rows],
-        bearings=seen.bearings[rows],
-        points=_any(seen.points, rows),
-        covariances=_any(seen.covariances, rows),
-        hidden=None if seen.hidden is None else seen.hidden[chosen],
-        signatures=_any(seen.signatures, rows),
-        classes=_any(seen.classes, rows),
-    )
-
-
-def _any(values: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
-    return None if values is None or np.isnan(values[rows]).all() else values[rows]
+def _without_empty(seen: Detections) -> Detections:
+    """Without columns that no row has a number in."""
+    optional = ("points", "covariances", "signatures", "classes")
+    columns = {name: getattr(seen, name) for name in optional}
+    empty: dict[str, Any] = {
+        name: None
+        for name, values in columns.items()
+        if values is not None and np.isnan(values).all()
+    }
+    return replace(seen, **empty)
 
 
 def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTable | None:

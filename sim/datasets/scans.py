@@ -1,6 +1,6 @@
 """A robot's measurements by row, for all data sets' tables."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -21,14 +21,9 @@ class Scans:
 
     def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
         """Chosen rows."""
-        return Scans(
-            self.stamps_ns[chosen],
-            self.ids[chosen],
-            self.ranges[chosen],
-            self.bearings[chosen],
-            None if self.points is None else self.points[chosen],
-            None if self.covariances is None else self.covariances[chosen],
-        )
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        given = {name: values[chosen] for name, values in columns.items() if values is not None}
+        return replace(self, **given)
 
     def grouped(self) -> Detections:
         """One message per stamp and form."""

@@ -198,23 +198,11 @@ def _steps(table: CsvTable) -> Int64[np.ndarray, " rows"]:
 
 def _name_by_labels(seen: Detections) -> Detections:
     """Scans with labels as identities, for comparison; unlabelled detections are omitted."""
-    message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
     chosen = seen.ids != NO_LABEL
-    _, first = np.unique(np.column_stack((message, seen.ids)), axis=0, return_index=True)
+    _, first = np.unique(np.column_stack((seen.message_of, seen.ids)), axis=0, return_index=True)
     once = np.zeros(len(chosen), np.bool_)
     once[first] = True
-    chosen &= once
-    counts = np.bincount(message[chosen], minlength=len(seen.stamps_ns))
-    return replace(
-        seen,
-        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        ids=seen.ids[chosen],
-        ranges=seen.ranges[chosen],
-        bearings=seen.bearings[chosen],
-        covariances=None if seen.covariances is None else seen.covariances[chosen],
-        hidden=None,
-        signatures=None,
-    )
+    return replace(seen.where(chosen & once), hidden=None, signatures=None)
 
 
 def _reference(root: Path) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:

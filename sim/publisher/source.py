@@ -6,7 +6,7 @@ from typing import TypedDict
 import numpy as np
 
 from teamslam.sim.world import streams as s
-from teamslam.sim.world.streams import RobotStream
+from teamslam.sim.world.streams import Detections, Intervals, RobotStream
 from teamslam.team.driver.source import FIRST_INCARNATION
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -56,8 +56,8 @@ class Source:
 
     def message(self, index: int) -> m.Measurement:
         """Measurement at `index` of the whole stream, numbered in this incarnation."""
-        stream, kind = self.stream, self.stream.kinds[index]
-        stamp_ns = int(stream.stamps_ns[index])
+        stream = self.stream
+        kind, row, stamp_ns = (int(a[index]) for a in (stream.kinds, stream.rows, stream.stamps_ns))
         name = Name(
             stamp_ns=stamp_ns - stream.clock_offset_ns if kind == s.ODOMETRY else stamp_ns,
             robot=stream.robot,
@@ -67,15 +67,21 @@ class Source:
         if index == self.base and self.incarnation > FIRST_INCARNATION:
             return _start(None, name | {"stamp_ns": stamp_ns})
         if kind == s.ODOMETRY:
-            return _odometry(stream.odometry(index), name)
+            return _odometry(stream.intervals, row, name)
         if kind == s.OBSERVATIONS:
-            return _observations(stream.observations(index), name)
+            return _observations(stream.landmark_detections, row, name)
         if kind == s.SIGHTINGS:
-            return _sightings(stream.sightings(index), name)
+            seen = stream.teammate_detections
+            at = seen.rows(row)
+            return m.Sightings(
+                **name,
+                teammates=tuple(stream.teammates[i] for i in seen.ids[at]),
+                ranges=from_floats(seen.ranges[at]),
+                bearings=from_floats(seen.bearings[at]),
+            )
         if kind == s.FIXES:
-            position, covariance = stream.fix(index)
-            stated = b"" if covariance is None else from_floats(covariance)
-            return m.Fix(**name, position=from_floats(position), covariance=stated)
+            position, covariance = np.split(stream.fixes[row], [2])
+            return m.Fix(**name, position=from_floats(position), covariance=_stated(covariance))
         return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
@@ -99,75 +105,56 @@ class Source:
         return [Outgoing(ch.TRUTH, stream.robot, truth)]
 
 
+def _stated(values: np.ndarray | None) -> bytes:
+    """Numbers of one message in the order of its rows; empty if absent or NaN."""
+    return b"" if values is None or np.isnan(values).any() else from_floats(values.ravel())
+
+
 def _start(start: s.StartPose | None, name: Name) -> m.InitialPose:
-    covariance = None if start is None else start.covariance
-    return m.InitialPose(
-        **name,
-        pose=b"" if start is None else from_floats(start.pose),
-        covariance=b"" if covariance is None else from_floats(covariance),
-    )
+    if start is None:
+        return m.InitialPose(**name, pose=b"", covariance=b"")
+    return m.InitialPose(**name, pose=from_floats(start.pose), covariance=_stated(start.covariance))
 
 
 def _observations(
-    z: s.ObservationMeasurement, name: Name
+    seen: Detections, message: int, name: Name
 ) -> m.Observations | m.Points | m.Detections:
     """A scan in its form: without identities, points, or ranges and bearings."""
-    covariances = b"" if z.covariances is None else from_floats(z.covariances)
-    if z.hidden:
+    at = seen.rows(message)
+    points, covariances, signatures, classes = (
+        _stated(None if values is None else values[at])
+        for values in (seen.points, seen.covariances, seen.signatures, seen.classes)
+    )
+    ranges, bearings = from_floats(seen.ranges[at]), from_floats(seen.bearings[at])
+    if seen.hidden is not None and seen.hidden[message]:
         return m.Detections(
             **name,
-            ranges=from_floats(z.ranges),
-            bearings=from_floats(z.bearings),
+            ranges=ranges,
+            bearings=bearings,
             covariances=covariances,
-            signatures=b"" if z.signatures is None else from_floats(z.signatures),
-            classes=b"" if z.classes is None else from_floats(z.classes.ravel()),
+            signatures=signatures,
+            classes=classes,
         )
-    if z.points is not None:
-        return m.Points(
-            **name,
-            ids=from_ids(z.ids),
-            positions=from_floats(z.points),
-            covariances=covariances,
-        )
+    ids = from_ids(seen.ids[at])
+    if seen.points is not None and (points or not ids):
+        return m.Points(**name, ids=ids, positions=points, covariances=covariances)
     return m.Observations(
-        **name,
-        ids=from_ids(z.ids),
-        ranges=from_floats(z.ranges),
-        bearings=from_floats(z.bearings),
-        covariances=covariances,
+        **name, ids=ids, ranges=ranges, bearings=bearings, covariances=covariances
     )
 
 
-def _sightings(t: s.SightingMeasurement, name: Name) -> m.Sightings:
-    return m.Sightings(
-        **name,
-        teammates=t.teammates,
-        ranges=from_floats(t.ranges),
-        bearings=from_floats(t.bearings),
-    )
-
-
-def _odometry(odometry: s.OdometryMeasurement, name: Name) -> m.AnyOdometry:
-    if odometry.increment is not None:
+def _odometry(intervals: Intervals, row: int, name: Name) -> m.AnyOdometry:
+    duration_ns = int(intervals.duration_ns[row])
+    if intervals.increments is not None and (increment := _stated(intervals.increments[row])):
+        claims = intervals.covariances
+        covariance = _stated(None if claims is None else claims[row])
         return m.Increment(
-            **name,
-            duration_ns=odometry.duration_ns,
-            increment=from_floats(odometry.increment),
-            covariance=b"" if odometry.covariance is None else from_floats(odometry.covariance),
+            **name, duration_ns=duration_ns, increment=increment, covariance=covariance
         )
-    if odometry.steered:
-        return m.Steering(
-            **name,
-            duration_ns=odometry.duration_ns,
-            wheel_speed=odometry.forward,
-            steering=odometry.yaw_rate,
-        )
-    return m.Odometry(
-        **name,
-        duration_ns=odometry.duration_ns,
-        forward=odometry.forward,
-        yaw_rate=odometry.yaw_rate,
-    )
+    speed, turn = float(intervals.forward[row]), float(intervals.yaw_rate[row])
+    if intervals.steered:
+        return m.Steering(**name, duration_ns=duration_ns, wheel_speed=speed, steering=turn)
+    return m.Odometry(**name, duration_ns=duration_ns, forward=speed, yaw_rate=turn)
 
 
 def for_the_evaluator(stream: RobotStream) -> list[Outgoing]:

@@ -3,13 +3,15 @@
 The stream keeps the true identities, unpublished, for the evaluation.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
+from teamslam.sim.world.streams import COLUMNS, NO_LABEL, Detections, RobotStream, WorldStreams
 from teamslam.team import core
-from teamslam.team.shapes import Bool, Float, Int64, UInt32
+from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,10 @@ def _hidden(
     stream: RobotStream, hiding: Hiding, tagged: UInt32[np.ndarray, " T"], rng: np.random.Generator
 ) -> RobotStream:
     seen = stream.landmark_detections
-    message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
     detected = rng.random(len(seen.ids)) >= hiding.missed
     named = np.isin(seen.ids, tagged)
-    parts = [_rows(seen, message, detected & named, hidden=False)] if len(tagged) else []
-    untagged = _rows(seen, message, detected & ~named, hidden=True)
+    parts = [_mark(seen.where(detected & named), hidden=False)] if len(tagged) else []
+    untagged = _mark(seen.where(detected & ~named), hidden=True)
     if hiding.clutter:
         untagged = _add_clutter(untagged, hiding, rng)
     both = in_order([*parts, untagged])
@@ -56,41 +57,20 @@ def _hidden(
     return replace(stream, landmark_detections=both)
 
 
-def _rows(
-    seen: Detections,
-    message: Int64[np.ndarray, " R"],
-    chosen: Bool[np.ndarray, " R"],
-    *,
-    hidden: bool,
-) -> Detections:
-    count = len(seen.stamps_ns)
-    offsets = np.concatenate(([0], np.cumsum(np.bincount(message[chosen], minlength=count))))
-    was = seen.hidden
-    return Detections(
-        stamps_ns=seen.stamps_ns,
-        offsets=offsets.astype(np.int64),
-        ids=seen.ids[chosen],
-        ranges=seen.ranges[chosen],
-        bearings=seen.bearings[chosen],
-        points=None if seen.points is None or hidden else seen.points[chosen],
-        covariances=_covariances(seen, chosen, hidden=hidden),
-        hidden=np.full(count, hidden) if was is None else was | hidden,
-        signatures=None if seen.signatures is None else seen.signatures[chosen],
-        classes=None if seen.classes is None else seen.classes[chosen],
-    )
+def _mark(seen: Detections, *, hidden: bool) -> Detections:
+    """Mark the messages as published without identities, which have no points."""
+    marks = np.full(len(seen.stamps_ns), hidden)
+    seen = replace(seen, hidden=marks if seen.hidden is None else seen.hidden | hidden)
+    return replace(seen, points=None, covariances=_polar_covariances(seen)) if hidden else seen
 
 
-def _covariances(
-    seen: Detections, chosen: Bool[np.ndarray, " R"], *, hidden: bool
-) -> Float[np.ndarray, "chosen 3"] | None:
-    """Covariances of the chosen rows; hidden points are converted to range and bearing."""
-    if seen.covariances is None:
-        return None
-    covariances: Float[np.ndarray, "chosen 3"] = seen.covariances[chosen]
-    if hidden and seen.points is not None:
-        points = seen.points[chosen]
-        rows = ~np.isnan(points[:, 0])
-        covariances[rows] = _of_ranges(points[rows], covariances[rows])
+def _polar_covariances(seen: Detections) -> Float[np.ndarray, "R 3"] | None:
+    """Covariances of ranges and bearings, also where points were measured."""
+    if seen.covariances is None or seen.points is None:
+        return seen.covariances
+    covariances = seen.covariances.copy()
+    rows = ~np.isnan(seen.points[:, 0])
+    covariances[rows] = _of_ranges(seen.points[rows], covariances[rows])
     return covariances
 
 
@@ -137,44 +117,33 @@ def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> 
     )
 
 
-def in_order(parts: list[Detections]) -> Detections:
+def in_order(parts: Sequence[Detections]) -> Detections:
     """Merge messages by time; at equal times those with identities first.
 
     Columns of only some parts, such as points or covariances, are NaN elsewhere.
     """
     if len(parts) == 1:
         return parts[0]
+    parts = [part for part in parts if len(part.ids)] or parts[:1]
+    counts = np.concatenate([np.diff(part.offsets) for part in parts])
     stamps = np.concatenate([part.stamps_ns for part in parts])
-    order = np.argsort(stamps, kind="stable")
-    pieces = [part.only(i, i + 1) for part in parts for i in range(len(part.stamps_ns))]
-    chosen = [pieces[i] for i in order if len(pieces[i].ids)]
-    counts = [len(piece.ids) for piece in chosen]
-    width = max((p.classes.shape[1] for p in chosen if p.classes is not None), default=0)
-
-    def joined(values: list[Float[np.ndarray, "..."]]) -> Float[np.ndarray, "..."]:
-        return np.concatenate(values)
-
-    def optional(name: str, width: int) -> Float[np.ndarray, "..."] | None:
-        values = [getattr(piece, name) for piece in chosen]
-        if all(value is None for value in values):
-            return None
-        shapes = [(count, width) if width > 1 else (count,) for count in counts]
-        return joined(
-            [
-                np.full(shape, np.nan) if value is None else value
-                for value, shape in zip(values, shapes, strict=True)
-            ]
-        )
-
-    return Detections(
-        stamps_ns=np.concatenate([piece.stamps_ns for piece in chosen]),
-        offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-        ids=np.concatenate([piece.ids for piece in chosen]),
-        ranges=joined([piece.ranges for piece in chosen]),
-        bearings=joined([piece.bearings for piece in chosen]),
-        points=optional("points", 2),
-        covariances=optional("covariances", 3),
-        hidden=np.concatenate([piece.hidden for piece in chosen if piece.hidden is not None]),
-        signatures=optional("signatures", 1),
-        classes=optional("classes", width),
+    whole = Detections(
+        stamps_ns=stamps,
+        offsets=np.concatenate(([0], np.cumsum(counts))),
+        hidden=np.concatenate([part.hidden for part in parts if part.hidden is not None]),
+        **{name: _column(parts, name) for name in COLUMNS},
     )
+    order = np.argsort(stamps, kind="stable")
+    return whole.take(order[counts[order] > 0])
+
+
+def _column(parts: Sequence[Detections], name: str) -> Any:
+    """Values of all parts: NaN in those without the column, None if no part has it."""
+    values = [getattr(part, name) for part in parts]
+    given = [each for each in values if each is not None]
+    if not given:
+        return None
+    return np.concatenate([
+        np.full((len(part.ids), *given[0].shape[1:]), np.nan) if each is None else each
+        for part, each in zip(parts, values, strict=True)
+    ])  # fmt: skip

@@ -4,6 +4,8 @@ All kinds use the same draws, so runs of different kinds, including dropped outl
 comparable.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from teamslam.sim.world.config import OutlierKind
@@ -28,28 +30,17 @@ def spoilt(
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":
-        offsets_before = np.concatenate(([0], np.cumsum(~chosen)))
-        return Detections(
-            seen.stamps_ns,
-            offsets_before[seen.offsets],
-            seen.ids[~chosen],
-            seen.ranges[~chosen],
-            seen.bearings[~chosen],
-        )
+        return seen.where(~chosen)
     if kind == "identity":
-        ids = np.where(chosen, _others(seen.ids, landmarks, uniforms[:, 1]), seen.ids)
-        return Detections(
-            seen.stamps_ns, seen.offsets, ids.astype(np.uint32), seen.ranges, seen.bearings
-        )
+        others = _others(seen.ids, landmarks, uniforms[:, 1])
+        return replace(seen, ids=np.where(chosen, others, seen.ids))
     nearest, farthest = span
     ranges = nearest + (farthest - nearest) * uniforms[:, 1]
     bearings = field_of_view * (0.5 - uniforms[:, 2])
-    return Detections(
-        seen.stamps_ns,
-        seen.offsets,
-        seen.ids,
-        np.where(chosen, ranges, seen.ranges),
-        np.where(chosen, bearings, seen.bearings),
+    return replace(
+        seen,
+        ranges=np.where(chosen, ranges, seen.ranges),
+        bearings=np.where(chosen, bearings, seen.bearings),
     )
 
 

@@ -7,7 +7,6 @@ radians, bearings in (−π, π].
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +19,6 @@ FIXES = 3
 ODOMETRY = 4
 NO_LABEL = 2**32 - 1
 """Identity of clutter, or of an unknown landmark."""
-
-KIND_NAMES = ("start pose", "observations", "sightings", "fixes", "odometry")
 
 
 @dataclass(frozen=True)
@@ -77,6 +74,10 @@ class Intervals:
         )
 
 
+COLUMNS = ("ids", "ranges", "bearings", "points", "covariances", "signatures", "classes")
+"""Fields of `Detections` that have a value for each row."""
+
+
 @dataclass(frozen=True)
 class Detections:
     """M range-bearing messages: message m has the rows offsets[m] … offsets[m + 1].
@@ -104,6 +105,11 @@ class Detections:
         """Rows of one message."""
         return slice(int(self.offsets[message]), int(self.offsets[message + 1]))
 
+    @property
+    def message_of(self) -> Int64[np.ndarray, " R"]:
+        """Message of each row."""
+        return np.repeat(np.arange(len(self.stamps_ns)), np.diff(self.offsets))
+
     def within(self, first_ns: int, last_ns: int) -> "Detections":
         """Messages stamped first_ns … last_ns."""
         first, last = np.searchsorted(self.stamps_ns, [first_ns, last_ns + 1])
@@ -111,57 +117,39 @@ class Detections:
 
     def only(self, first: int, last: int) -> "Detections":
         """Messages first … last − 1."""
-        rows = slice(int(self.offsets[first]), int(self.offsets[last]))
-        return Detections(
-            stamps_ns=self.stamps_ns[first:last],
-            offsets=self.offsets[first : last + 1] - self.offsets[first],
-            ids=self.ids[rows],
-            ranges=self.ranges[rows],
-            bearings=self.bearings[rows],
-            points=None if self.points is None else self.points[rows],
-            covariances=None if self.covariances is None else self.covariances[rows],
-            hidden=None if self.hidden is None else self.hidden[first:last],
-            signatures=None if self.signatures is None else self.signatures[rows],
-            classes=None if self.classes is None else self.classes[rows],
+        offsets = self.offsets[first : last + 1] - self.offsets[first]
+        return self._select(
+            slice(first, last), offsets, slice(int(self.offsets[first]), int(self.offsets[last]))
         )
 
+    def where(self, rows: Bool[np.ndarray, " R"]) -> "Detections":
+        """Chosen rows; messages stay, with or without rows."""
+        kept = np.concatenate(([0], np.cumsum(rows)))
+        return self._select(slice(None), kept[self.offsets], rows)
 
-class OdometryMeasurement(NamedTuple):
-    """Interval that ends at stamp_ns; otherwise as in `Intervals`."""
+    def take(self, messages: Int64[np.ndarray, " N"]) -> "Detections":
+        """These messages, in this order."""
+        counts = np.diff(self.offsets)[messages]
+        first = np.repeat(self.offsets[messages] - np.cumsum(counts) + counts, counts)
+        offsets = np.concatenate(([0], np.cumsum(counts)))
+        return self._select(messages, offsets, first + np.arange(int(counts.sum())))
 
-    stamp_ns: int
-    duration_ns: int
-    forward: float
-    yaw_rate: float
-    steered: bool = False
-    increment: Float[np.ndarray, "3"] | None = None
-    covariance: Float[np.ndarray, "3 3"] | None = None
-
-
-class ObservationMeasurement(NamedTuple):
-    """Landmarks seen at stamp_ns: ids, ranges [m], bearings [rad]; may be empty.
-
-    points, covariances, signatures, classes: as in `Detections`. hidden: published without ids.
-    """
-
-    stamp_ns: int
-    ids: UInt32[np.ndarray, " R"]
-    ranges: Float[np.ndarray, " R"]
-    bearings: Float[np.ndarray, " R"]
-    points: Float[np.ndarray, "R 2"] | None = None
-    covariances: Float[np.ndarray, "R 3"] | None = None
-    hidden: bool = False
-    signatures: Float[np.ndarray, " R"] | None = None
-    classes: Float[np.ndarray, "R C"] | None = None
-
-
-class SightingMeasurement(NamedTuple):
-    """Teammates seen at stamp_ns: names, ranges [m], bearings [rad]."""
-
-    stamp_ns: int
-    teammates: tuple[str, ...]
-    ranges: Float[np.ndarray, " R"]
-    bearings: Float[np.ndarray, " R"]
+    def _select(
+        self,
+        messages: slice | np.ndarray,
+        offsets: Int64[np.ndarray, " N_plus_1"],
+        rows: slice | np.ndarray,
+    ) -> "Detections":
+        columns = {
+            name: values[rows] for name in COLUMNS if (values := getattr(self, name)) is not None
+        }
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[messages],
+            offsets=offsets.astype(np.int64),
+            hidden=None if self.hidden is None else self.hidden[messages],
+            **columns,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,71 +237,6 @@ class RobotStream:
             truth_ns=truth_ns,
             truth=truth,
         )
-
-    def odometry(self, counter: int) -> OdometryMeasurement:
-        """Odometry interval of this counter."""
-        row = self._row(counter, ODOMETRY)
-        intervals = self.intervals
-        increment = _known(intervals.increments, row)
-        return OdometryMeasurement(
-            int(intervals.end_ns[row]),
-            int(intervals.duration_ns[row]),
-            float(intervals.forward[row]),
-            float(intervals.yaw_rate[row]),
-            intervals.steered and increment is None,
-            increment,
-            _known(intervals.covariances, row),
-        )
-
-    def observations(self, counter: int) -> ObservationMeasurement:
-        """Landmark message of this counter."""
-        seen = self.landmark_detections
-        row = self._row(counter, OBSERVATIONS)
-        at = seen.rows(row)
-        return ObservationMeasurement(
-            stamp_ns=int(self.stamps_ns[counter]),
-            ids=seen.ids[at],
-            ranges=seen.ranges[at],
-            bearings=seen.bearings[at],
-            points=_alike(seen.points, at),
-            covariances=_alike(seen.covariances, at),
-            hidden=seen.hidden is not None and bool(seen.hidden[row]),
-            signatures=_alike(seen.signatures, at),
-            classes=_alike(seen.classes, at),
-        )
-
-    def sightings(self, counter: int) -> SightingMeasurement:
-        """Teammate message of this counter."""
-        seen = self.teammate_detections
-        at = seen.rows(self._row(counter, SIGHTINGS))
-        names = tuple(self.teammates[i] for i in seen.ids[at])
-        stamp_ns = int(self.stamps_ns[counter])
-        return SightingMeasurement(stamp_ns, names, seen.ranges[at], seen.bearings[at])
-
-    def fix(self, counter: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "3"] | None]:
-        """Position of this counter, and its covariance if stated."""
-        row = self._row(counter, FIXES)
-        covariance = self.fixes[row, 2:]
-        return self.fixes[row, :2], None if np.isnan(covariance).any() else covariance
-
-    def _row(self, counter: int, kind: int) -> int:
-        found = int(self.kinds[counter])
-        if found != kind:
-            raise LookupError(
-                f"measurement {counter} of {self.robot}: {KIND_NAMES[found]}, not "
-                f"{KIND_NAMES[kind]}"
-            )
-        return int(self.rows[counter])
-
-
-def _known(values: np.ndarray | None, row: int) -> np.ndarray | None:
-    """Row of the array; None if missing or NaN."""
-    return None if values is None or np.isnan(values[row].flat[0]) else values[row]
-
-
-def _alike(values: np.ndarray | None, rows: slice) -> np.ndarray | None:
-    """Rows of one message; None if missing or NaN."""
-    return None if values is None or np.isnan(values[rows]).any() else values[rows]
 
 
 @dataclass(frozen=True)

@@ -114,16 +114,17 @@ class _AtTruth:
 
     def drive(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
         """(x, y, θ) → (x + d cos(θ + φ), y + d sin(θ + φ), θ + φ), with errors of d and φ."""
-        o = stream.odometry(counter)
-        after, before = _true(stream, o.stamp_ns), _true(stream, o.stamp_ns - o.duration_ns)
-        seconds = o.duration_ns * 1e-9
+        driven, k = stream.intervals, int(stream.rows[counter])
+        end_ns, duration_ns = int(driven.end_ns[k]), int(driven.duration_ns[k])
+        after, before = _true(stream, end_ns), _true(stream, end_ns - duration_ns)
+        seconds = duration_ns * 1e-9
         way = after[:2] - before[:2]
         heading = before[2] + _around(after[2] - before[2])
         distance = float(way @ [np.cos(heading), np.sin(heading)])
         noise = np.array(
             [
-                o.forward * seconds - distance,
-                _around(o.yaw_rate * seconds - (after[2] - before[2])),
+                float(driven.forward[k]) * seconds - distance,
+                _around(float(driven.yaw_rate[k]) * seconds - (after[2] - before[2])),
             ]
         )
         F, G = np.eye(3), np.zeros((3, 2))
@@ -139,10 +140,12 @@ class _AtTruth:
 
     def look(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
         """Ranges and bearings of landmarks, from where the robot truly is."""
-        scan = stream.observations(counter)
-        pose = _true(stream, scan.stamp_ns)
+        seen = stream.landmark_detections
+        at = seen.rows(int(stream.rows[counter]))
+        scan = seen.ids[at], seen.ranges[at], seen.bearings[at]
+        pose = _true(stream, int(stream.stamps_ns[counter]))
         R = np.array([config.sensor.range_sigma**2, config.sensor.bearing_sigma**2])
-        for id_, measured, bearing in zip(scan.ids, scan.ranges, scan.bearings, strict=True):
+        for id_, measured, bearing in zip(*scan, strict=True):
             place = self._place[int(id_)]
             dx, dy = self._landmarks[place] - pose[:2]
             r = float(np.hypot(dx, dy))

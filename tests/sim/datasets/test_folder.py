@@ -14,12 +14,14 @@ from teamslam.sim.datasets.folder_writer import seconds, write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.config import FolderWorld
 from teamslam.sim.world.streams import FIXES as FIXES_KIND
 from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
 from teamslam.team.config import RobotConfig
+from teamslam.team.wire.arrays import floats
 from tests import teams
 
 HOUR = "1248272272.841"
@@ -264,7 +266,7 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path):
     (tmp_path / "r2").mkdir()
     (tmp_path / "r2" / "odometry.csv").write_text(SPEEDS)
     stream = read(tmp_path, "r1", "r2").streams[0]
-    assert stream.sightings(1).teammates == ("r2",)
+    assert Source(stream).message(1).teammates == ("r2",)
     assert [note.partition(" (")[0] for note in stream.notes[1:3]] == [
         "1 sighting dropped: of itself",
         "1 sighting dropped: of a robot that is not in the team",
@@ -341,9 +343,9 @@ def test_fixes_are_read_within_the_odometry_and_keep_their_bits(tmp_path):
     assert stream.fixes_ns.tolist() == [1 * 10**9, 2 * 10**9, 3 * 10**9]
     assert stream.fixes[:, :2].tolist() == [[1.5, -2.0], [0.1, 7.0], [5.0, 6.0]]
     numbers = np.flatnonzero(stream.kinds == FIXES_KIND).tolist()
-    stated = [stream.fix(number)[1] for number in numbers]
-    assert stated[0].tolist() == [4.0, 0.5, 3.0]
-    assert stated[1:] == [None, None]
+    stated = [Source(stream).message(number).covariance for number in numbers]
+    assert floats(stated[0], "").tolist() == [4.0, 0.5, 3.0]
+    assert stated[1:] == [b"", b""]
     assert [note for note in stream.notes if "fixes.csv" in note and "position" in note] == [
         "1 position earlier than the row before: sorted by time (r1/fixes.csv, at line 4)",
         "1 position dropped: before its first odometry (r1/fixes.csv, at line 4)",

@@ -15,6 +15,7 @@ from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.importing.columns import propose_map
+from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.streams import WorldStreams
@@ -81,9 +82,8 @@ def test_robots_are_the_namespaces_and_see_each_other_by_their_tags(tmp_path):
     ann, bob = read(tmp_path / "set").streams
     assert (ann.robot, bob.robot) == ("ann", "bob")
     assert ann.intervals.forward.tolist() == [1.0, 1.0]
-    assert [ann.sightings(k).teammates for k in np.flatnonzero(ann.kinds == 2).tolist()] == [
-        ("bob",)
-    ] * 2
+    met = [Source(ann).message(k) for k in np.flatnonzero(ann.kinds == 2).tolist()]
+    assert [each.teammates for each in met] == [("bob",)] * 2
     assert run(bag, "-o", tmp_path / "own").exit_code == 0
     assert [each.robot for each in read(tmp_path / "own").streams] == ["ann", "bob"]
 

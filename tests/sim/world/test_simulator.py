@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 
+from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.paths import Limits, driven, followed, moved, wrapped
@@ -22,6 +23,8 @@ from teamslam.sim.world.streams import (
     grouped,
 )
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
 
 angles = st.floats(-np.pi, np.pi)
 
@@ -63,22 +66,20 @@ def test_measurements_are_numbered_by_time_with_what_was_seen_before_the_interva
     assert np.count_nonzero(stream.kinds == OBSERVATIONS) == 500, "empty messages too"
 
 
-def test_accessors_give_the_measurement_of_a_counter():
+def test_a_source_makes_the_message_of_a_counter():
     stream = world_of(load("thesis")).streams[0]
-    odometry = np.flatnonzero(stream.kinds == ODOMETRY).tolist()
-    measurements = [stream.odometry(i) for i in odometry]
-    assert [r.stamp_ns for r in measurements] == [10**9 * k for k in range(1, 501)]
-    assert {r.duration_ns for r in measurements} == {10**9}
-    assert measurements[6].forward == stream.intervals.forward[6]
-    seen = [stream.observations(i) for i in np.flatnonzero(stream.kinds == OBSERVATIONS).tolist()]
-    assert np.array_equal(
-        np.concatenate([r.bearings for r in seen]), stream.landmark_detections.bearings
-    )
-    met = stream.sightings(int(np.flatnonzero(stream.kinds == SIGHTINGS)[0]))
+    source = Source(stream)
+    messages = [source.message(i) for i in range(len(stream))]
+    odometry = [each for each in messages if isinstance(each, m.Odometry)]
+    assert [each.stamp_ns for each in odometry] == [10**9 * k for k in range(1, 501)]
+    assert {each.duration_ns for each in odometry} == {10**9}
+    assert odometry[6].forward == stream.intervals.forward[6]
+    seen = [floats(each.bearings, "") for each in messages if isinstance(each, m.Observations)]
+    assert np.array_equal(np.concatenate(seen), stream.landmark_detections.bearings)
+    met = next(each for each in messages if isinstance(each, m.Sightings))
     assert met.teammates == ("r2",)
-    assert 3.0 - 8.0 < met.ranges[0] < 20.0 + 8.0
-    with pytest.raises(LookupError, match="measurement 0 of r1: start pose, not odometry"):
-        stream.odometry(0)
+    assert 3.0 - 8.0 < floats(met.ranges, "")[0] < 20.0 + 8.0
+    assert isinstance(messages[0], m.InitialPose)
 
 
 def test_the_teams_order_is_by_stamp_and_keeps_each_robots_order():
