@@ -67,8 +67,8 @@ def test_calibration_takes_a_set_without_names_and_hears_no_label(steps):
     world, scenario = measurements_of(steps)
     (stream,) = world.streams
     assert scenario.name == "dlr"
-    seen = stream.observations(int(np.flatnonzero(stream.kinds == OBSERVATIONS)[0]))
-    assert 3 in seen.ids
+    seen = stream.landmark_detections
+    assert 3 in seen.ids[seen.rows(0)]
     received = next(each for each in messages_of(stream) if isinstance(each, m.Detections))
     assert translate.scan_of(received).ids.tolist() == [UNNAMED, UNNAMED + 1]
 
@@ -77,13 +77,13 @@ def test_a_set_in_steps_keeps_every_number(steps):
     (stream,) = streams(steps).streams
     assert kind_of(steps) == "unlabelled"
     assert scenario_beside(steps) == "dlr"
-    odometry = stream.odometry(int(np.flatnonzero(stream.kinds == ODOMETRY)[3]))
-    assert odometry.increment.tolist() == [0.5, 0.0, 0.1]
+    odometry = stream.intervals
+    assert odometry.increments[3].tolist() == [0.5, 0.0, 0.1]
     c, s = np.cos(0.1), np.sin(0.1)
     turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    assert np.allclose(odometry.covariance, turned @ np.diag([1e-4, 2e-4, 3e-4]) @ turned.T)
-    scan = stream.observations(int(np.flatnonzero(stream.kinds == OBSERVATIONS)[5]))
-    assert scan.hidden
+    assert np.allclose(odometry.covariances[3], turned @ np.diag([1e-4, 2e-4, 3e-4]) @ turned.T)
+    scan = stream.landmark_detections.only(5, 6)
+    assert scan.hidden.all()
     assert scan.ids.tolist() == [NO_LABEL, 3]
     assert np.allclose(scan.ranges * np.cos(scan.bearings), 2.0)
     assert np.allclose(scan.ranges * np.sin(scan.bearings), [0.0, 0.5])
@@ -95,9 +95,10 @@ def test_a_car_keeps_its_steering_and_gps_and_what_nobody_has_labelled(car):
     (stream,) = found.streams
     assert scenario_beside(car) == "victoria"
     assert found.landmarks is None
-    first = stream.odometry(int(np.flatnonzero(stream.kinds == ODOMETRY)[0]))
-    assert first.steered
-    assert (first.forward, first.yaw_rate, first.duration_ns) == (1.0, 0.1, 50_000_000)
+    driven = stream.intervals
+    assert driven.steered
+    first = driven.forward[0], driven.yaw_rate[0], driven.duration_ns[0]
+    assert first == (1.0, 0.1, 50_000_000)
     assert set(stream.landmark_detections.ids.tolist()) == {NO_LABEL}
     assert stream.landmark_detections.signatures.tolist() == [0.3] * 7
     assert stream.positions.tolist() == [[1.0, 2.0], [4.0, 5.0]]
