@@ -20,38 +20,17 @@ from teamslam.team.config import AssociationSettings, MotionModel, Sensor
 Fields = dict[str, Any]
 
 
-def scenario_toml(calibration: Calibration, scenario: Scenario, sources: Sequence[str]) -> str:
-    """TOML document whose `base` is the built-in scenario's name, or the data set's."""
-    world = scenario.world
-    otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
-    base = scenario.name if scenario.name in builtin_names() else otherwise
-    lines = [*_head(calibration, sources), f'base = "{base}"']
-    if isinstance(world, LiveWorld):
-        lines += [f'name = "{scenario.name}"', f'team = "{scenario.team}"']
-        lines += ["", "[world]", 'kind = "live"', *(["admit = true"] if world.admit else [])]
-    for name, figures, declared in _parts(calibration):
-        if figures:
-            lines += ["", f"[{name}]", *_table(figures, declared)]
-    differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
-    by_robot = calibration.robots or calibration.clocks or (calibration.by_truth and differ)
-    for robot in scenario.robots if by_robot or isinstance(world, LiveWorld) else ():
-        fields = nest_figures({}, calibration.robots.get(robot.id, ()), Sensor)
-        own = [f"sensor = {_inline(fields)}"] if fields else []
-        clock = calibration.clocks.get(robot.id)
-        if clock is not None:
-            own.append(f"clock_offset_s = {clock.value:.5g}  # {_uncertainty(clock)}")
-        lines += ["", "[[robots]]", f'id = "{robot.id}"', *own]
-    return "\n".join(lines) + "\n"
-
-
-def within(own: str, calibration: Calibration, sources: Sequence[str], output: Path) -> str:
-    """Text of `output`: the user's scenario `own` with the calibrated figures.
+def scenario_text(
+    calibration: Calibration, start: Scenario, own: str | None, sources: Sequence[str], output: Path
+) -> str:
+    """Text of `output`: the user's scenario `own` with the calibrated figures; without one, a
+    scenario on a built-in base.
 
     Common figures replace all robots' values, except figures of single robots. Other fields stay. A
     scenario must name all robots or none, so all are named if it names none and a robot has figures
     of its own.
     """
-    document = own_document(own)
+    document = _document_of(start, calibration) if own is None else own_document(own)
     world = document.get("world", {})
     if world.get("path"):
         world["path"] = os.path.relpath(world["path"], output.parent)
@@ -87,6 +66,26 @@ def within(own: str, calibration: Calibration, sources: Sequence[str], output: P
     return "\n".join([*_head(calibration, sources), *comments, "", tomli_w.dumps(document)])
 
 
+def _document_of(scenario: Scenario, calibration: Calibration) -> Fields:
+    """Document whose `base` is the built-in scenario's name, or the data set's.
+
+    It names the robots of a live team, robots with figures of their own, and robots whose own
+    sensors in the base the calibration replaces.
+    """
+    world = scenario.world
+    otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
+    base = scenario.name if scenario.name in builtin_names() else otherwise
+    document: Fields = {"base": base}
+    if isinstance(world, LiveWorld):
+        document |= {"name": scenario.name, "team": scenario.team}
+        document["world"] = {"kind": "live"} | ({"admit": True} if world.admit else {})
+    differ = len({msgspec.json.encode(robot.sensor) for robot in scenario.robots}) > 1
+    own = calibration.robots or calibration.clocks or (calibration.by_truth and differ)
+    if own or isinstance(world, LiveWorld):
+        document["robots"] = [{"id": robot.id} for robot in scenario.robots]
+    return document
+
+
 def _round_figure(figure: Figure) -> Figure:
     return replace(figure, value=float(f"{figure.value:.5g}"))
 
@@ -120,33 +119,6 @@ def _parts(
         ("defaults.front_end.association", calibration.detections, AssociationSettings),
         ("central", calibration.central, CentralConfig),
     )
-
-
-def _inline(value: object) -> str:
-    """Number, or table of numbers and tables, on one line."""
-    if not isinstance(value, dict):
-        return f"{value:.5g}"
-    return "{ " + ", ".join(f"{key} = {_inline(each)}" for key, each in value.items()) + " }"
-
-
-def _table(figures: Sequence[Figure], declared: type[msgspec.Struct]) -> list[str]:
-    fields = nest_figures({}, figures, declared)
-    lines = []
-    for figure in figures:
-        if figure.name in fields:
-            lines.append(f"{figure.name} = {figure.value:.5g}  # {_uncertainty(figure)}")
-        elif "." not in figure.name:
-            lines.append(f"# {figure.name}: {figure.value:.5g} {_uncertainty(figure)}")
-    for name, value in fields.items():
-        if isinstance(value, dict):
-            inner = ", ".join(f"{key} = {number:.5g}" for key, number in value.items())
-            marks = [
-                f"{f.name.partition('.')[2]} {_uncertainty(f)}"
-                for f in figures
-                if f.name.startswith(f"{name}.")
-            ]
-            lines.append(f"{name} = {{ {inner} }}  # {', '.join(marks)}")
-    return lines
 
 
 def _uncertainty(figure: Figure) -> str:

@@ -45,7 +45,7 @@ def calibrate(
 
     from teamslam.sim.calibration.calibrate import calibrate_models
     from teamslam.sim.calibration.figures import CalibrationError
-    from teamslam.sim.calibration.scenario import scenario_toml, within
+    from teamslam.sim.calibration.scenario import scenario_text
     from teamslam.sim.calibration.source import measurements_of, own_scenario
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.cli.options import scenario_of, warn_of_holes
@@ -90,7 +90,7 @@ def calibrate(
     write_json(json_file, asdict(found))
     if output is not None:
         names = [name for name, _, _ in read]
-        text = within(own, found, names, output) if own else scenario_toml(found, start, names)
+        text = scenario_text(found, start, own, names, output)
         if output.exists():
             set_aside(output)
         output.write_text(text, "utf-8")

@@ -24,7 +24,7 @@ from teamslam.sim.calibration.figures import (
 from teamslam.sim.calibration.join import joined_team
 from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
 from teamslam.sim.calibration.motion import creep, fit_motion
-from teamslam.sim.calibration.scenario import scenario_toml, within
+from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
 from teamslam.sim.cli.main import app
@@ -271,13 +271,13 @@ def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path)
     )
     found = Calibration(motion, sensor, True, ("a note",), central, detections=detections)
     place = tmp_path / "mine.toml"
-    text = scenario_toml(found, load("utias"), ["set.zip"])
+    text = scenario_text(found, load("utias"), None, ["set.zip"], place)
     place.write_text(text, "utf-8")
     for said in (
-        "± 0.002 rad/√m",
-        "range_correlation_s = 7  # ± 1 s",
-        "# bearing_outliers: 0.017 ±",
-        "# clutter_share: 0 ±",
+        "# defaults.motion.turn.per_m: 0.07 ± 0.002 rad/√m",
+        "# defaults.sensor.range_correlation_s: 7 ± 1 s",
+        "# defaults.sensor.bearing_outliers: 0.017 ±",
+        "# defaults.front_end.association.clutter_share: 0 ±",
     ):
         assert said in text
     written, before = load(place), load("utias")
@@ -322,7 +322,7 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
     found = Calibration(
         (Figure("forward_scale", 1.1, 0.01, ""),), of_sensor, True, (), (), of_robots
     )
-    elsewhere.write_text(within(str(own), found, ["set"], elsewhere), "utf-8")
+    elsewhere.write_text(scenario_text(found, load(own), str(own), ["set"], elsewhere), "utf-8")
     before, learnt = load(own), load(elsewhere)
     assert File(learnt.world.path).resolve() == File(before.world.path).resolve()
     assert learnt.exchange == "continuous"

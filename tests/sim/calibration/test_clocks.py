@@ -11,7 +11,7 @@ from teamslam.sim.calibration import calibrate
 from teamslam.sim.calibration.calibrate import Calibration, against_truth, calibrate_models
 from teamslam.sim.calibration.clocks import Clock, clocks_of, on_one_clock
 from teamslam.sim.calibration.figures import Figure
-from teamslam.sim.calibration.scenario import scenario_toml, within
+from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -65,7 +65,8 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     assert not [note for note in found.notes if "sensor.mount" in note]
     assert [note for note in found.notes if note.startswith("r2: its detections are stamped")]
     learnt = places[1] / "learnt.toml"
-    learnt.write_text(within(str(places[1] / "scenario.toml"), found, ["late"], learnt))
+    own = str(places[1] / "scenario.toml")
+    learnt.write_text(scenario_text(found, late, own, ["late"], learnt))
     after = with_options(load(str(learnt)), dataset=places[1])
     assert [robot.clock_offset_s for robot in after.robots] == [
         0.0,
@@ -79,7 +80,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     on_time = msgspec.structs.replace(late, robots=tuple(robots))
     # Self-calibration in the joined map corrects most of the late map's error by itself.
     assert map_error(on_time) < 1.1 * map_error(right) < 0.5 * map_error(late)
-    assert "clock_offset_s" in scenario_toml(found, late, ["late"])
+    assert "clock_offset_s" in scenario_text(found, late, None, ["late"], learnt)
 
 
 def test_clocks_that_are_right_are_left_alone(places):
@@ -100,7 +101,7 @@ def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path):
     late = Figure("clock_offset_s", 0.5, 0.01, "s")
     found = Calibration((), (), True, (), clocks={"r2": late}, team=("r1", "r2", "r3"))
     learnt = tmp_path / "learnt.toml"
-    learnt.write_text(within(str(own), found, ["set"], learnt))
+    learnt.write_text(scenario_text(found, load(str(own)), str(own), ["set"], learnt))
     clocks = {robot.id: robot.clock_offset_s for robot in load(str(learnt)).robots}
     assert clocks == {"r1": 0.0, "r2": 0.5, "r3": 0.0}
 
