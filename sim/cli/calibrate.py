@@ -7,7 +7,15 @@ from typing import Annotated
 import typer
 
 from teamslam.sim.cli.help import Command
-from teamslam.sim.cli.options import FAILED, WRONG_USE, JsonFile, fail, set_aside, write_json
+from teamslam.sim.cli.options import (
+    FAILED,
+    WRONG_USE,
+    JsonFile,
+    fail,
+    failing,
+    set_aside,
+    write_json,
+)
 from teamslam.team.extras import install_command
 
 app = typer.Typer()
@@ -67,10 +75,8 @@ def calibrate(
             read.append((path.name, *measurements_of(found_at)))
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
-    try:
+    with failing(FAILED, CalibrationError):
         found = calibrate_models(worlds, start, lambda text: typer.echo(text, err=True))
-    except CalibrationError as error:
-        fail(str(error), FAILED)
     table = Table("part", "figure", "value", "± (1 σ)", "unit")
     parts = (
         ("motion", found.motion),

@@ -17,6 +17,7 @@ from teamslam.sim.cli.options import (
     Connect,
     Keys,
     fail,
+    failing,
     over_tls,
     parsed_start,
 )
@@ -113,10 +114,8 @@ def driver(
     logging.captureWarnings(True)
     # A detector lists its tags in any order; measurements stay with their names.
     warnings.filterwarnings("ignore", message=".*ids are not ascending", category=DriverWarning)
-    try:
+    with failing(WRONG_USE, TopicsError):
         topics = load_topics(ros2)
-    except TopicsError as error:
-        fail(str(error), WRONG_USE)
     if robot not in topics.robots:
         fail(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}", WRONG_USE)
     live = None
@@ -124,57 +123,54 @@ def driver(
         live = LiveAnswers(robot, topics.robots[robot], has_tf=answers is Back.ALL)
     pose = () if start is None else parsed_start(start)[1]
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
-    try:
-        with (
-            process(f"driver-{robot}", endless=True, patient=True) as stop,
-            Driver(
-                robot,
-                team=team,
-                connect=connect if keys is None else over_tls(connect),
-                keys=keys,
-                file=file,
-                start=pose[:3] or None,
-                start_covariance=None if variances is None else np.diag(variances),
-                latency_s=latency,
-                on_message=None if live is None else live.add_message,
-            ) as source,
-        ):
-            translated = Ros2Driver(
-                source, topics.robots[robot], topics.domain, name=robot, others=topics.robots,
-                on_odometry=None if live is None else live.add_odometry,
-            )  # fmt: skip
-            with ForeignKeys(
-                ros2_connect or connect,
-                translated.keys,
-                translated.tokens,
-                latched=translated.latched,
-            ) as foreign:
-                _LOG.info("listening to %s", ", ".join((*translated.keys, *translated.latched)))
-                publisher = RosPublisher(foreign, f"teamslam_{robot}", topics.domain)
-                while not (stop.is_set() or source.team_has_ended):
-                    for sample in foreign.receive(0.0 if translated.waiting else WAIT_S):
-                        translated.put(sample)
-                    translated.deliver(AT_ONCE)
-                    if live is not None:
-                        live.publish(publisher)
-                    source.tell(translated.figures(), translated.warnings())
-                    translated.report()
-                    if translated.refusal:
-                        fail(f"{ros2}: {translated.refusal}", WRONG_USE)
-                until = time.monotonic() + LAST_S
-                while time.monotonic() < until:  # messages in transit; the topic may continue
-                    for sample in foreign.receive(LAST_S):
-                        translated.put(sample)
-                translated.deliver()
-                _LOG.info(
-                    "the stream of %s ends here and is delivered; %s keeps it", robot, source.path
-                )
+    with (
+        failing(WRONG_USE, MeasurementError, at="--start"),
+        failing(FAILED, DriverError),
+        process(f"driver-{robot}", endless=True, patient=True) as stop,
+        Driver(
+            robot,
+            team=team,
+            connect=connect if keys is None else over_tls(connect),
+            keys=keys,
+            file=file,
+            start=pose[:3] or None,
+            start_covariance=None if variances is None else np.diag(variances),
+            latency_s=latency,
+            on_message=None if live is None else live.add_message,
+        ) as source,
+    ):
+        translated = Ros2Driver(
+            source, topics.robots[robot], topics.domain, name=robot, others=topics.robots,
+            on_odometry=None if live is None else live.add_odometry,
+        )  # fmt: skip
+        with ForeignKeys(
+            ros2_connect or connect,
+            translated.keys,
+            translated.tokens,
+            latched=translated.latched,
+        ) as foreign:
+            _LOG.info("listening to %s", ", ".join((*translated.keys, *translated.latched)))
+            publisher = RosPublisher(foreign, f"teamslam_{robot}", topics.domain)
+            while not (stop.is_set() or source.team_has_ended):
+                for sample in foreign.receive(0.0 if translated.waiting else WAIT_S):
+                    translated.put(sample)
+                translated.deliver(AT_ONCE)
+                if live is not None:
+                    live.publish(publisher)
                 source.tell(translated.figures(), translated.warnings())
-            _log_totals(translated)
-    except MeasurementError as error:
-        fail(f"--start: {error}", WRONG_USE)
-    except DriverError as error:
-        fail(str(error), FAILED)
+                translated.report()
+                if translated.refusal:
+                    fail(f"{ros2}: {translated.refusal}", WRONG_USE)
+            until = time.monotonic() + LAST_S
+            while time.monotonic() < until:  # messages in transit; the topic may continue
+                for sample in foreign.receive(LAST_S):
+                    translated.put(sample)
+            translated.deliver()
+            _LOG.info(
+                "the stream of %s ends here and is delivered; %s keeps it", robot, source.path
+            )
+            source.tell(translated.figures(), translated.warnings())
+        _log_totals(translated)
 
 
 def _log_totals(translated: "Ros2Driver") -> None:

@@ -17,6 +17,7 @@ from teamslam.sim.cli.options import (
     TeamOption,
     connect_bus,
     fail,
+    failing,
     saved_maps,
     write_json,
 )
@@ -67,13 +68,11 @@ def save(
 
     if (log is None) == (team is None):
         fail("give either a log or, for a running team, --team NAME", WRONG_USE)
-    try:
+    with failing(WRONG_USE, SavedMapError):
         named = map_name(name or output.stem)
         found = _map_of_log(log) if log is not None else _map_of_team(team, connect, keys, patience)
         saved = msgspec.structs.replace(found, name=named)
         write_map(output, saved)
-    except SavedMapError as error:
-        fail(str(error), WRONG_USE)
     count, days = len(ids(saved.ids, "ids")), len(saved.sets)
     size = output.stat().st_size / 1e3
     typer.echo(
@@ -88,10 +87,8 @@ def _map_of_log(log: Path) -> "SavedMap":
     from teamslam.central.saved_maps import NothingToSaveError
     from teamslam.team.recording.reader import open_log
 
-    try:
+    with failing(FAILED, RerunError, NothingToSaveError, at=log):
         return recorded_map(recorded(open_log(log)), "site")
-    except (RerunError, NothingToSaveError) as error:
-        fail(f"{log}: {error}", FAILED)
 
 
 def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: float) -> "SavedMap":
@@ -101,11 +98,8 @@ def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: fl
     from teamslam.team.wire.codec import decoded
     from teamslam.team.wire.messages import FoldRequest, SavedMap
 
-    with connect_bus(str(team), connect, keys, "operator") as bus:
-        try:
-            replies = bus.ask(SITE, "", FoldRequest(stamp_ns=0), patience)
-        except BusError as error:
-            fail(str(error), FAILED)
+    with connect_bus(str(team), connect, keys, "operator") as bus, failing(FAILED, BusError):
+        replies = bus.ask(SITE, "", FoldRequest(stamp_ns=0), patience)
     if not replies:
         fail(f"no centre of the team {team} is running at {connect}: save from its log", FAILED)
     return decoded(replies[-1], SavedMap)
@@ -149,11 +143,8 @@ def peer(
     from teamslam.team.wire.codec import decoded
     from teamslam.team.wire.messages import FoldRequest, FusedMap
 
-    with connect_bus(team, connect, keys, "operator") as bus:
-        try:
-            replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
-        except BusError as error:
-            fail(str(error), FAILED)
+    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, BusError):
+        replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
     if not replies:
         fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
     fused = decoded(replies[-1], FusedMap)

@@ -29,6 +29,7 @@ from teamslam.sim.cli.options import (
     check_names,
     connect_bus,
     fail,
+    failing,
     over_tls,
     own_keys,
     parsed_speed,
@@ -242,7 +243,7 @@ def _peer_shell(
     if fold not in get_args(FoldWhen):
         fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
     signer = signer_of(keys, f"robot-{config.id}", scenario.team)
-    try:
+    with failing(WRONG_USE, SetFileError):
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
             door,
@@ -256,8 +257,6 @@ def _peer_shell(
             signer=signer,
             maps=maps,
         )
-    except SetFileError as error:
-        fail(str(error), WRONG_USE)
 
 
 @app.command(cls=Command, epilog="teamslam central waypoints")
@@ -312,10 +311,8 @@ def central(
         connect_bus(resolved.team, connect, keys, "central", stop) as bus,
     ):
         _connected(resolved, connect)
-        try:
+        with failing(WRONG_USE, SetFileError):
             _central_shell(bus, resolved, stop, store, patience, keys, maps).run()
-        except SetFileError as error:
-            fail(str(error), WRONG_USE)
 
 
 def _central_shell(
@@ -398,12 +395,10 @@ def record(
         refuse_existing(output)
     peers = [robot.id for robot in resolved.robots] if resolved.peers else []
     ends = (FINAL_MAP, TEAM_FINAL) if peers else (FINAL_MAP,)
-    try:
+    with failing(WRONG_USE, LogError):
         is_over = exists and not check_continues(
             output, resolved.team, metadata, same_run=resume, ends=ends
         )
-    except LogError as error:
-        fail(str(error), WRONG_USE)
     if is_over:
         typer.echo(f"{output} was finished by an earlier recorder", err=True)
         _fail_if_provisional(_joined(output) if join_parts else parts_of(output), ends)

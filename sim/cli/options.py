@@ -5,7 +5,8 @@ import logging
 import math
 import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from ipaddress import ip_address
 from itertools import pairwise
 from pathlib import Path
@@ -221,6 +222,15 @@ def fail(message: str, status: int) -> NoReturn:
     raise typer.Exit(status)
 
 
+@contextmanager
+def failing(status: int, *errors: type[Exception], at: object = "") -> Iterator[None]:
+    """Exit with this status and the text of such an error; at: named before it."""
+    try:
+        yield
+    except errors as error:
+        fail(f"{at}: {error}" if at else str(error), status)
+
+
 def write_json(path: Path | None, figures: object) -> None:
     """Write a command's figures to its --json file, if given: a regular file at once."""
     if path is None:
@@ -323,10 +333,8 @@ def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
     """Read saved maps; ends with 2 for an unusable file, or two maps of one name."""
     from teamslam.team.saved_map import SavedMapError, read_map
 
-    try:
+    with failing(WRONG_USE, SavedMapError):
         found = [read_map(path) for path in paths or ()]
-    except SavedMapError as error:
-        fail(str(error), WRONG_USE)
     names = sorted(each.name for each in found)
     twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:

@@ -15,6 +15,7 @@ from teamslam.sim.cli.options import (
     check_names,
     connect_bus,
     fail,
+    failing,
     signer_of,
 )
 from teamslam.team.wire.arrays import ids
@@ -43,11 +44,8 @@ def withdraw(
     from teamslam.central.desk.orders import withdraw as order
 
     check_names(team, robot)
-    with connect_bus(team, connect, keys, "operator") as bus:
-        try:
-            fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
-        except WithdrawError as error:
-            fail(str(error), FAILED)
+    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, WithdrawError):
+        fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
     landmarks = len(ids(fused.ids, "ids"))
     typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
 
@@ -80,10 +78,8 @@ def verdict(
     if word not in ("same", "different"):
         fail(f"{word!r} is no verdict: same or different", WRONG_USE)
     check_names(team)
-    try:
+    with failing(WRONG_USE, ValueError):
         one, two = local_landmark(first), local_landmark(second)
-    except ValueError as error:
-        fail(str(error), WRONG_USE)
     if one == two:
         fail(f"{first} is one landmark, and needs no verdict", WRONG_USE)
     with connect_bus(team, connect, keys, "operator") as bus:
@@ -141,12 +137,9 @@ def end(
     from teamslam.central.desk.orders import WithdrawError, end_team, give_up
 
     check_names(team, without)
-    with connect_bus(team, connect, keys, "operator") as bus:
-        try:
-            if without is None:
-                end_team(bus, reason, patience)
-            else:
-                give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
-        except WithdrawError as error:
-            fail(str(error), FAILED)
+    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, WithdrawError):
+        if without is None:
+            end_team(bus, reason, patience)
+        else:
+            give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
     typer.echo(f"the team no longer waits for {without}" if without else "the team ends")

@@ -20,6 +20,7 @@ from teamslam.sim.cli.options import (
     MapFiles,
     check_localises,
     fail,
+    failing,
     saved_maps,
     warn_of_holes,
     write_json,
@@ -235,12 +236,10 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     if isinstance(log, Log):
         warn_of_holes(log)
     recorded = evaluate(log.samples())
-    try:
+    with failing(FAILED, RerunError, at=path):
         plain = isinstance(log, DataSetRun) and changes == Changes()
         computed = list(log.samples()) if plain else changed_run(log, changes)
         changed = recorded if plain else evaluate(computed)
-    except RerunError as error:
-        fail(f"{path}: {error}", FAILED)
     runs = {"computed": changed} if plain else {"recorded": recorded, "recomputed": changed}
     table = Table("", *runs)
     for figure, cells in compare_rows(runs):
@@ -291,10 +290,8 @@ def _verify(path: Path, json_file: Path | None) -> None:
     log = open_log(path)
     warn_of_holes(log)
     began = time.monotonic()
-    try:
+    with failing(FAILED, RerunError, at=path):
         result = verify(log)
-    except RerunError as error:
-        fail(f"{path}: {error}", FAILED)
     elapsed_s = time.monotonic() - began
     _print_verification(result, elapsed_s)
     figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
@@ -358,12 +355,10 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     from teamslam.central.desk.verification.recorded import RerunError, recorded
     from teamslam.team.recording.reader import open_log
 
-    try:
-        opened = open_log(log)
-        warn_of_holes(opened)
+    opened = open_log(log)
+    warn_of_holes(opened)
+    with failing(FAILED, RerunError, at=log):
         found = ledger(recorded(opened))
-    except RerunError as error:
-        fail(f"{log}: {error}", FAILED)
     robots = in_order({robot for robot, _ in found.entries})
     console = Console()
     sheet = disposition_sheet({robot: found.totals(robot) for robot in robots})

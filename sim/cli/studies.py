@@ -7,7 +7,7 @@ import typer
 from teamslam.sim.cli.options import WRONG_USE, fail
 
 STUDIES = "teamslam.sim.studies"
-COMMANDS = ("experiment", "batch-reference", "limit")
+COMMANDS = ("experiment", "batch-reference")
 
 
 def add_studies(app: typer.Typer) -> None:

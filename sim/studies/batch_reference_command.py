@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from teamslam.sim.cli.help import Command
-from teamslam.sim.cli.options import FAILED, fail, warn_of_holes
+from teamslam.sim.cli.options import FAILED, failing, warn_of_holes, write_json
 
 Noise = Annotated[
     Literal["white", "profile"],
@@ -38,18 +38,8 @@ def batch_reference(
         run = log_or_run(source)
     if isinstance(run, Log):
         warn_of_holes(run)
-    try:
+    with failing(FAILED, BatchReferenceError):
         result = batch_map(run.samples(), noise)
-    except BatchReferenceError as error:
-        fail(str(error), FAILED)
     figures = result.to_json()
     typer.echo(json.dumps(figures, indent=2))
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=2) + "\n")
-
-
-@app.command(name="limit", hidden=True)
-def limit(log: Source, noise: Noise = "white", json_file: JsonFile = None) -> None:
-    """The former name of `batch-reference`."""
-    typer.echo("`teamslam limit` is called `teamslam batch-reference` now", err=True)
-    batch_reference(log, noise, json_file)
+    write_json(json_file, figures)

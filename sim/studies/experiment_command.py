@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from teamslam.sim.cli.help import Command, Group
-from teamslam.sim.cli.options import FAILED, WRONG_USE, fail
+from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
 from teamslam.team.extras import install_command
 
@@ -121,10 +121,8 @@ def merge(
         programs_of,
     )
 
-    try:
+    with failing(WRONG_USE, ShardError):
         study, program = described_study(shards)
-    except ShardError as error:
-        fail(str(error), WRONG_USE)
     asked = Asked(
         name=study.name,
         seeds=study.seeds,
@@ -190,9 +188,8 @@ def _stoppable(output: Path) -> Iterator[None]:
     from teamslam.sim.studies.experiments.cases import SchedulerError
 
     try:
-        yield
-    except SchedulerError as error:
-        fail(str(error), WRONG_USE)
+        with failing(WRONG_USE, SchedulerError):
+            yield
     except KeyboardInterrupt:
         fail(f"interrupted; results so far are in {output}: repeat the command to continue", FAILED)
 
@@ -212,10 +209,8 @@ def _run_shard(asked: Asked, text: str) -> None:
         write_shard,
     )
 
-    try:
+    with failing(WRONG_USE, ShardError):
         shard = parsed_shard(text)
-    except ShardError as error:
-        fail(str(error), WRONG_USE)
     tasks = tasks_by_name(asked.plans())
     if not tasks:
         fail(without_datasets(asked.name), WRONG_USE)
