@@ -41,10 +41,6 @@ Output = Annotated[
     ),
 ]
 Jobs = Annotated[int | None, typer.Option(help="Processes; default: one per core.", min=1)]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(help="Compute the runs on a Dask scheduler's workers.", metavar="tcp://HOST:PORT"),
-]
 Datasets = Annotated[
     list[Path] | None,
     typer.Option("--dataset", help="A UTIAS data set, folder or zip; repeatable."),
@@ -69,7 +65,6 @@ def _command(name: str, summary: str) -> None:
         output: Output = FOLDER,
         jobs: Jobs = None,
         shard: ShardText = None,
-        scheduler: Scheduler = None,
         check: Check = False,
         json_file: JsonFile = None,
     ) -> None:
@@ -81,7 +76,6 @@ def _command(name: str, summary: str) -> None:
             paths=dataset or [],
             output=output,
             jobs=jobs,
-            scheduler=scheduler,
             check=check,
             json_file=json_file,
         )
@@ -152,7 +146,6 @@ class Asked:
     paths: Sequence[Path]
     output: Path
     jobs: int | None
-    scheduler: str | None = None
     check: bool
     json_file: Path | None
 
@@ -184,12 +177,9 @@ def _require_joblib() -> None:
 
 @contextmanager
 def _stoppable(output: Path) -> Iterator[None]:
-    """Exit with advice where the runs are interrupted, or the scheduler is unusable."""
-    from teamslam.sim.studies.experiments.cases import SchedulerError
-
+    """Exit with advice where the runs are interrupted."""
     try:
-        with failing(WRONG_USE, SchedulerError):
-            yield
+        yield
     except KeyboardInterrupt:
         fail(f"interrupted; results so far are in {output}: repeat the command to continue", FAILED)
 
@@ -216,7 +206,7 @@ def _run_shard(asked: Asked, text: str) -> None:
         fail(without_datasets(asked.name), WRONG_USE)
     part = tasks_of(tasks, shard)
     with _stoppable(asked.output):
-        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), shown, asked.scheduler)
+        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), shown)
     study = Study(
         name=asked.name,
         seeds=asked.seeds,
@@ -253,7 +243,7 @@ def _run(asked: Asked) -> None:
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
     with _stoppable(asked.output):
-        concluded = computed(plans, asked.output, asked.jobs or cores(), shown, asked.scheduler)
+        concluded = computed(plans, asked.output, asked.jobs or cores(), shown)
     origin = provenance()
     console = Console()
     if not console.is_terminal:

@@ -16,7 +16,7 @@ from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner, xu_localisation
-from teamslam.sim.studies.experiments.cases import FOLDER, Cases, Done, SchedulerError
+from teamslam.sim.studies.experiments.cases import FOLDER, Cases, Done
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
 from teamslam.sim.studies.experiments.output import write
@@ -183,11 +183,6 @@ def test_leaving_while_a_case_is_handed_over_leaves_no_error(error, tmp_path, mo
     next(runs)
     runs.close()  # type: ignore[attr-defined] # a generator
     assert [each.exc_type for each in shown] == [each for each in [error] if each is not KeyError]
-
-
-def test_without_dask_or_a_scheduler_the_remedy_is_said(tmp_path):
-    with pytest.raises(SchedulerError, match="--scheduler"):
-        list(Cases(tmp_path).run([counted(1.0)], 1, "tcp://127.0.0.1:1"))
 
 
 def test_a_data_set_is_known_by_its_content(tmp_path):

@@ -1,14 +1,13 @@
 """Compute cases in parallel and store their results on disk, with joblib's workers and memory.
 
-A case that fails or dies loses only itself. With a scheduler the cases run on Dask's workers, also
-on a cluster (decision 37).
+A case that fails or dies loses only itself.
 """
 
 import threading
 import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,17 +16,12 @@ from joblib import Memory, Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.team.extras import install_command
 
 FOLDER = "cases"
 _STORED = "output.pkl"
 IDLE_S = 5
 """Timeout [s] of an idle worker."""
 Cached = Callable[..., dict[str, Any]]
-
-
-class SchedulerError(ValueError):
-    """An unusable scheduler; the text gives reason and remedy."""
 
 
 @dataclass(frozen=True)
@@ -57,20 +51,17 @@ class Cases:
         result: dict[str, Any] = self._cached(**arguments)
         return result
 
-    def run(self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None) -> Iterator[Done]:
+    def run(self, tasks: Sequence[Task], jobs: int) -> Iterator[Done]:
         """Compute the cases, `jobs` at a time; yields each as it is done, in no fixed order.
 
-        Long cases begin first. Leaving the iterator ends the workers. scheduler: address of a Dask
-        scheduler whose workers can read the folder; their number replaces `jobs`.
+        Long cases begin first. Leaving the iterator ends the workers.
         """
         # An idle worker may end just as it gets a case; joblib warns and starts another. With
         # warnings as errors joblib's thread would end instead.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
-        with ExitStack() as stack:
-            for each in _backend(scheduler):
-                stack.enter_context(each)
-            finished = self._parallel(list(waiting.values()), jobs, scheduler)
+        with parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S):
+            finished = self._parallel(list(waiting.values()), jobs)
             try:
                 for done in finished:
                     del waiting[done.task.name]
@@ -82,14 +73,10 @@ class Cases:
                 with _cancelling():
                     finished.close()
 
-    def _parallel(
-        self, tasks: Sequence[Task], jobs: int, scheduler: str | None = None
-    ) -> Generator[Done, None, None]:
+    def _parallel(self, tasks: Sequence[Task], jobs: int) -> Generator[Done, None, None]:
         # With one job joblib would run a loop in this process, which a dying case would end.
-        workers = max(jobs, 2) if scheduler is None else -1
-        at_once = jobs if scheduler is None else "all"
         parallel = Parallel(
-            workers, return_as="generator_unordered", pre_dispatch=at_once, batch_size=1
+            max(jobs, 2), return_as="generator_unordered", pre_dispatch=jobs, batch_size=1
         )
         done: Generator[Done, None, None] = parallel(
             delayed(_attempt)(self._cached, task) for task in tasks
@@ -102,20 +89,6 @@ class Cases:
         except TerminatedWorkerError as error:
             return Done(task, None, f"its process died: {' '.join(str(error).split())}")
         return done
-
-
-def _backend(scheduler: str | None) -> list[AbstractContextManager[Any]]:
-    if scheduler is None:
-        return [parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S)]
-    try:
-        from distributed import Client
-    except ImportError:
-        raise SchedulerError(f"--scheduler needs Dask: {install_command('cluster')}") from None
-    try:
-        client = Client(scheduler, timeout="10s")
-    except (OSError, ValueError) as error:
-        raise SchedulerError(f"--scheduler {scheduler}: no Dask scheduler there: {error}") from None
-    return [client, parallel_config("dask")]
 
 
 @contextmanager

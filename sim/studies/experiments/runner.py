@@ -70,10 +70,9 @@ def computed(
     folder: Path,
     jobs: int,
     progress: Progress,
-    scheduler: str | None = None,
 ) -> list[Concluded]:
     """Outcomes of all plans; common tasks run once."""
-    results, failures = compute_runs(tasks_by_name(plans), folder, jobs, progress, scheduler)
+    results, failures = compute_runs(tasks_by_name(plans), folder, jobs, progress)
     return [_conclude(plan, results, failures) for plan in plans]
 
 
@@ -87,7 +86,6 @@ def compute_runs(
     folder: Path,
     jobs: int,
     progress: Progress,
-    scheduler: str | None = None,
 ) -> tuple[Results, Mapping[str, Done]]:
     """Results of these tasks, stored or computed now, and the failed ones."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -97,7 +95,7 @@ def compute_runs(
     missing = [task for name, task in tasks.items() if name not in results]
     failures: dict[str, Done] = {}
     with progress(missing, len(results)) as tell:
-        for done in cases.run(missing, jobs, scheduler):
+        for done in cases.run(missing, jobs):
             if done.result is None:
                 failures[done.task.name] = done
             else:
