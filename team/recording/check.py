@@ -84,7 +84,8 @@ class _Evidence:
     """Evidence about missing samples.
 
     part: the log is a cut. repaired: it was made from an unfinished log. totals: by key, each
-    process's final number of publications, by the process's start.
+    process's final number of publications, by the process's start. channels: those of `_READ` that
+    are there. plain: keys of other channels.
     """
 
     part: bool
@@ -95,14 +96,22 @@ class _Evidence:
     last_words: LastWords = field(default_factory=LastWords)
     last_word: tuple[str, ...] = ()
     channels: set[ch.Channel] = field(default_factory=set)
+    plain: set[str] = field(default_factory=set)
 
     def take(self, sample: Sample) -> None:
         self.counters[sample.key].take(sample)
         self.inventory.take(sample)
+        if sample.key not in self.plain:
+            self._read(sample)
+
+    def _read(self, sample: Sample) -> None:
+        """Register what channel and content of a sample prove, or that its key proves nothing."""
         row = ch.channel_of(sample.key)
-        if row is not None and row[0] in (ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL):
-            self.channels.add(row[0])
-        if row is None or row[0] not in (ch.TALLY, ch.STATUS):
+        if row is None or row[0] not in _READ:
+            self.plain.add(sample.key)
+            return
+        self.channels.add(row[0])
+        if row[0] not in (ch.TALLY, ch.STATUS):
             return
         found = try_open(sample)
         message = None if found is None else found[2]
@@ -149,6 +158,8 @@ _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
 """Channels published after the end of the streams."""
+_READ = {ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL, ch.TALLY, ch.STATUS}
+"""Channels whose presence or content is evidence beyond their counters and numbers."""
 NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
 NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"

@@ -18,6 +18,8 @@ from teamslam.team.wire.intervals import Interval, IntervalSet
 
 Life = Int64[np.ndarray, "_"]
 """Positions of one life's publications, by counter."""
+_LATEST = 2**63 - 1
+"""Largest wall clock [ns]: larger ones are from damaged or hostile logs."""
 
 
 class Counters:
@@ -34,7 +36,7 @@ class Counters:
             self._replies += 1
             return
         self._counters.append(sample.counter)
-        self._walls.append(min(sample.wall_ns, 2**63 - 1))
+        self._walls.append(sample.wall_ns if sample.wall_ns < _LATEST else _LATEST)
 
     def findings(
         self, *, part: bool, numbered: bool = False, totals: Sequence[int] = ()

@@ -5,13 +5,14 @@ A source numbers measurements across all of its robot's sensor channels; the rob
 numbers are detected at a stream's end, too, and for a missing stream.
 """
 
-import zlib
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from functools import lru_cache
+from typing import Annotated, Literal, NamedTuple
+from zlib import crc32
 
-import msgpack
+import msgspec
 
 from teamslam.team.recording.received import Received
 from teamslam.team.wire import channels as ch
@@ -20,10 +21,12 @@ from teamslam.team.wire.bus import NO_COUNTER, Sample, try_open
 
 MISSING = "missing: "
 """Prefix of the recorder's last note, which lists missing messages."""
-_HEAD = 128  # covers a message's tag, stamp, robot, incarnation and number [bytes]
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])
-"""Channels without numbers, sent as replies."""
+"""Channels without numbers, sent as replies, whose repetitions are recognised by their content."""
+_TOTALS = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD, ch.ROBOT_HEAD)
+"""Channels whose messages name totals."""
+_Role = Literal["measurements", "submaps", "reply", "totals", ""]
 
 
 class NumberedStream(NamedTuple):
@@ -54,16 +57,20 @@ class Numbered:
 
     def take(self, number: int, payload: bytes) -> bool:
         """Add a payload; returns False if present with the same content."""
-        found = zlib.crc32(payload)
-        there = self._sums[number] if number < self.whole else self._beyond.get(number)
+        found, sums, beyond = crc32(payload), self._sums, self._beyond
+        whole = len(sums)
+        there = sums[number] if number < whole else beyond.get(number)
         if there is not None:
             self.contradicted += there != found
             return there != found
         self.count += 1
-        self.note_number(number)
-        self._beyond[number] = found
-        while (following := self._beyond.pop(self.whole, None)) is not None:
-            self._sums.append(following)
+        self.newest = max(self.newest, number)
+        if number > whole:
+            beyond[number] = found
+            return True
+        sums.append(found)
+        while beyond and (following := beyond.pop(len(sums), None)) is not None:
+            sums.append(following)
         return True
 
     def note_number(self, newest: int) -> None:
@@ -110,27 +117,27 @@ class Inventory:
 
     def take(self, sample: Sample) -> bool:
         """Add a sample; returns False if its stream has it."""
-        found = ch.channel_of(sample.key)
-        if found is None:
-            return True
-        channel, robot = found
-        if channel in _ASKED_FOR:  # repeated on request
+        role, robot = _role_of(sample.key)
+        if role == "measurements" or role == "submaps":
+            named = numbered_in(sample.payload)
+            if named is None:
+                return True
+            return self._of(role, robot, named.incarnation).take(named.number, sample.payload)
+        if role == "reply":
             name = hash((sample.key, sample.payload))
             known = name in self._contents
             self._contents.add(name)
             return not known
-        if channel in ch.SENSORS or channel is ch.SUBMAP:
-            named = numbered_in(sample.payload)
-            if named is None:
-                return True
-            kind: Kind = "submaps" if channel is ch.SUBMAP else "measurements"
-            return self._of(kind, robot, named[0]).take(named[1], sample.payload)
-        if channel in (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD, ch.ROBOT_HEAD):
+        if role == "totals":
             self._note_totals(sample)
         return True
 
     def _of(self, kind: Kind, robot: str, incarnation: int) -> Numbered:
-        return self.streams.setdefault(NumberedStream(kind, robot, incarnation), Numbered())
+        stream = NumberedStream(kind, robot, incarnation)
+        found = self.streams.get(stream)
+        if found is None:
+            found = self.streams[stream] = Numbered()
+        return found
 
     def _note_totals(self, sample: Sample) -> None:
         found = try_open(sample)
@@ -202,17 +209,41 @@ def intervals(of: list[tuple[int, int]]) -> str:
     return named + (f" and {len(of) - SHOWN} more gaps" if len(of) > SHOWN else "")
 
 
-def numbered_in(payload: bytes) -> tuple[int, int] | None:
-    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …], or None."""
-    unpacker = msgpack.Unpacker()
-    unpacker.feed(payload[:_HEAD])
+class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """The first fields of a numbered message; the others are skipped."""
+
+    tag: str
+    stamp_ns: int
+    robot: str
+    incarnation: Annotated[int, msgspec.Meta(ge=0)]
+    number: Annotated[int, msgspec.Meta(ge=0)]
+
+
+_DECODER = msgspec.msgpack.Decoder(_Head)
+
+
+def numbered_in(payload: bytes) -> _Head | None:
+    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …], or None.
+
+    An undecodable payload is recorded unchanged, and reported by the message's reader.
+    """
     try:
-        if unpacker.read_array_header() < 5:
-            return None
-        for _ in range(3):
-            unpacker.skip()
-        incarnation, number = unpacker.unpack(), unpacker.unpack()
-    except (ValueError, msgpack.UnpackException):
-        return None  # recorded unchanged; reported by the message's reader
-    sound = all(isinstance(n, int) and n >= 0 for n in (incarnation, number))
-    return (incarnation, number) if sound else None
+        return _DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+
+
+@lru_cache(maxsize=16_384)
+def _role_of(key: str) -> tuple[_Role, str]:
+    """Role of a key in the inventory, and its robot."""
+    found = ch.channel_of(key)
+    if found is None:
+        return "", ""
+    channel, robot = found
+    if channel in _ASKED_FOR:
+        return "reply", robot
+    if channel is ch.SUBMAP:
+        return "submaps", robot
+    if channel in ch.SENSORS:
+        return "measurements", robot
+    return ("totals" if channel in _TOTALS else ""), robot

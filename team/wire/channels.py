@@ -37,9 +37,11 @@ _PATTERNS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Channel:
     """One row: the message on a key, its rate, its delivery, and its place in a log.
+
+    Rows are compared by identity.
 
     alternatives: further messages on the key.
     """

@@ -16,6 +16,7 @@ from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
@@ -131,3 +132,20 @@ def test_a_recorder_that_was_started_again_counts_what_is_in_the_earlier_parts()
     inventory.remember(sample(key, 0, 10))
     assert not inventory.is_new(sample(key, 0, 10))
     assert inventory.received.of_process(key, 5) == (1, 1)
+
+
+def test_an_undecodable_measurement_is_no_substitute_for_a_sound_one():
+    key = c.ODOMETRY.key("r1")
+    first, second = (
+        encoded(build.odometry(robot="r1", incarnation=0, number=number)) for number in (0, 1)
+    )
+    inventory = Inventory()
+    nested = first[:-1] + b"\x91" * 5_000
+    for payload in (first[:-1], nested, second):
+        assert inventory.is_new(Sample(key, payload, 0, 0, 0))
+    assert list(inventory.findings()) == [
+        ("source/r1", "1 measurements of incarnation 0 missing: 0")
+    ]
+    assert inventory.is_new(Sample(key, first, 0, 0, 0))
+    assert not inventory.is_new(Sample(key, first, 0, 0, 0)), "requested and recorded once"
+    assert list(inventory.findings()) == []
