@@ -74,7 +74,7 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 def absurd(message: m.Message) -> str | None:
     """The reason to refuse a message with an unreachable count; None: accepted."""
     if (
-        isinstance(message, m.Measurement)  # most messages are
+        m.is_measurement(message)  # most messages are
         and message.incarnation <= MOST_LIVES
         and message.number <= MOST_COUNT
     ):

@@ -33,9 +33,9 @@ class StreamAccount:
     def count(self, measurement: m.Measurement) -> None:
         """Count a measurement that is consumed next."""
         self.consumed = measurement.number + 1
-        is_step = isinstance(measurement, m.AnyOdometry)
-        self.steps += is_step
-        self.all_steps += is_step
+        if isinstance(measurement, m.AnyOdometry):
+            self.steps += 1
+            self.all_steps += 1
 
     def acknowledge(self, progress: m.Progress) -> None:
         """Note how many submaps the centre has dealt with."""

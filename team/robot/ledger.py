@@ -47,10 +47,12 @@ class Ledger:
         disposition = used or self.used
         if rejected is not None:
             disposition = rejected.disposition
+        elif isinstance(measurement, NO_SCAN):  # first: most measurements are odometry
+            pass
         elif isinstance(measurement, m.Sightings | m.Fix):
             self._sighted.add(number)
             disposition = IN_SIGHTING
-        elif not isinstance(measurement, NO_SCAN):
+        else:
             self._scans[number] = measurement.stamp_ns
             if isinstance(measurement, m.Detections):
                 self._detections[number] = measurement.stamp_ns

@@ -40,6 +40,9 @@ MOST_SET_ASIDE = 8
 """After so many measurements of one window were set aside, the window is not computed again for
 further ones."""
 
+NOTHING_PASSES = -(2**63)
+"""Time before which no odometry ends."""
+
 MOST_WARNINGS = 64
 """Number of the newest warnings that are kept."""
 
@@ -149,6 +152,9 @@ class Mapper:
     def take(self, measurement: m.Measurement) -> bool:
         """Take the next measurement; returns whether it closed a window."""
         self._taking = measurement
+        if type(measurement) is m.Odometry and self._go_on(measurement):
+            return False
+        self._due_ns = NOTHING_PASSES
         self.note_input(measurement.number)
         if isinstance(measurement, m.AnyOdometry):
             stamp_ns = measurement.stamp_ns + self._offset_ns
@@ -157,6 +163,25 @@ class Mapper:
         is_near = self._note_time(measurement.stamp_ns, measurement.stamp_ns - 1)
         self.account(measurement, self._observe(measurement, is_near))
         return False
+
+    def _go_on(self, measurement: m.Odometry) -> bool:
+        """Take an odometry message within all bounds that reaches nothing which is due.
+
+        Most messages of odometry that is faster than scans are such. Returns False, and takes
+        nothing, for any other; `drive` would take this one to the same state.
+        """
+        stamp_ns = measurement.stamp_ns + self._offset_ns
+        if stamp_ns >= self._due_ns:
+            return False
+        interval = OdometryInterval(
+            stamp_ns, measurement.duration_ns, measurement.forward, measurement.yaw_rate
+        )
+        if not (self._note_time(stamp_ns, stamp_ns) and self._judge.admit(interval)):
+            return False
+        self._slam.last_measurement = measurement.number
+        self._slam.go_on(interval)
+        self.account(measurement, None)
+        return True
 
     def _note_time(self, stamp_ns: int, passed_ns: int) -> bool:
         """Note the team time of a measurement and the time that has passed with it.
@@ -187,8 +212,10 @@ class Mapper:
             closed = self._slam.drive(interval, measured=rejected is None)
         if closed is not None:
             self._close(closed, measurement, rejected)
+            self._due_ns = self._slam.due_ns
             return True
         self.account(measurement, rejected)
+        self._due_ns = self._slam.due_ns
         keyframe_ns = self._slam.last_keyframe_ns
         if keyframe_ns != before_ns and keyframe_ns is not None:
             self.out += self.poses.publish(keyframe_ns, self)
@@ -311,7 +338,7 @@ class Mapper:
     def forget_window(self) -> None:
         """Forget the measurements of the open window."""
         self._window: list[m.Measurement] = []
-        self._aside = 0
+        self._aside, self._due_ns = 0, NOTHING_PASSES
 
     def set_aside(self) -> bool:
         """Reset to the state before the measurement whose handling raised an exception.
@@ -344,7 +371,7 @@ class Mapper:
 
     def _reopen_window(self) -> None:
         """Open the window behind the last submap anew, without measurements."""
-        last = self.submaps.last
+        last, self._due_ns = self.submaps.last, NOTHING_PASSES
         self._slam = HybridSlam(self.config, self.writer.incarnation)
         if last is None:
             self.note_input(0)

@@ -186,12 +186,12 @@ class RobotNode:
         """Why a message can not be true of this robot: it is another's, its counts are absurd,
         or its end is too early.
         """
+        if m.is_measurement(message):  # first: most messages are measurements
+            own = message.robot == self.robot
+            return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
         refused = absurd(message)
         if refused is not None:
             return refused
-        if isinstance(message, m.Measurement):  # first: most messages are measurements
-            own = message.robot == self.robot
-            return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
         match message:
             case m.Progress() if message.incarnation == self.account.incarnation:
                 if message.submaps > self.submaps + AHEAD:
@@ -209,7 +209,7 @@ class RobotNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
-        if isinstance(message, m.Measurement):
+        if m.is_measurement(message):
             self.inbox.put(message)
         else:
             self.receive(message)
@@ -257,7 +257,11 @@ class RobotNode:
 
     def consume(self) -> None:
         """Consume the measurements whose turn has come, while the centre gives credit."""
-        while not self.is_held and (measurement := self.inbox.take_next()) is not None:
+        inbox = self.inbox
+        while (inbox.ahead or inbox.later) and not self.is_held:
+            measurement = inbox.take_next()
+            if measurement is None:
+                break
             self._consume(measurement)
         if not self.done and self.stream_end.is_reached() and not self.is_held:
             self._finish()

@@ -1,6 +1,6 @@
 """Put the measurements of one robot in the order of their counter."""
 
-from teamslam.team.door import another_time
+from teamslam.team.door import MOST_COUNT, MOST_LIVES, absurd, another_time
 from teamslam.team.wire.messages import End, InitialPose, Measurement, StreamEnd
 
 NEAR_LIVES = 16
@@ -12,13 +12,16 @@ class Inbox:
 
     Duplicates and measurements of earlier incarnations are dropped. A later incarnation begins when
     its measurement 0 arrives.
+
+    ahead: measurements of the incarnation that wait for their turn, by number. later: those of
+    later incarnations.
     """
 
     def __init__(self) -> None:
         self.incarnation = 0
         self.next_measurement = 0
-        self._waiting: dict[int, Measurement] = {}
-        self._later: dict[int, dict[int, Measurement]] = {}
+        self.ahead: dict[int, Measurement] = {}
+        self.later: dict[int, dict[int, Measurement]] = {}
         self._received = 0
         self._began_ns: int | None = None
         self._of_source: set[int] = set()
@@ -32,8 +35,8 @@ class Inbox:
         """Skip measurements of `incarnation` consumed by an earlier process."""
         self.incarnation = incarnation
         self.next_measurement = next_measurement
-        waiting = self._later.pop(incarnation, {}) | self._waiting
-        self._waiting = {
+        waiting = self.later.pop(incarnation, {}) | self.ahead
+        self.ahead = {
             n: r
             for n, r in waiting.items()
             if r.incarnation == incarnation and n >= next_measurement
@@ -43,19 +46,22 @@ class Inbox:
     def put(self, measurement: Measurement) -> None:
         """Add a measurement, in any order."""
         if measurement.incarnation > self.incarnation:
-            self._later.setdefault(measurement.incarnation, {})[measurement.number] = measurement
+            self.later.setdefault(measurement.incarnation, {})[measurement.number] = measurement
         elif (
             measurement.incarnation == self.incarnation
             and measurement.number >= self.next_measurement
         ):
-            self._waiting[measurement.number] = measurement
+            self.ahead[measurement.number] = measurement
 
     def refusal(self, measurement: Measurement) -> str | None:
         """Why a measurement cannot belong to this stream; None if it can.
 
-        Incarnations follow one another and begin with their only initial pose, the earliest stamp.
+        Counters are no absurd ones. Incarnations follow one another and begin with their only
+        initial pose, the earliest stamp.
         """
         number, incarnation = measurement.number, measurement.incarnation
+        if incarnation > MOST_LIVES or number > MOST_COUNT:
+            return absurd(measurement)
         if (type(measurement) is InitialPose) != (number == 0):
             what = type(measurement).__name__
             return f"{what} as measurement {number}; the initial pose is measurement 0"
@@ -87,34 +93,32 @@ class Inbox:
     def take_next(self) -> Measurement | None:
         """Remove and return the next measurement, if its turn has come."""
         while True:
-            measurement = self._waiting.pop(self.next_measurement, None)
+            measurement = self.ahead.pop(self.next_measurement, None)
             if measurement is not None:
                 self._of_source.discard(self.next_measurement)
                 self.next_measurement += 1
                 if type(measurement) is InitialPose:
                     self._began_ns = measurement.stamp_ns
                 return measurement
-            beginnings = [e for e, r in self._later.items() if 0 in r] if self._later else None
+            beginnings = [e for e, r in self.later.items() if 0 in r] if self.later else None
             if not beginnings:
                 return None
             following = min(beginnings)
             self.incarnation, self.next_measurement = following, 0
-            self._waiting = self._later.pop(following)
+            self.ahead = self.later.pop(following)
             self._forget(following)
 
     def _forget(self, incarnation: int) -> None:
         """Drop measurements whose turn cannot come after this incarnation."""
         self._received = 0
         self._of_source.clear()
-        self._later = {
-            e: measurements for e, measurements in self._later.items() if e > incarnation
-        }
+        self.later = {e: measurements for e, measurements in self.later.items() if e > incarnation}
 
     @property
     def received(self) -> int:
         """Gap-free count of this incarnation's measurements, consumed or not."""
         self._received = max(self._received, self.next_measurement)
-        while self._received in self._waiting:
+        while self._received in self.ahead:
             self._received += 1
         return self._received
 
@@ -124,17 +128,17 @@ class Inbox:
 
         With only a later incarnation, the gap is at its beginning.
         """
-        if self._waiting:
-            first = min(self._waiting)
+        if self.ahead:
+            first = min(self.ahead)
             return (
                 None
                 if first <= self.next_measurement
                 else (self.incarnation, self.next_measurement, first - 1)
             )
-        if not self._later:
+        if not self.later:
             return None
-        following = min(self._later)
-        first = min(self._later[following])
+        following = min(self.later)
+        first = min(self.later[following])
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: StreamEnd) -> bool:
@@ -164,7 +168,7 @@ class Inbox:
     def _here(self, incarnation: int) -> int:
         if incarnation == self.incarnation:
             return self.received
-        later, first = self._later.get(incarnation, {}), 0
+        later, first = self.later.get(incarnation, {}), 0
         while first in later:
             first += 1
         return first
@@ -172,4 +176,4 @@ class Inbox:
     @property
     def waiting(self) -> int:
         """Number of measurements that wait for their turn."""
-        return len(self._waiting) + sum(len(r) for r in self._later.values())
+        return len(self.ahead) + sum(len(r) for r in self.later.values())

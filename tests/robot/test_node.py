@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team import translate
+from teamslam.team.config import FrontEnd
 from teamslam.team.pairs import PAIRS
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot import node as robot_node
+from teamslam.team.robot.mapper import Mapper
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.robot.node import robot_node as node_for
 from teamslam.team.wire import channels as ch
@@ -562,3 +564,58 @@ def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r1"))) == [
         encoded(MEASUREMENTS[0])
     ]
+
+
+def rolling(seed: int) -> list[m.Measurement]:
+    """Odometry at 50 Hz with stops, leaps and implausible speeds, and scans in any order."""
+    rng = np.random.default_rng(seed)
+    found: list[m.Measurement] = [
+        m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
+    ]
+    tick_ns, now_ns = 20_000_000, 0
+
+    def add(kind, stamp_ns, **fields):
+        named = {"robot": "r1", "incarnation": 0, "number": len(found)}
+        found.append(kind(stamp_ns=int(stamp_ns), **named, **fields))
+
+    for k in range(700):
+        at_ns = now_ns + int(rng.integers(-tick_ns, 3 * tick_ns))
+        if rng.random() < 0.05:
+            r, b = rng.uniform(1.0, 9.0, 2), rng.uniform(-1.0, 1.0, 2)
+            seen = {"ids": from_ids((1, 2)), "ranges": from_floats(r), "bearings": from_floats(b)}
+            add(m.Observations, at_ns, **seen)
+        if rng.random() < 0.02:
+            seen = {"ranges": from_floats([4.0]), "bearings": from_floats([0.1])}
+            add(m.Sightings, at_ns, teammates=("r2",), **seen)
+        if rng.random() < 0.01:
+            now_ns += int(rng.choice([-3 * tick_ns, 2 * 10**9, 10**12]))
+        now_ns += tick_ns
+        draw = rng.random()
+        duration_ns = 0 if draw < 0.02 else 10**12 if draw > 0.999 else tick_ns
+        speed = 0.0 if 200 < k < 400 else 999.0 if 0.4 < draw < 0.45 else float(draw)
+        if rng.random() < 0.05:
+            step = from_floats([0.01, 0.0, 0.02])
+            add(m.Increment, now_ns, duration_ns=tick_ns, increment=step)
+        else:
+            add(m.Odometry, now_ns, duration_ns=duration_ns, forward=speed, yaw_rate=speed - 0.4)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_odometry_that_reaches_nothing_due_has_a_shorter_way_to_the_same_state(seed, monkeypatch):
+    front = FrontEnd(particles=8, window_s=3.0, keyframe_s=0.4, node_s=0.7, standing_s=5.0)
+    measurements = rolling(seed)
+    options = {"front_end": front, "clock_offset_s": 0.013 * (seed % 2), "pose_s": 0.0}
+    taken = []
+    shorter = Mapper._go_on
+
+    def noted(self, measurement):
+        taken.append(shorter(self, measurement))
+        return taken[-1]
+
+    monkeypatch.setattr(Mapper, "_go_on", noted)
+    out = driven(RobotNode(config(**options)), measurements)
+    assert sum(taken) > 100
+    monkeypatch.setattr(Mapper, "_go_on", lambda *_: False)
+    longer = driven(RobotNode(config(**options)), measurements)
+    assert [encoded(each.message) for each in out] == [encoded(each.message) for each in longer]

@@ -58,6 +58,7 @@ from teamslam.team.wire.messages.measurements import Sightings as Sightings
 from teamslam.team.wire.messages.measurements import Steering as Steering
 from teamslam.team.wire.messages.measurements import StreamEnd as StreamEnd
 from teamslam.team.wire.messages.measurements import StreamHead as StreamHead
+from teamslam.team.wire.messages.measurements import is_measurement as is_measurement
 from teamslam.team.wire.messages.nodes import Configuration as Configuration
 from teamslam.team.wire.messages.nodes import Fault as Fault
 from teamslam.team.wire.messages.nodes import Kept as Kept

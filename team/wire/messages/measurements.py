@@ -1,7 +1,7 @@
 """The measurements of a robot's sensors, and the end of its stream."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeGuard
 
 import msgspec
 from msgspec import Meta
@@ -193,6 +193,18 @@ class Fix(Measurement, frozen=True, kw_only=True, tag="fix/1"):
         check_finite(self.position, "position", 2)
         if self.covariance:
             check_blocks(self.covariance, 1, "covariance")
+
+
+_CLASSES = frozenset(Measurement.__subclasses__())
+
+
+def is_measurement(message: Message) -> TypeGuard[Measurement]:
+    """Whether a message is a measurement, in a tenth of the time of `isinstance`.
+
+    The metaclass of messages is derived from that of abstract base classes, whose instance checks
+    are calls.
+    """
+    return type(message) in _CLASSES
 
 
 class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
