@@ -31,6 +31,8 @@ CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
+# A process of a team imports 300 modules: compiling them takes as long as importing them.
+unexport PYTHONDONTWRITEBYTECODE
 
 # All hashes of each version: of every platform's wheel and of the sources.
 HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.11.5 --generate-hashes \
