@@ -14,11 +14,11 @@ from beartype import BeartypeConf, FrozenDict, beartype
 
 F = TypeVar("F", bound=Callable[..., object])
 
-CALLS = 20
+CALLS = 5
 """Number of checked calls of each function in a test; the others run as in a program.
 
 A check takes longer than most functions, and a test that calls one half a million times, with the
-same shapes, learns nothing from the last of them.
+same shapes, learns nothing from the others.
 """
 _CONFIGURATION = BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict({Self: Any}))
 _calls: Counter[tuple[str, str]] = Counter()

@@ -20,6 +20,7 @@ from teamslam.team.saved_map import SavedMapError, map_name
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
+from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
 
 SIGMA_M = 0.05
@@ -27,15 +28,19 @@ UTM = (399_000.0, 5_756_000.0)
 """An origin of the survey far from the site, as in a national grid."""
 
 
-def world_of(seed: int, unknown: tuple[str, ...], steps: int):
+@cache
+def drive(seed, unknown=("*",)):
+    """The scenario, the world, and the samples of a team without a survey."""
     scenario = load("thesis-b")
-    world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=steps)
+    world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=200)
     scenario = msgspec.structs.replace(scenario, seed=seed, world=world)
-    return scenario, streams_of(scenario)
+    streams = streams_of(scenario)
+    return scenario, streams, list(run_team(scenario, streams))
 
 
-def surveyed_landmarks(seed, streams, numbers, wrong=None, origin=(0.0, 0.0)):
+def surveyed_landmarks(seed, numbers, wrong=None, origin=(0.0, 0.0)):
     """Survey landmarks with an error of SIGMA_M; wrong: displacements [m] by number."""
+    _, streams, _ = drive(seed)
     noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (len(numbers), 2))
     at = np.searchsorted(streams.landmark_ids, numbers)
     found = []
@@ -47,27 +52,28 @@ def surveyed_landmarks(seed, streams, numbers, wrong=None, origin=(0.0, 0.0)):
     return tuple(found)
 
 
-def team(scenario, streams, surveyed, maps=()):
-    """Run a team; return the samples and the centre."""
-    central = msgspec.structs.replace(scenario.central, surveyed=surveyed)
-    scenario = msgspec.structs.replace(scenario, central=central)
-    centres = []
-
-    def made(config, names) -> CentralNode:
-        centres.append(make_centre(config, names, maps=maps))
-        return centres[-1]
-
-    return list(run_team(scenario, streams, central=made)), centres[0]
+def fold_drive(seed, surveyed, *, unknown=("*",), maps=()) -> tuple[m.FusedMap, CentralNode]:
+    """The final map of a drive's submaps, which depend on no survey, and its centre."""
+    scenario, _, samples = drive(seed, unknown)
+    config = msgspec.structs.replace(scenario.central, surveyed=surveyed)
+    centre = make_centre(config, [each.id for each in scenario.robots])
+    for message in (*maps, *(opened(each)[2] for each in samples)):
+        centre.maps.fold.store.add(message)
+    return centre.maps.fold.make_map("final")[-1].message, centre
 
 
-def day(seed, numbers, *, unknown=("*",), wrong=None, steps=500, origin=(0.0, 0.0)):
-    """Run a team with surveyed landmarks."""
-    scenario, streams = world_of(seed, unknown, steps)
-    surveyed = surveyed_landmarks(seed, streams, numbers, wrong, origin)
-    return team(scenario, streams, surveyed)[0], streams
+def day(seed, numbers, *, unknown=("*",), wrong=None, origin=(0.0, 0.0)):
+    """The final map with surveyed landmarks, and the world."""
+    surveyed = surveyed_landmarks(seed, numbers, wrong, origin)
+    return fold_drive(seed, surveyed, unknown=unknown)[0], drive(seed)[1]
 
 
-day_once = cache(lambda *args, **options: day(*args, **options))
+@cache
+def live_day():
+    """The samples of a team whose centre has a survey from the beginning."""
+    scenario, streams, _ = drive(1)
+    central = msgspec.structs.replace(scenario.central, surveyed=surveyed_landmarks(1, (3, 15)))
+    return list(run_team(msgspec.structs.replace(scenario, central=central), streams))
 
 
 def errors(fused: m.FusedMap, streams, origin=(0.0, 0.0)):
@@ -80,8 +86,10 @@ def errors(fused: m.FusedMap, streams, origin=(0.0, 0.0)):
 
 
 def test_two_surveyed_landmarks_make_the_map_absolute_without_any_known_start():
-    samples, streams = day_once(1, (3, 15))
-    fused = final_map(samples)
+    samples = live_day()
+    fused, streams = final_map(samples), drive(1)[1]
+    folded, _ = day(1, (3, 15))
+    assert (fused.ids, fused.means) == (folded.ids, folded.means)
     assert fused.frame == SURVEY_FRAME
     assert {each.robot for each in fused.members} == {"r1", "r2"}
     assert not fused.changes
@@ -93,13 +101,12 @@ def test_two_surveyed_landmarks_make_the_map_absolute_without_any_known_start():
 
 
 def test_the_absolute_covariance_is_right():
-    nees = [errors(final_map(s), w)[1] for s, w in (day(k, (3, 9, 15)) for k in range(20))]
+    nees = [errors(*day(seed, (3, 9, 15)))[1] for seed in range(8)]
     assert 0.8 < np.mean(nees) < 1.25
 
 
 def test_one_surveyed_landmark_and_a_known_start_are_in_one_frame():
-    samples, streams = day(1, (3,), unknown=("r2",))
-    fused = final_map(samples)
+    fused, streams = day(1, (3,), unknown=("r2",))
     assert fused.frame == SURVEY_FRAME
     assert not any("not joined" in each for each in fused.reasons)
     assert errors(fused, streams)[0] < 0.3
@@ -108,8 +115,7 @@ def test_one_surveyed_landmark_and_a_known_start_are_in_one_frame():
 @pytest.mark.parametrize("unknown", [("*",), ()])
 def test_a_surveyed_landmark_that_contradicts_the_rest_is_named_and_left_out(unknown):
     numbers = (3, 6, 9, 12, 15)
-    samples, streams = day(1, numbers, unknown=unknown, wrong={9: (2.0, 1.0)})
-    fused = final_map(samples)
+    fused, streams = day(1, numbers, unknown=unknown, wrong={9: (2.0, 1.0)})
     words = [each for each in fused.reasons if "surveyed landmark" in each]
     assert len(words) == 1
     assert "the surveyed landmark 9 is (" in words[0]
@@ -117,29 +123,26 @@ def test_a_surveyed_landmark_that_contradicts_the_rest_is_named_and_left_out(unk
 
 
 def test_a_sound_survey_warns_of_nothing():
-    assert not [r for r in final_map(day_once(1, (3, 15))[0]).reasons if "survey" in r]
+    assert not [r for r in day(1, (3, 15))[0].reasons if "survey" in r]
 
 
 def test_a_survey_of_another_place_leaves_the_team_its_own_map():
-    samples, _ = day(1, (3, 9, 15), wrong={3: (30.0, 0.0), 9: (0.0, 40.0), 15: (9.0, 9.0)})
-    fused = final_map(samples)
+    fused, _ = day(1, (3, 9, 15), wrong={3: (30.0, 0.0), 9: (0.0, 40.0), 15: (9.0, 9.0)})
     assert fused.frame == "r1/1"
     assert any("the surveyed landmarks not joined" in each for each in fused.reasons)
 
 
 def test_coordinates_of_a_national_grid_lose_no_accuracy():
-    near, _ = day(1, (3, 15), steps=200)
-    far, _ = day(1, (3, 15), steps=200, origin=UTM)
-    a, b = final_map(near), final_map(far)
+    a, _ = day(1, (3, 15))
+    b, _ = day(1, (3, 15), origin=UTM)
     off = floats(b.means, "means").reshape(-1, 2) - UTM - floats(a.means, "means").reshape(-1, 2)
     assert np.abs(off).max() < 1e-4
     assert b.frame == SURVEY_FRAME
 
 
 def test_every_map_is_computed_again_from_the_log():
-    samples, _ = day_once(1, (3, 15))
     recorded = Recorded()
-    recorded.take_all(samples)
+    recorded.take_all(live_day())
     computed = recomputed_centre(recorded)
     maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
     for each in maps:
@@ -163,16 +166,13 @@ def test_a_meaningless_survey_is_refused_with_the_reason(surveyed, fusion, words
 def test_the_saved_map_of_a_surveyed_day_keeps_its_frame_on_later_days():
     maps = []
     for seed in (1, 2, 3):
-        scenario, streams = world_of(seed, ("*",), 300)
-        surveyed = surveyed_landmarks(seed, streams, (3, 9, 15)) if seed == 1 else ()
-        samples, centre = team(scenario, streams, surveyed, maps)
+        surveyed = surveyed_landmarks(seed, (3, 9, 15)) if seed == 1 else ()
+        fused, centre = fold_drive(seed, surveyed, maps=maps)
         maps = [centre.maps.fold.save_map(f"day{seed}")]
-        fused = final_map(samples)
         assert fused.frame == maps[0].frame == SURVEY_FRAME
-        assert not evaluate(samples).arbitrary_frame
-    assert errors(fused, streams)[0] < 0.3
+    assert errors(fused, drive(3)[1])[0] < 0.3
     assert not any("second time" in each for each in fused.reasons)
-    samples, _ = team(scenario, streams, surveyed_landmarks(3, streams, (3,)), maps)
-    assert any("second time" in each for each in final_map(samples).reasons)
+    fused, _ = fold_drive(3, surveyed_landmarks(3, (3,)), maps=maps)
+    assert any("second time" in each for each in fused.reasons)
     with pytest.raises(SavedMapError, match="surveyed"):
         map_name("survey")
