@@ -1,7 +1,7 @@
 """Saved maps and the fold: save its final map, and list what has changed since earlier days."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import metadata
 
 import numpy as np
@@ -34,10 +34,15 @@ class NothingToSaveError(ValueError):
 
 
 def save_map(
-    fold: Fold, fused: m.FusedMap, name: str, before: Mapping[str, m.SavedMap], day: bytes
+    fold: Fold,
+    fused: m.FusedMap,
+    name: str,
+    before: Mapping[str, m.SavedMap],
+    firsts: Collection[bytes],
 ) -> m.SavedMap:
     """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
-    day: digest of the day's first submap, by which all maps of one day are known.
+    firsts: digest of the first submap of each robot's stream in the map, by which maps with
+    measurements in common are recognised.
 
     With the biases c that all sensors share, the landmarks x are N(x̄ + S (c − c̄), P − S C Sᵀ) given
     c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out. One that moved by e, which
@@ -61,7 +66,8 @@ def save_map(
             at, e = 2 * chosen.index(each.landmark), np.array([each.dx, each.dy])
             given[at : at + 2, at : at + 2] += np.outer(e, e)
     frame = fold.frame
-    earlier = [before[robot] for robot, _ in fold.home if robot in before]
+    joined = [stream for stream, key in fold.home.items() if key == fold.main_key]
+    earlier = [before[robot] for robot, _ in joined if robot in before]
     unnamed = [id_ for id_ in chosen if id_ >= UNNAMED]
     numbers = [id_ for id_ in chosen if id_ < UNNAMED]
     return m.SavedMap(
@@ -74,7 +80,7 @@ def save_map(
         sensitivity=from_floats(rows),
         counts=from_ids(_counts(island, chosen, before)),
         frame="" if frame is None else translate.frame_name(*frame),
-        sets=tuple(sorted({day, *(one for each in earlier for one in each.sets)})),
+        sets=tuple(sorted({*firsts, *(one for each in earlier for one in each.sets)})),
         software=metadata.version("teamslam"),
         core=core.digest[:16],
     )

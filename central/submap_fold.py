@@ -129,16 +129,18 @@ class SubmapFold:
         if self._final is None or not self._final[0].contributions:
             raise NothingToSaveError("there is no final map with a landmark")
         before = {saved.author: saved for saved in self.store.maps.values()}
-        return save_map(*self._final, name, before, digest_of(encoded(self._first_submap())))
+        return save_map(*self._final, name, before, self._first_submaps(self._final[0]))
 
-    def _first_submap(self) -> m.Submap:
-        """Return the first submap of the final map: every later map of its team has it, too."""
-        assert self._final is not None
-        streams = {whole_of(stream) for stream in self._final[0].home if not is_map(stream)}
-        firsts = [self.store.chains[stream][0] for stream in sorted(streams)]
-        if not firsts:
+    def _first_submaps(self, fold: Fold) -> list[bytes]:
+        """List the digests of the first submaps of the robots' streams in the team's map.
+
+        Two maps of a team have a measurement in common only if they have a stream in common.
+        """
+        main = [stream for stream, key in fold.home.items() if key == fold.main_key]
+        streams = {whole_of(stream) for stream in main if not is_map(stream)}
+        if not streams:
             raise NothingToSaveError("no robot has a submap in the final map")
-        return min(firsts, key=lambda each: each.stamp_ns)
+        return [digest_of(encoded(self.store.chains[stream][0])) for stream in sorted(streams)]
 
     def _file_members(self) -> None:
         """Add the store's new members to the ticks; folded ticks are folded again."""

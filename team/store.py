@@ -125,7 +125,7 @@ class SubmapStore:
 
         Its start is unknown, or the origin if its frame is the survey's.
 
-        Law 1: two maps with a set in common would count its measurements twice.
+        Law 1: two maps with a stream in common would count its measurements twice.
         """
         for other in self.maps.values():
             if other.name != saved.name and {*other.sets} & {*saved.sets}:

@@ -171,10 +171,29 @@ def test_a_running_centre_saves_the_map_of_its_present_set():
     whole = decoded(half.answer_site(request)[0], m.SavedMap)
     assert whole == first_day()[1]
     assert early.sets == whole.sets
+    assert len(whole.sets) == len(robots)
     assert (
         np.diag(unpacked(floats(early.covariance, "covariance"), 36)).sum()
         > np.diag(unpacked(floats(whole.covariance, "covariance"), 36)).sum()
     )
+
+
+def test_two_saves_of_a_day_count_once_though_an_earlier_robot_came_between():
+    """Each names the streams in it: the second save has the first one's among others."""
+    samples, centre, _ = second_day(loaded=False)
+    fold = type(centre.maps.fold)(centre.config, centre.config_digest)
+    saves = []
+    for robot in ("r2", "r1"):
+        for sample in samples:
+            message = opened(sample)[2]
+            if isinstance(message, m.InitialPose | m.Submap) and message.robot == robot:
+                fold.store.add(message)
+        fold.make_map("final")
+        saves.append(fold.save_map(f"after_{robot}"))
+    assert [len(each.sets) for each in saves] == [1, 2]
+    store = SubmapStore()
+    assert store.add(saves[0]) is None
+    assert "in common" in str(store.add(saves[1]))
 
 
 def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
@@ -186,7 +205,7 @@ def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
     def covariance(chi2):
         moved = m.LandmarkChange(landmark=15, state="moved", dx=by[0], dy=by[1], chi2=chi2)
         saved = save_map(
-            fold, msgspec.structs.replace(fused, changes=(moved,)), "later", {}, bytes(8)
+            fold, msgspec.structs.replace(fused, changes=(moved,)), "later", {}, [bytes(8)]
         )
         return unpacked(floats(saved.covariance, "covariance"), 2 * len(ids(saved.ids, "ids")))
 
@@ -210,10 +229,11 @@ def elsewhere(points):
 
 @pytest.mark.parametrize("change", [lambda points: points * [1.0, -1.0], elsewhere])
 def test_a_mirrored_map_or_one_of_another_site_is_refused_and_changes_nothing(change):
-    samples, _, _ = day(1001, [with_means(change)])
+    samples, centre, _ = day(1001, [with_means(change)])
     fused = final_map(samples)
     assert numbers(fused) == numbers(final_map(second_day(loaded=False)[0]))
     assert any("the saved map site not joined" in each for each in fused.reasons)
+    assert not {*centre.maps.fold.save_map("later").sets} & {*first_day()[1].sets}
 
 
 def test_a_map_of_which_half_the_landmarks_have_moved_is_withdrawn_and_changes_nothing():
@@ -269,7 +289,7 @@ def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
             maps = [centre.maps.fold.save_map(f"day{each}")]
             figures.append((each, *errors(final_map(samples), streams)))
             sizes.append(len(maps[0].covariance))
-        assert len(maps[0].sets) == 4
+        assert len(maps[0].sets) == 8
     assert len(set(sizes)) == 1
     first = np.mean([rmse for each, rmse, _ in figures if each == 0])
     last = np.mean([rmse for each, rmse, _ in figures if each == 3])

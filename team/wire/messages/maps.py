@@ -32,7 +32,7 @@ ChangeState = Literal["unchanged", "moved", "gone", "new"]
 MOST_SAVED = 2000
 """Most landmarks of a saved map, whose joint covariance has 64 MB."""
 MOST_SETS = 10_000
-"""Most sets in a saved map: one a day for 27 years."""
+"""Most streams in a saved map: five a day for five years."""
 
 
 class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
@@ -293,9 +293,9 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     `biases` taken as zero. biases: errors that all sensors share on every day, ascending;
     sensitivity: B × 2L floats: given these errors b the means are means + bᵀ sensitivity. Errors of
     single robots are part of the covariance. counts: number of submaps of each landmark, those of
-    earlier days included. frame: as in FusedMap. sets: for each day in it the digest of that day's
-    first submap, ascending: two maps with a day in common cannot be joined. software, core: version
-    of the program, digest of the native core.
+    earlier days included. frame: as in FusedMap. sets: digests of the first submap of each robot's
+    stream in it, on all days, ascending: two maps with a stream in common cannot be joined.
+    software, core: version of the program, digest of the native core.
     """
 
     name: Name
