@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import msgspec
-
 from teamslam.sim.datasets.kinds import UTIAS_MARKER
 from teamslam.sim.datasets.tables import open_data_set as opened_set
 from teamslam.sim.datasets.utias import present_robots
@@ -33,11 +31,8 @@ def own_scenario(path: Path) -> str | None:
 
 def _read_with_its_robots(path: Path) -> Scenario:
     """Data set's scenario with all robots that have files."""
-    own = scenario_beside(path)
-    if own != "utias":
-        return with_present_robots(with_options(load(own), dataset=path))[0]
-    with opened_set(str(path), UTIAS_MARKER) as files:
-        present = present_robots(files)
-    scenario = with_options(load("utias"), robots=max(present, default=None), dataset=path)
-    robots = tuple(robot for robot in scenario.robots if int(robot.id[1:]) in present)
-    return msgspec.structs.replace(scenario, robots=robots or scenario.robots)
+    own, robots = scenario_beside(path), None
+    if own == "utias":
+        with opened_set(str(path), UTIAS_MARKER) as files:
+            robots = max(present_robots(files), default=None)
+    return with_present_robots(with_options(load(own), robots=robots, dataset=path))[0]

@@ -15,21 +15,6 @@ def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
     return packed[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
 
 
-def polar_covariances(
-    x: Float[np.ndarray, " N"],
-    y: Float[np.ndarray, " N"],
-    r: Float[np.ndarray, " N"],
-    packed: Float[np.ndarray, "N 3"],
-) -> Float[np.ndarray, "N 3"]:
-    """J C Jᵀ as (rr, rb, bb) of points at distance r with packed C; J = ∂(r, bearing)/∂(x, y)."""
-    c, s = x / r, y / r
-    xx, xy, yy = packed.T
-    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
-    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / r
-    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (r * r)
-    return np.column_stack((rr, rb, bb))
-
-
 def numbers_in(
     table: CsvTable, form: tuple[str, ...], forms: Sequence[tuple[str, ...]]
 ) -> Float[np.ndarray, "R _"]:

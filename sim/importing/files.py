@@ -15,10 +15,10 @@ from teamslam.sim.datasets.folder_tables import (
     POLAR_COVARIANCE,
     POSES,
 )
-from teamslam.sim.datasets.some_rows import polar_covariances
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
 from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
 
 QUATERNION = 8

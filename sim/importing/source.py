@@ -16,7 +16,7 @@ from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.bag import import_bag
 from teamslam.sim.importing.bag_topics import propose_topics
-from teamslam.sim.importing.columns import load_map
+from teamslam.sim.importing.columns import MEASURED, load_map
 from teamslam.sim.importing.files import import_files, trajectory
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.recorded.streams import measurements_in
@@ -32,7 +32,6 @@ from teamslam.team.ros2.topics import TopicsError, load_topics
 TEAM_PROFILE, ROS2_PROFILE = b"teamslam", b"ros2"
 HEAD = 64
 """Bytes that contain an MCAP file's profile."""
-MEASURED = ("odometry", "observations", "sightings", "detections")
 
 
 @dataclass(frozen=True)

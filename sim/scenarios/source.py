@@ -1,8 +1,9 @@
 """Streams of a scenario's world of any kind."""
 
 import hashlib
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -21,44 +22,41 @@ from teamslam.sim.world.config import (
     LiveWorld,
     SimulatedWorld,
     UnlabelledWorld,
+    UtiasWorld,
 )
 from teamslam.sim.world.identities import Hiding, with_hidden_identities
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
+from teamslam.team.config import RobotConfig
 from teamslam.team.pairs import NEEDS_MAP
+
+READERS: Mapping[type, Callable[[Any, Sequence[RobotConfig]], WorldStreams]] = {
+    UtiasWorld: utias,
+    FolderWorld: folder,
+    UnlabelledWorld: lambda world, robots: unlabelled(world, len(robots)),
+    GraphWorld: lambda world, robots: graph_world(world, len(robots)),
+}
+"""Reader of each kind of data set."""
 
 
 def streams_of(scenario: Scenario) -> WorldStreams:
     """Simulate the world or read its data set; raises DatasetError."""
-    streams = _make_streams(scenario)
     world = scenario.world
-    if isinstance(world, SimulatedWorld):
-        hiding = Hiding(world.tagged, world.missed, world.clutter, world.visible_to_m)
-        if world.identities == "hidden" or world.missed:
-            hiding = hiding if world.identities == "hidden" else replace(hiding, tagged=1.0)
-            return with_hidden_identities(streams, hiding, noise_seed(scenario))
-        return streams
-    if isinstance(world, UnlabelledWorld | LiveWorld):
-        return streams
-    hidden = world.identities == "hidden"
-    return with_hidden_identities(streams, Hiding(), scenario.seed) if hidden else streams
-
-
-def _make_streams(scenario: Scenario) -> WorldStreams:
-    if isinstance(scenario.world, SimulatedWorld):
-        return simulated(scenario.world, scenario.robots, noise_seed(scenario))
-    if isinstance(scenario.world, UnlabelledWorld):
-        return unlabelled(scenario.world, len(scenario.robots))
-    if isinstance(scenario.world, GraphWorld):
-        return graph_world(scenario.world, len(scenario.robots))
-    if isinstance(scenario.world, FolderWorld):
-        return folder(scenario.world, scenario.robots)
-    if isinstance(scenario.world, LiveWorld):
+    if isinstance(world, LiveWorld):
         raise ScenarioError(
             f"{scenario.name}: a live team has no world: its robots' drivers publish the "
             "measurements (docs/your_robot.md); for recorded data give --dataset"
         )
-    return utias(scenario.world, scenario.robots)
+    if isinstance(world, SimulatedWorld):
+        seed = noise_seed(scenario)
+        streams = simulated(world, scenario.robots, seed)
+        tagged = world.tagged if world.identities == "hidden" else 1.0
+        hiding = Hiding(tagged, world.missed, world.clutter, world.visible_to_m)
+        hides = world.identities == "hidden" or world.missed > 0.0
+        return with_hidden_identities(streams, hiding, seed) if hides else streams
+    streams = READERS[type(world)](world, scenario.robots)
+    hides = world.identities == "hidden" and not isinstance(world, UnlabelledWorld)
+    return with_hidden_identities(streams, Hiding(), scenario.seed) if hides else streams
 
 
 def scenario_beside(path: str | Path) -> str:
@@ -80,10 +78,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
     """
     world = scenario.world
-    if (
-        isinstance(world, SimulatedWorld | LiveWorld | UnlabelledWorld | GraphWorld)
-        or not world.path
-    ):
+    if not isinstance(world, FolderWorld | UtiasWorld) or not world.path:
         return scenario, None
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))

@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from teamslam.sim.world.streams import COLUMNS, NO_LABEL, Detections, RobotStream, WorldStreams
+from teamslam.sim.world.streams import (
+    COLUMNS,
+    NO_LABEL,
+    Detections,
+    RobotStream,
+    WorldStreams,
+    polar_covariances,
+)
 from teamslam.team import core
 from teamslam.team.shapes import Float, UInt32
 
@@ -70,21 +77,10 @@ def _polar_covariances(seen: Detections) -> Float[np.ndarray, "R 3"] | None:
         return seen.covariances
     covariances = seen.covariances.copy()
     rows = ~np.isnan(seen.points[:, 0])
-    covariances[rows] = _of_ranges(seen.points[rows], covariances[rows])
+    x, y = seen.points[rows].T
+    ranges = np.maximum(core.hypot(x, y), 1e-6)
+    covariances[rows] = polar_covariances(x, y, ranges, covariances[rows])
     return covariances
-
-
-def _of_ranges(
-    points: Float[np.ndarray, "n 2"], covariances: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
-    """(rr, rb, bb) of points with (xx, xy, yy): J S Jᵀ with J = ∂(range, bearing)/∂(x, y)."""
-    ranges = np.maximum(core.hypot(points[:, 0], points[:, 1]), 1e-6)
-    c, s = (points / ranges[:, np.newaxis]).T
-    xx, xy, yy = covariances.T
-    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
-    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / ranges
-    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / ranges**2
-    return np.column_stack((rr, rb, bb))
 
 
 def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> Detections:

@@ -314,3 +314,18 @@ def moved(
     """Odometry intervals that measure SE(2) motions."""
     untold = np.zeros(len(end_ns))
     return Intervals(end_ns, duration_ns, untold, untold, False, increments, covariances)
+
+
+def polar_covariances(
+    x: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, " N"],
+    r: Float[np.ndarray, " N"],
+    packed: Float[np.ndarray, "N 3"],
+) -> Float[np.ndarray, "N 3"]:
+    """J C Jᵀ as (rr, rb, bb) of points at distance r with packed C; J = ∂(r, bearing)/∂(x, y)."""
+    c, s = x / r, y / r
+    xx, xy, yy = packed.T
+    rr = c * c * xx + 2.0 * c * s * xy + s * s * yy
+    rb = (c * s * (yy - xx) + (c * c - s * s) * xy) / r
+    bb = (s * s * xx - 2.0 * c * s * xy + c * c * yy) / (r * r)
+    return np.column_stack((rr, rb, bb))
