@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -30,8 +30,7 @@ def calibrate(
         ),
     ],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Write a scenario with the learnt figures."),
+        Path | None, output_option("Write a scenario with the learnt figures.")
     ] = None,
     truth: Annotated[bool, typer.Option(help="Use the ground truth where it is there.")] = True,
     scenario: Annotated[

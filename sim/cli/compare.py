@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from teamslam.central.desk.pictures.style import Form
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import WRONG_USE, JsonFile, fail, warn_of_holes, write_json
 
 app = typer.Typer()
@@ -16,9 +16,7 @@ FEWEST = 2
 @app.command(cls=Command, epilog="teamslam compare runs/first runs/second -o both.png")
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or their logs; two or more.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write the picture here (png, svg, pdf).")
-    ] = None,
+    output: Annotated[Path | None, output_option("Write the picture here (png, svg, pdf).")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Compare runs side by side: a column for each in a table, and a picture with -o."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.help import Command, network, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -55,20 +55,15 @@ def driver(
     connect: Connect = LOOPBACK,
     ros2_connect: Annotated[
         str | None,
-        typer.Option(
+        network(
             help="Where ROS 2 is on Zenoh (rmw_zenoh's router, or a bridge); default: --connect.",
             metavar="ENDPOINT",
-            rich_help_panel=NETWORK,
         ),
     ] = None,
     keys: Keys = None,
     file: Annotated[
         Path | None,
-        typer.Option(
-            help="Where all measurements are kept; default: ROBOT.stream here.",
-            metavar="FILE",
-            rich_help_panel=RARE,
-        ),
+        rare(help="Where all measurements are kept; default: ROBOT.stream here.", metavar="FILE"),
     ] = None,
     start: Annotated[
         str | None,
@@ -79,11 +74,8 @@ def driver(
     ] = None,
     latency: Annotated[
         float,
-        typer.Option(
-            help="Seconds by which landmarks may arrive later than odometry.",
-            min=0.0,
-            metavar="S",
-            rich_help_panel=RARE,
+        rare(
+            help="Seconds by which landmarks may arrive later than odometry.", min=0.0, metavar="S"
         ),
     ] = 0.2,
     answers: Annotated[

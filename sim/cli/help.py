@@ -30,6 +30,21 @@ WIDEST = 100
 WIDE = {"max_content_width": WIDEST}
 
 
+def rare(*names: str, **settings: Any) -> Any:
+    """Option in the section of those that are rarely needed."""
+    return typer.Option(*names, rich_help_panel=RARE, **settings)
+
+
+def network(*names: str, **settings: Any) -> Any:
+    """Option in the section about network and keys."""
+    return typer.Option(*names, rich_help_panel=NETWORK, **settings)
+
+
+def output_option(text: str, **settings: Any) -> Any:
+    """Option `--output`, or `-o`, with this help."""
+    return typer.Option("--output", "-o", help=text, **settings)
+
+
 class _Plain:
     """Help of a command or group in plain sections; its epilog is an example."""
 

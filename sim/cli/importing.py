@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
 
 app = typer.Typer()
@@ -28,9 +28,7 @@ def import_(
             "UTIAS set."
         ),
     ],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for the data set.")
-    ] = None,
+    output: Annotated[Path | None, output_option("Folder for the data set.")] = None,
     robot: Annotated[str | None, typer.Option(help="The robot's name, if it is one.")] = None,
     start: Annotated[
         list[str] | None,

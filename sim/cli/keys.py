@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import WRONG_USE, Robots, fail, scenario_of
 from teamslam.sim.scenarios.scenario import with_options
 
@@ -18,9 +18,7 @@ app = typer.Typer()
 )
 def keys(
     team: Annotated[str, typer.Argument(help="The team's name, as its scenario has it.")],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="The folder; it holds the authority, too.")
-    ],
+    output: Annotated[Path, output_option("The folder; it holds the authority, too.")],
     scenario: Annotated[
         str | None, typer.Option(help="For every robot of a scenario.", metavar="SCENARIO")
     ] = None,
@@ -38,8 +36,7 @@ def keys(
         typer.Option(help="A new certificate for a node, as robot-r1, or all.", metavar="NODE"),
     ] = None,
     revoke: Annotated[
-        list[str] | None,
-        typer.Option(help="Revoke this node's certificate.", metavar="NODE"),
+        list[str] | None, typer.Option(help="Revoke this node's certificate.", metavar="NODE")
     ] = None,
     replay: Annotated[
         bool,

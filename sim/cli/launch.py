@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from teamslam.central.desk.names import data_set_name
-from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.help import Command, network, output_option, rare
 from teamslam.sim.cli.importing import imported_into
 from teamslam.sim.cli.options import (
     ANY_PORT,
@@ -82,12 +82,7 @@ def launch(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="The run's folder; default: a new one below runs/.",
-            metavar="DIR",
-        ),
+        output_option("The run's folder; default: a new one below runs/.", metavar="DIR"),
     ] = None,
     identities: IdentitiesOption = None,
     without_centre: Annotated[
@@ -99,11 +94,7 @@ def launch(
     localise: Localise = False,
     record: Annotated[
         Path | None,
-        typer.Option(
-            help="The log to write; default: log.mcap in the run's folder.",
-            metavar="FILE",
-            rich_help_panel=RARE,
-        ),
+        rare(help="The log to write; default: log.mcap in the run's folder.", metavar="FILE"),
     ] = None,
     json_file: JsonFile = None,
     pieces: Pieces = None,
@@ -112,46 +103,33 @@ def launch(
     peers: Peers = False,
     comm_range: Annotated[
         float | None,
-        typer.Option(
+        rare(
             "--comm-range",
             help="Peers reach each other within this true distance in metres.",
             metavar="M",
             min=0.001,
-            rich_help_panel=RARE,
         ),
     ] = None,
     views: Annotated[
-        bool,
-        typer.Option(
-            help="Record what Foxglove, Lichtblick and Rerun draw, too.", rich_help_panel=RARE
-        ),
+        bool, rare(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
     ] = True,
     end_silent: Annotated[
         float | None,
-        typer.Option(
+        rare(
             help="End a process that is silent for this many seconds, so that it is started "
             "again; default: only name it.",
             min=10.0,
             metavar="S",
-            rich_help_panel=RARE,
         ),
     ] = None,
     port: Port = 0,
     foxglove_port: FoxglovePort = 8765,
     listen: Annotated[
-        str,
-        typer.Option(
-            help="Where the router listens; port 0: any free one.",
-            metavar="ENDPOINT",
-            rich_help_panel=NETWORK,
-        ),
+        str, network(help="Where the router listens; port 0: any free one.", metavar="ENDPOINT")
     ] = ANY_PORT,
     keys: Keys = None,
     insecure: Annotated[
-        bool,
-        typer.Option(
-            help="Without keys, admit everyone who reaches the router.", rich_help_panel=NETWORK
-        ),
+        bool, network(help="Without keys, admit everyone who reaches the router.")
     ] = False,
 ) -> None:
     """Launch a whole team, watch it, and end with a report and a log.

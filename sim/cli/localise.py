@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.launch import launch
 from teamslam.sim.cli.options import Dataset, JsonFile, Robots, Seed, SpeedText
 from teamslam.sim.cli.rerun import rerun
@@ -35,9 +35,7 @@ def localise(
     robots: Robots = None,
     seed: Seed = None,
     speed: SpeedText = "max",
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="The run's folder.", metavar="DIR")
-    ] = None,
+    output: Annotated[Path | None, output_option("The run's folder.", metavar="DIR")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Localise robots in a saved map, without mapping.

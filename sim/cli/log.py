@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.help import Command, Group, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from teamslam.team.recording.tables import Exported
     from teamslam.team.wire.channels import Channel
 
-NewLog = Annotated[Path, typer.Option("--output", "-o", help="The new log.", metavar="FILE")]
+NewLog = Annotated[Path, output_option("The new log.", metavar="FILE")]
 ChannelNames = Annotated[
     str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
 ]
@@ -176,7 +176,7 @@ def merge(
 @app.command(cls=Command, epilog="teamslam log export runs/first -o paths --format tum")
 def export(
     log: LogArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="A new folder.")],
+    output: Annotated[Path, output_option("A new folder.")],
     form: Annotated[
         Format,
         typer.Option(

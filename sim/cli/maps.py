@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.help import Command, Group, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -41,9 +41,7 @@ def save(
         typer.Argument(help="A log, or the folder of its run; without --team.", show_default=False),
     ] = None,
     *,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="The file to write.", metavar="FILE")
-    ],
+    output: Annotated[Path, output_option("The file to write.", metavar="FILE")],
     name: Annotated[
         str | None,
         typer.Option(help="Name of the map, as site; default: that of the file.", metavar="NAME"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.help import Command, output_option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -108,18 +108,14 @@ def world(
     keys: Keys = None,
     speed: SpeedText = "1",
     recorder: Annotated[
-        bool,
-        typer.Option(
-            help="Wait for a recorder before the first measurement.", rich_help_panel=RARE
-        ),
+        bool, rare(help="Wait for a recorder before the first measurement.")
     ] = True,
     cache: Annotated[
         int | None,
-        typer.Option(
+        rare(
             help="Measurements per robot that can be asked for again; default: all.",
             min=0,
             metavar="N",
-            rich_help_panel=RARE,
         ),
     ] = None,
     robots: Robots = None,
@@ -161,20 +157,18 @@ def robot(
     peers: Peers = False,
     store: Annotated[
         Path | None,
-        typer.Option(
+        rare(
             "--set",
             help="With --peers: the file that stores the team's set, of one run only.",
             metavar="FILE",
-            rich_help_panel=RARE,
         ),
     ] = None,
     fold: Annotated[
         str,
-        typer.Option(
+        rare(
             help="With --peers: fold the set always, on request (`teamslam map peer`) and at the "
             "end, or at the end only.",
             metavar="always|request|end",
-            rich_help_panel=RARE,
         ),
     ] = "always",
     map_: MapFiles = None,
@@ -346,9 +340,7 @@ def _central_shell(
 @app.command(cls=Command, epilog="teamslam record waypoints -o team.mcap")
 def record(
     scenario: ScenarioArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="The MCAP file to write.", metavar="FILE")
-    ],
+    output: Annotated[Path, output_option("The MCAP file to write.", metavar="FILE")],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     resume: Annotated[
@@ -360,12 +352,7 @@ def record(
         ),
     ] = False,
     join_parts: Annotated[
-        bool,
-        typer.Option(
-            "--join/--no-join",
-            help="Join the parts of the log at the end.",
-            rich_help_panel=RARE,
-        ),
+        bool, rare("--join/--no-join", help="Join the parts of the log at the end.")
     ] = True,
 ) -> None:
     """Record every message of the team to one MCAP file, until the team has left.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
 import typer
 
-from teamslam.sim.cli.help import NETWORK, RARE
+from teamslam.sim.cli.help import network, rare
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
@@ -56,33 +56,19 @@ MapFiles = Annotated[
     ),
 ]
 Localise = Annotated[
-    bool,
-    typer.Option(
-        "--localise",
-        help="Localise robots in the map of --map, which stays as it is.",
-        rich_help_panel=RARE,
-    ),
+    bool, rare("--localise", help="Localise robots in the map of --map, which stays as it is.")
 ]
 JsonFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--json", help="Write the figures as JSON, too.", metavar="FILE", rich_help_panel=RARE
-    ),
+    Path | None, rare("--json", help="Write the figures as JSON, too.", metavar="FILE")
 ]
 Connect = Annotated[
-    str,
-    typer.Option(
-        help="The router's endpoint, as tcp/HOST:PORT.",
-        metavar="ENDPOINT",
-        rich_help_panel=NETWORK,
-    ),
+    str, network(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
 ]
 Keys = Annotated[
     Path | None,
-    typer.Option(
+    network(
         help="Folder with the certificate of this process, as `teamslam keys` makes them.",
         metavar="DIR",
-        rich_help_panel=NETWORK,
     ),
 ]
 ASSUMED_NAME = "recorded"
@@ -101,22 +87,16 @@ Seed = Annotated[
 ]
 Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 1000.", metavar="N")]
 Peers = Annotated[
-    bool,
-    typer.Option(
-        "--peers",
-        help="Each robot keeps the team's set and folds it by itself.",
-        rich_help_panel=RARE,
-    ),
+    bool, rare("--peers", help="Each robot keeps the team's set and folds it by itself.")
 ]
 Pieces = Annotated[
     int | None,
-    typer.Option(
+    rare(
         help="Cut the log of a data set of one robot into this many robots with unknown "
         "initial poses.",
         min=1,
         max=100,
         metavar="N",
-        rich_help_panel=RARE,
     ),
 ]
 IdentitiesOption = Annotated[
@@ -126,14 +106,8 @@ IdentitiesOption = Annotated[
         metavar="WHICH",
     ),
 ]
-EstimatorOption = Annotated[
-    str | None,
-    typer.Option(help=_either(Estimator), metavar="NAME", rich_help_panel=RARE),
-]
-FusionOption = Annotated[
-    str | None,
-    typer.Option(help=_either(FusionRule), metavar="RULE", rich_help_panel=RARE),
-]
+EstimatorOption = Annotated[str | None, rare(help=_either(Estimator), metavar="NAME")]
+FusionOption = Annotated[str | None, rare(help=_either(FusionRule), metavar="RULE")]
 Dataset = Annotated[
     Path | None,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from teamslam.central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
-from teamslam.sim.cli.help import NETWORK, RARE, Command
+from teamslam.sim.cli.help import Command, network, output_option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -41,35 +41,17 @@ def replay(
     speed: SpeedText = "1",
     connect: Annotated[
         str | None,
-        typer.Option(
-            help="The router to publish at; default: one of our own.",
-            metavar="ENDPOINT",
-            rich_help_panel=NETWORK,
-        ),
+        network(help="The router to publish at; default: one of our own.", metavar="ENDPOINT"),
     ] = None,
     listen: Annotated[
-        str,
-        typer.Option(
-            help="Where our own router listens; port 0: any free one.",
-            metavar="ENDPOINT",
-            rich_help_panel=NETWORK,
-        ),
+        str, network(help="Where our own router listens; port 0: any free one.", metavar="ENDPOINT")
     ] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool,
-        typer.Option(
-            help="Without keys, admit every process that reaches our own router.",
-            rich_help_panel=NETWORK,
-        ),
+        bool, network(help="Without keys, admit every process that reaches our own router.")
     ] = False,
     wait: Annotated[
-        float,
-        typer.Option(
-            help="Seconds between the router's start and the first message.",
-            metavar="S",
-            rich_help_panel=RARE,
-        ),
+        float, rare(help="Seconds between the router's start and the first message.", metavar="S")
     ] = 1.0,
 ) -> None:
     """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
@@ -112,10 +94,8 @@ def report(
     log: LogArgument,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder for the report; default: the run's, or one named like the log beside it.",
+        output_option(
+            "Folder for the report; default: the run's, or one named like the log beside it.",
             metavar="DIR",
         ),
     ] = None,
@@ -225,9 +205,7 @@ def _check_folder(path: Path) -> None:
 @app.command(cls=Command, epilog="teamslam repair team.mcap -o whole.mcap")
 def repair(
     log: LogArgument,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="The new, complete log.", metavar="FILE")
-    ],
+    output: Annotated[Path, output_option("The new, complete log.", metavar="FILE")],
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from teamslam.sim.importing.source import is_own_log

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.help import Command, output_option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -51,12 +51,10 @@ def rerun(
         bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
     ] = False,
     without: Annotated[
-        list[str] | None,
-        typer.Option(help="A robot to leave out; repeatable.", metavar="ROBOT"),
+        list[str] | None, typer.Option(help="A robot to leave out; repeatable.", metavar="ROBOT")
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Folder for a picture of both maps.", metavar="DIR"),
+        Path | None, output_option("Folder for a picture of both maps.", metavar="DIR")
     ] = None,
     particles: Annotated[
         int | None, typer.Option(help="Particles of each robot.", min=4, metavar="N")
@@ -114,10 +112,9 @@ def rerun(
     estimator: EstimatorOption = None,
     unsafe_feedback: Annotated[
         bool,
-        typer.Option(
+        rare(
             "--unsafe-feedback",
             help="Robots send the team's map back as their own: law 1 broken, for comparison.",
-            rich_help_panel=RARE,
         ),
     ] = False,
     json_file: JsonFile = None,

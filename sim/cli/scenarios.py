@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import (
     WRONG_USE,
     IdentitiesOption,
@@ -45,7 +45,7 @@ def scenarios(
 @app.command(cls=Command, epilog="teamslam simulate waypoints -o my_world")
 def simulate(
     scenario: ScenarioArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the data set.")],
+    output: Annotated[Path, output_option("Folder for the data set.")],
     robots: Robots = None,
     seed: Seed = None,
     identities: IdentitiesOption = None,

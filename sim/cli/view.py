@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from teamslam.sim.cli.help import RARE, Command
+from teamslam.sim.cli.help import Command, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -32,22 +32,10 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("teamslam")
 Port = Annotated[
-    int,
-    typer.Option(
-        help="Where the page is served; 0: any free port.",
-        min=0,
-        metavar="PORT",
-        rich_help_panel=RARE,
-    ),
+    int, rare(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
 ]
 FoxglovePort = Annotated[
-    int,
-    typer.Option(
-        help="Where Foxglove can connect; 0: any free port.",
-        min=0,
-        metavar="PORT",
-        rich_help_panel=RARE,
-    ),
+    int, rare(help="Where Foxglove can connect; 0: any free port.", min=0, metavar="PORT")
 ]
 Open = Annotated[
     bool | None,
@@ -82,10 +70,9 @@ def view(
     foxglove_port: FoxglovePort = 8765,
     host: Annotated[
         str,
-        typer.Option(
+        rare(
             help="The address to serve at; others than 127.0.0.1 show it to others.",
             metavar="ADDRESS",
-            rich_help_panel=RARE,
         ),
     ] = "127.0.0.1",
     browser: Open = None,
