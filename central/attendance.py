@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from teamslam.central.robot_attendance import Attendance, Awaited, Least, note
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.newer import further, later_end, later_head
+from teamslam.team.wire.message_order import further, later_end, later_head
 
 _OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
 HasReceived = Callable[[m.Done], bool]

@@ -22,7 +22,7 @@ from teamslam.team.estimation.contribution import (
 )
 from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
-from teamslam.team.estimation.plausible import sighting_beyond, start_beyond, submap_beyond
+from teamslam.team.estimation.plausibility import sighting_beyond, start_beyond, submap_beyond
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
 from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap

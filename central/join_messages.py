@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.fused import JOINT_LANDMARKS, version_entry
+from teamslam.central.fused_map import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
 from teamslam.central.sent_priors import in_main_island
 from teamslam.central.survey import survey_warnings

@@ -11,7 +11,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from teamslam.central.fused import JOINT_LANDMARKS
+from teamslam.central.fused_map import JOINT_LANDMARKS
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Stream, is_map

@@ -9,14 +9,14 @@ from pathlib import Path
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
 from teamslam.central.stored_set import StoredSet
-from teamslam.team.missing import MissingMeasurements
+from teamslam.team.missing_measurements import MissingMeasurements
 from teamslam.team.shell import WAIT_S, Shell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
 from teamslam.team.wire.codec import WireError
-from teamslam.team.wire.patience import Patience
+from teamslam.team.wire.request_times import RequestTimes
 
 LOST_S = 3.0
 """Time [s] after which a lost robot delays no broadcast; the final map still waits for it."""
@@ -64,7 +64,7 @@ class CentralShell:
         self._alive: set[str] = set()
         self._stop = stop
         self._missing = MissingMeasurements(self._shell)
-        self._patience: Patience[tuple[str, int]] = Patience()
+        self._request_times: RequestTimes[tuple[str, int]] = RequestTimes()
         self._greeted: set[str] = set()
         self._orders_due = 0.0
 
@@ -77,11 +77,11 @@ class CentralShell:
         if self.node.config.fusion == "join":
             self._shell.answer(ch.SITE, "", self.node.answer_site)
         self._request_orders()
-        self._shell.look_for_the_end()
+        self._shell.query_end()
         self._restore()
         self._shell.begin()
         while self._shell.going:
-            self._shell.look_for_the_end()
+            self._shell.query_end()
             samples = self._shell.receive()
             if self._stored is not None:
                 self._stored.note(samples)
@@ -194,7 +194,7 @@ class CentralShell:
         self._greeted |= robots.intersection(self.node.robots)
         requested = {(each.robot, each.incarnation): each for each in self.node.lacking()}
         firsts = {stream: each.first for stream, each in requested.items()}
-        for stream in self._patience.due(firsts, time.monotonic()):
+        for stream in self._request_times.due(firsts, time.monotonic()):
             _LOG.warning(
                 "submaps of %s from %d on are missing: asked for",
                 stream[0],

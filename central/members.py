@@ -14,7 +14,7 @@ from weakref import WeakValueDictionary
 from teamslam.team import translate
 from teamslam.team.estimation.contribution import Contribution, is_map
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.plausible import with_least_spread
+from teamslam.team.estimation.plausibility import with_least_spread
 from teamslam.team.wire.digest import Digest
 from teamslam.team.wire.messages import SightingFactor, Submap
 

@@ -17,7 +17,7 @@ import msgspec
 
 from teamslam.central.attendance import TeamAttendance
 from teamslam.central.config import CentralConfig
-from teamslam.central.fused import fused_message
+from teamslam.central.fused_map import fused_message
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
 from teamslam.team.door import Door, absurd

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from teamslam.central.carried_off import cuts_of
 from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose
-from teamslam.central.fused import receivable
+from teamslam.central.fused_map import receivable
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
     Tail,

@@ -24,7 +24,7 @@ from teamslam.team.ros2.keys import publication
 from teamslam.team.ros2.topics import RobotTopics
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, landmark_blocks, stamps
-from teamslam.team.wire.zenoh.foreign import ForeignKeys
+from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
 
 MOST_PATH = 2000
 """Most poses of a path; a longer one keeps every second pose."""

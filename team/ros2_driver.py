@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from teamslam.team.containment import place_of
-from teamslam.team.driver.measured import MeasurementError
+from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from teamslam.team.ros2.decoding import (
     READERS,
@@ -31,7 +31,7 @@ from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token
 from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
 from teamslam.team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
-from teamslam.team.wire.zenoh.foreign import ForeignSample
+from teamslam.team.wire.zenoh.foreign_keys import ForeignSample
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 HELD = 1000

@@ -16,8 +16,8 @@ import msgspec
 
 from teamslam.team.config import MAP
 from teamslam.team.containment import Boundary
+from teamslam.team.end_query import EndQuery
 from teamslam.team.spare_time import SpareTime
-from teamslam.team.the_end import TheEnd
 from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
 from teamslam.team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
 from teamslam.team.wire.codec import WireError, decoded, encoded
@@ -112,7 +112,7 @@ class Shell:
         self.notes: Callable[[], tuple[str, ...]] = tuple
         self.believed: Callable[[Sequence[Sample]], Sequence[Sample]] = lambda samples: samples
         """Filter for the samples that reach the node."""
-        self.the_end = TheEnd(bus, name, ends)
+        self.end_query = EndQuery(bus, name, ends)
         self.take_end: Take = self.take
         """Handler of the samples that end the team and that this node has missed."""
         self._recorder_is_there: bool | None = None
@@ -223,9 +223,9 @@ class Shell:
             self.publish([self.boundary.note(error, Sample(what, b"", 0, 0, -1), "")])
         return None
 
-    def look_for_the_end(self) -> None:
+    def query_end(self) -> None:
         """Query the router periodically for a missed end of the team."""
-        if missed := self.the_end.missed():
+        if missed := self.end_query.missed():
             self.take_end(missed)
 
     def note(self, samples: Iterable[Sample]) -> None:
@@ -357,7 +357,7 @@ class Shell:
         self.begin()
         while self.going:
             self.take(self.believed(self.receive()))
-            self.look_for_the_end()
+            self.query_end()
             self.contained("duty", duty)
             self.report()
         self.report(last=True)

@@ -8,7 +8,7 @@ from teamslam.central.desk.names import in_order
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, sound
-from teamslam.team.wire.newer import later_head
+from teamslam.team.wire.message_order import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0

@@ -96,12 +96,12 @@ def driver(
     import numpy as np
 
     from teamslam.team.driver.driver import Driver, DriverError
-    from teamslam.team.driver.measured import DriverWarning, MeasurementError
+    from teamslam.team.driver.measurement_messages import DriverWarning, MeasurementError
     from teamslam.team.ros2.topics import TopicsError, load_topics
     from teamslam.team.ros2_answers import LiveAnswers, RosPublisher
     from teamslam.team.ros2_driver import Ros2Driver
     from teamslam.team.shell import process
-    from teamslam.team.wire.zenoh.foreign import ForeignKeys
+    from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
 
     logging.captureWarnings(True)
     # A detector lists its tags in any order; measurements stay with their names.

@@ -9,8 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from teamslam.team.end_query import SINCE
 from teamslam.team.shell import PARENT
-from teamslam.team.the_end import SINCE
 
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
 PROGRAM = (sys.executable, "-P", "-m", "teamslam")

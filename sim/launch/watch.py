@@ -12,7 +12,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Sample, shown
 from teamslam.team.wire.codec import WireError
-from teamslam.team.wire.newer import is_newer_map
+from teamslam.team.wire.message_order import is_newer_map
 
 if TYPE_CHECKING:
     from teamslam.sim.launch.truth import LiveErrors

@@ -52,7 +52,7 @@ def run_world(
     bus.watch_alive()
     for robot in robots:
         shell.answer(ch.MEASUREMENTS, robot, node.measurements)
-    shell.look_for_the_end()
+    shell.query_end()
     if shell.going:
         shell.begin()
     if scenario.peers and not scenario.radio.is_perfect:
@@ -67,7 +67,7 @@ def run_world(
             if mismatch not in named:
                 named.add(mismatch)
                 _LOG.warning("%s", mismatch)
-        shell.look_for_the_end()
+        shell.query_end()
         shell.report()
     shell.report(last=True)
     shell.wait_for_recorder(lambda: node.unrecorded > 0, shell.take)

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike
 
 from teamslam.team.config import Bounds
 from teamslam.team.driver import journal as j
-from teamslam.team.driver import measured
+from teamslam.team.driver import measurement_messages
 from teamslam.team.driver.link import Link
-from teamslam.team.driver.measured import DriverWarning, MeasurementError
+from teamslam.team.driver.measurement_messages import DriverWarning, MeasurementError
 from teamslam.team.driver.motion import Odometer, Pose, between
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.keys.roster import KeysError
@@ -92,8 +92,8 @@ class Driver:
         on_message: Callable[[m.Message], None] | None = None,
         map: Path | str | None = None,  # noqa: A002
     ) -> None:
-        if not re.fullmatch(measured.NAME, robot):
-            raise DriverError(f"{robot!r} is no robot's name: {measured.NAMED}")
+        if not re.fullmatch(measurement_messages.NAME, robot):
+            raise DriverError(f"{robot!r} is no robot's name: {measurement_messages.NAMED}")
         self.robot = robot
         self._bounds = Bounds() if bounds is None else bounds
         self._fastest_turn = LIKELY_RAD_S if bounds is None else self._bounds.yaw_rate_rad_s
@@ -152,7 +152,7 @@ class Driver:
         """
         stamp_ns, length_ns = _times(t, duration, "odometry")
         what = f"odometry of {self.robot} at {t} s"
-        v, w = measured.pair(forward, yaw_rate, what)
+        v, w = measurement_messages.pair(forward, yaw_rate, what)
         if abs(w) > self._fastest_turn:
             raise MeasurementError(
                 f"{what}: a yaw rate of {w:g} rad/s is {abs(w) / (2.0 * np.pi):.1f} turns a "
@@ -181,7 +181,9 @@ class Driver:
         The motion is in the frame of its start pose; covariance (3 × 3) in that of its end pose.
         """
         stamp_ns, length_ns = _times(t, duration, "odometry_increment")
-        step = measured.pose_of(increment, f"odometry_increment of {self.robot} at {t} s")
+        step = measurement_messages.pose_of(
+            increment, f"odometry_increment of {self.robot} at {t} s"
+        )
         with self._lock:
             lasts_ns = self._until(stamp_ns, length_ns, "odometry_increment")
             told = None
@@ -202,8 +204,10 @@ class Driver:
 
         covariance: 3 × 3, of the motion since the last call, in the frame of its end pose.
         """
-        stamp_ns = measured.stamp_of(t, "odometry_pose")
-        pose = measured.pose_of((x, y, theta), f"odometry_pose of {self.robot} at {t} s")
+        stamp_ns = measurement_messages.stamp_of(t, "odometry_pose")
+        pose = measurement_messages.pose_of(
+            (x, y, theta), f"odometry_pose of {self.robot} at {t} s"
+        )
         with self._lock:
             lasts_ns = self._until(stamp_ns, None, "odometry_pose", longest_s=AWAY_S)
             before, told, step = self._odometer.pose, None, (0.0, 0.0, 0.0)
@@ -230,8 +234,10 @@ class Driver:
 
         covariances: L × 2 × 2 of (range, bearing); None: the sensor's noise.
         """
-        stamp_ns = measured.stamp_of(t, "observe")
-        seen = measured.observations(self.robot, stamp_ns, ids, (ranges, bearings), covariances)
+        stamp_ns = measurement_messages.stamp_of(t, "observe")
+        seen = measurement_messages.observations(
+            self.robot, stamp_ns, ids, (ranges, bearings), covariances
+        )
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -246,8 +252,8 @@ class Driver:
 
         covariances: L × 2 × 2; None: the sensor's noise of range and bearing.
         """
-        stamp_ns = measured.stamp_of(t, "observe_points")
-        seen = measured.points(self.robot, stamp_ns, ids, xy, covariances)
+        stamp_ns = measurement_messages.stamp_of(t, "observe_points")
+        seen = measurement_messages.points(self.robot, stamp_ns, ids, xy, covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -264,16 +270,18 @@ class Driver:
         classes: a row for each, the probability of its reported class given each class, which is
         that column of the detector's confusion matrix.
         """
-        stamp_ns = measured.stamp_of(t, "detect")
-        seen = measured.detections(self.robot, stamp_ns, (ranges, bearings), covariances, classes)
+        stamp_ns = measurement_messages.stamp_of(t, "detect")
+        seen = measurement_messages.detections(
+            self.robot, stamp_ns, (ranges, bearings), covariances, classes
+        )
         self._see(j.OBSERVATIONS, seen)
 
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
         """Add inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
-        stamp_ns = measured.stamp_of(t, "sight")
-        seen = measured.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
+        stamp_ns = measurement_messages.stamp_of(t, "sight")
+        seen = measurement_messages.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
 
     def fix(
@@ -283,8 +291,8 @@ class Driver:
 
         covariance: 2 × 2 [m²]; None: `gnss.sigma_m` of the robot's configuration.
         """
-        stamp_ns = measured.stamp_of(t, "fix")
-        self._see(j.SIGHTINGS, measured.fix(self.robot, stamp_ns, (x, y), covariance))
+        stamp_ns = measurement_messages.stamp_of(t, "fix")
+        self._see(j.SIGHTINGS, measurement_messages.fix(self.robot, stamp_ns, (x, y), covariance))
 
     # State.
 
@@ -478,12 +486,12 @@ class Driver:
         self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
     ) -> m.Increment:
         what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
-        return measured.sound(
+        return measurement_messages.sound(
             m.Increment(
                 **self._head(stamp_ns),
                 duration_ns=lasts_ns,
                 increment=from_floats(step),
-                covariance=measured.square(covariance, what),
+                covariance=measurement_messages.square(covariance, what),
             ),
             what,
         )
@@ -573,8 +581,8 @@ def _times(
     t: float | Decimal, duration: float | Decimal | None, call: str
 ) -> tuple[int, int | None]:
     """Convert the end and the length of an interval to [ns]."""
-    length_ns = None if duration is None else measured.stamp_of(duration, "a duration")
-    return measured.stamp_of(t, call), length_ns
+    length_ns = None if duration is None else measurement_messages.stamp_of(duration, "a duration")
+    return measurement_messages.stamp_of(t, call), length_ns
 
 
 def _read_map(path: Path, *, with_keys: bool) -> m.SavedMap:
@@ -596,10 +604,10 @@ def _start_of(
     if start is None:
         return b"", b""
     what = f"the start of {robot}"
-    pose = measured.pose_of(start, what)
+    pose = measurement_messages.pose_of(start, what)
     if abs(pose[2]) > 2.0 * np.pi:
         raise MeasurementError(f"{what}: theta is {pose[2]:g}; it is in radians, in one turn")
-    packed = measured.square(covariance, what)
+    packed = measurement_messages.square(covariance, what)
     if covariance is not None:
-        measured.definite(np.asarray(covariance, dtype=np.float64)[np.newaxis], what)
+        measurement_messages.definite(np.asarray(covariance, dtype=np.float64)[np.newaxis], what)
     return from_floats(pose), packed

@@ -10,10 +10,10 @@ import msgspec
 
 from teamslam.team.door import MOST_LIVES
 from teamslam.team.driver.node import SourceNode
+from teamslam.team.end_query import EndQuery
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import KeysError
 from teamslam.team.shell import Shell
-from teamslam.team.the_end import TheEnd
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import BusError
@@ -138,7 +138,7 @@ class Link:
             self._claim_name(bus)
             shell = Shell(bus, self._node, self._name, self._leaving)
             own_ends = (ch.FINAL_MAP, ch.TEAM_FINAL)  # without a centre its own robot's
-            shell.the_end = TheEnd(bus, self._name, own_ends, self._node.journal.robot)
+            shell.end_query = EndQuery(bus, self._name, own_ends, self._node.journal.robot)
             self._node.alive.clear()
             for channel in self._node.listens:
                 bus.subscribe(channel, self._node.journal.robot)
@@ -216,7 +216,7 @@ class Link:
             if self._node.ordered_to_end and self._node.journal.state == "open":
                 with self._lock:
                     self._node.journal.mark("ended")
-            shell.look_for_the_end()
+            shell.query_end()
             shell.report()
             for warning in self._node.warnings[said:]:
                 _LOG.warning("%s", warning)

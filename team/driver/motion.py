@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.team.config import Bounds
-from teamslam.team.driver.measured import MeasurementError, wrapped
+from teamslam.team.driver.measurement_messages import MeasurementError, wrapped
 from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 TOLERANCE = 0.1

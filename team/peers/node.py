@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 from teamslam.team.peers.exchange import is_oversized, list_requested, make_answer, make_request
 from teamslam.team.peers.feed import feed_order, new_of_streams
-from teamslam.team.peers.given import GIVEN_BYTES, Given
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.proofs import Proofs
 from teamslam.team.peers.replica import SHARE, RefusedError, Replica
+from teamslam.team.peers.send_limit import GIVEN_BYTES, Given
 from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

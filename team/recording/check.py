@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 from teamslam.team.recording.counters import Counters
 from teamslam.team.recording.cut import CUT
-from teamslam.team.recording.declared import find_misdeclaration, read_declarations
+from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.inventory import MISSING, Inventory
-from teamslam.team.recording.last_words import LastWords
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.recording.records import check_index
 from teamslam.team.recording.repair import REPAIRED, read_undamaged
+from teamslam.team.recording.unannounced_ends import LastWords
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened, try_open

@@ -14,7 +14,7 @@ from zlib import crc32
 
 import msgspec
 
-from teamslam.team.recording.received import Received
+from teamslam.team.recording.sample_counts import Received
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, try_open

@@ -8,10 +8,10 @@ from contextlib import closing, suppress
 
 import msgspec
 
+from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.replayer import schedule
-from teamslam.team.the_end import TheEnd
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
 from teamslam.team.wire.channels import (
     ALIVE,
@@ -48,7 +48,7 @@ from teamslam.team.wire.messages import (
     SubmapsRequest,
     Tally,
 )
-from teamslam.team.wire.patience import Patience
+from teamslam.team.wire.request_times import RequestTimes
 
 NODE = "recorder"
 PROGRESS_EVERY = 256
@@ -94,7 +94,7 @@ class RecordLoop:
         self._failure: RecorderError | None = None
         self._retry_s = 0.0
         self._inventory = Inventory() if inventory is None else inventory
-        self._patience: Patience[NumberedStream] = Patience()
+        self._request_times: RequestTimes[NumberedStream] = RequestTimes()
         self._reported: dict[tuple[str, int], tuple[int, int]] = {}
         self._missing = set(expected)
         self._alive: set[str] = set()
@@ -229,7 +229,7 @@ class RecordLoop:
     def request_missing(self, now_s: float) -> None:
         """Request long-missing messages from sources and robots, without blocking."""
         self._go_on(now_s)
-        for stream in self._patience.due(self._inventory.gaps, now_s):
+        for stream in self._request_times.due(self._inventory.gaps, now_s):
             kind, robot, incarnation = stream
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
@@ -291,7 +291,7 @@ class RecordLoop:
         message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
-    def check_end(self, end: TheEnd) -> None:
+    def check_end(self, end: EndQuery) -> None:
         """Request a missed end, and remove processes that left unannounced."""
         missed = end.missed()
         if missed and not self._has_ended:
@@ -348,7 +348,7 @@ def record(
         loop.write_scenario(scenario)
         due = time.monotonic()
         remind_due = due + _REMIND_S
-        end = TheEnd(bus, NODE, ENDS if peers else (FINAL_MAP,))
+        end = EndQuery(bus, NODE, ENDS if peers else (FINAL_MAP,))
         while not stop.is_set():
             if loop.finished:
                 # A token has priority over data: overtaken messages still arrive.

@@ -12,7 +12,7 @@ import msgspec
 
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.containment import reply_of
-from teamslam.team.missing import ASK_TIMEOUT_S, MissingMeasurements
+from teamslam.team.missing_measurements import ASK_TIMEOUT_S, MissingMeasurements
 from teamslam.team.robot.node import robot_node
 from teamslam.team.shell import RECORDER, Shell
 from teamslam.team.wire import channels as ch
@@ -72,7 +72,7 @@ class RobotShell:
         self._be_the_only_one()
         self._subscribe()
         self.shell.answer(ch.SENT, name, lambda request: self.node.answer_submaps(request))
-        self.shell.look_for_the_end()
+        self.shell.query_end()
         if not self.node.finished and self._resume():
             self._catch_up()
         self._look_for_driver()

@@ -21,11 +21,11 @@ from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
 from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.estimation.plausible import start_beyond
+from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.scans import Scan, sensible
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import UNMEASURED, Rejection
-from teamslam.team.robot.classified import classify_landmarks
+from teamslam.team.robot.landmark_classes import classify_landmarks
 from teamslam.team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
 from teamslam.team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses

@@ -22,7 +22,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.map_joining.conditioning import pose_now
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
-from teamslam.team.estimation.plausible import are_landmarks
+from teamslam.team.estimation.plausibility import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float
 

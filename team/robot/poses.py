@@ -16,7 +16,7 @@ import numpy as np
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
-from teamslam.team.estimation.plausible import prior_beyond
+from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.own_map import OwnMap
 from teamslam.team.robot.statements import MessageWriter
@@ -25,7 +25,7 @@ from teamslam.team.robot.team_map import TeamMap
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
-from teamslam.team.wire.newer import is_newer_prior
+from teamslam.team.wire.message_order import is_newer_prior
 
 
 @runtime_checkable

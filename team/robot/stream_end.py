@@ -3,7 +3,7 @@
 from teamslam.team.stream.inbox import Inbox
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.newer import later_end, later_head
+from teamslam.team.wire.message_order import later_end, later_head
 
 
 class EndOfStream:

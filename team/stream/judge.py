@@ -6,7 +6,7 @@ import numpy as np
 
 from teamslam.team.config import Bounds
 from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.estimation.plausible import is_motion_spread as _spread
+from teamslam.team.estimation.plausibility import is_motion_spread as _spread
 from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Bool, Float
 

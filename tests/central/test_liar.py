@@ -22,7 +22,7 @@ from teamslam.team.estimation.gaussian import deviation
 from teamslam.team.estimation.map_joining.joining import converged
 from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
-from teamslam.team.estimation.plausible import with_least_spread
+from teamslam.team.estimation.plausibility import with_least_spread
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

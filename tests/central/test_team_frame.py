@@ -16,7 +16,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_ids, ids
 from teamslam.team.wire.bus import Outgoing
-from teamslam.team.wire.newer import is_newer_map
+from teamslam.team.wire.message_order import is_newer_map
 from tests import build
 from tests.teams import config, published, stream
 

@@ -15,10 +15,10 @@ from shutil import copytree
 import msgspec
 import pytest
 
+from teamslam.team.end_query import EndQuery
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import load_roster, nodes_of
-from teamslam.team.the_end import TheEnd
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened, replied
@@ -167,7 +167,7 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
             ]
 
         def ends(bus: ZenohBus, *channels: ch.Channel) -> list[Sample]:
-            end = TheEnd(bus, "robot/r1", channels or (ch.FINAL_MAP,))
+            end = EndQuery(bus, "robot/r1", channels or (ch.FINAL_MAP,))
             end._began -= 3600.0
             return end.missed()
 
@@ -219,7 +219,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(keys, *, locked
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
             found += answers(robot, ch.SUBMAPS, "", build.submaps_request())
-            ended = TheEnd(robot).missed()
+            ended = EndQuery(robot).missed()
         finally:
             over.set()
             serving.join()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from teamslam.central.fused import fused_message, version_entry
+from teamslam.central.fused_map import fused_message, version_entry
 from teamslam.central.join_messages import Tail
 from teamslam.central.node import CentralNode
 from teamslam.central.submap_fold import RecordedFields, SubmapFold

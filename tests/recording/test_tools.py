@@ -17,7 +17,7 @@ from teamslam.team.recording.check import check_log
 from teamslam.team.recording.counters import Counters
 from teamslam.team.recording.csv_tables import export_csv
 from teamslam.team.recording.cut import cut
-from teamslam.team.recording.declared import find_misdeclaration, read_declarations
+from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.merge import MERGED, merge
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder

@@ -9,7 +9,7 @@ from teamslam.team.config import Bounds
 from teamslam.team.estimation.gaussian import PoseGaussian, curved
 from teamslam.team.estimation.map_joining.conditioning import followed
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.plausible import prior_beyond
+from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.team_map import CONDENSED, TeamMap
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

@@ -16,8 +16,8 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import NO_LABEL
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
-from teamslam.team.driver import measured
-from teamslam.team.driver.measured import MeasurementError
+from teamslam.team.driver import measurement_messages
+from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.rejection import Rejection
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -150,10 +150,10 @@ def test_a_tables_class_is_a_column_of_the_confusion_matrix(tmp_path):
 
 def test_a_driver_gives_probabilities_and_a_wrong_shape_is_named():
     given = [[0.9, 0.1], [0.2, 0.8]]
-    seen = measured.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given)
+    seen = measurement_messages.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given)
     assert np.allclose(np.exp(translate.classes_of(seen, 2)), given)
     with pytest.raises(MeasurementError, match="one row for each of 2"):
-        measured.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given[:1])
+        measurement_messages.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given[:1])
 
 
 def test_a_submaps_landmark_has_the_sum_of_its_detections(tmp_path):

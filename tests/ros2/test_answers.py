@@ -16,7 +16,7 @@ from teamslam.team.ros2_answers import Answers, LiveAnswers, RosPublisher
 from teamslam.team.translate import landmark_blocks_of
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
-from teamslam.team.wire.zenoh.foreign import ForeignKeys
+from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import example, packed, spd, wait_until
 

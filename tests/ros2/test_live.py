@@ -13,7 +13,7 @@ import zenoh.ext
 
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.driver.journal import Journal
-from teamslam.team.driver.measured import MeasurementError
+from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
 from teamslam.team.ros2.keys import of_rmw, of_token
@@ -21,7 +21,7 @@ from teamslam.team.ros2.topics import RobotTopics, TopicsError, load_topics
 from teamslam.team.ros2.translator import Measured
 from teamslam.team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
 from teamslam.team.wire.digest import configured
-from teamslam.team.wire.zenoh.foreign import ForeignKeys, ForeignSample
+from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
 

@@ -13,7 +13,7 @@ from teamslam.team.ros2.topics import RobotTopics, Topics
 from teamslam.team.ros2_driver import Ros2Driver
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.zenoh.foreign import ForeignSample
+from teamslam.team.wire.zenoh.foreign_keys import ForeignSample
 from tests import build
 from tests.ros2 import messages as ros
 from tests.teams import world_of

@@ -10,8 +10,8 @@ import pytest
 import zenoh
 from zenoh.handlers import Callback
 
-from teamslam.team import the_end
-from teamslam.team.the_end import TheEnd
+from teamslam.team import end_query
+from teamslam.team.end_query import EndQuery
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
@@ -509,19 +509,19 @@ def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint
 def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, monkeypatch):
     first, final = (f for f in [FINAL, msgspec.structs.replace(FINAL, dof=99)])
     with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
-        assert TheEnd(centre).missed() == []
+        assert EndQuery(centre).missed() == []
         centre.publish(Outgoing(c.FINAL_MAP, "", first))
         centre.publish(Outgoing(c.FINAL_MAP, "", final))
-        wait_until(lambda: bool(TheEnd(centre).missed()))
-        assert TheEnd(stranger).missed() == []
+        wait_until(lambda: bool(EndQuery(centre).missed()))
+        assert EndQuery(stranger).missed() == []
     with ZenohBus("t", endpoint) as straggler:
-        (sample,) = TheEnd(straggler).missed()
+        (sample,) = EndQuery(straggler).missed()
         assert decoded(sample.payload, m.FusedMap) == final
         assert (sample.key, sample.stamp_ns) == (c.FINAL_MAP.key(), final.stamp_ns)
-        monkeypatch.setattr(the_end, "_STARTED", time.monotonic())
-        assert TheEnd(straggler).missed() == [], "a process begins that knows nothing of that run"
-        monkeypatch.setenv(the_end.SINCE, str(time.time_ns() - 60 * 10**9))
-        assert TheEnd(straggler).missed(), "whoever started it says that it belongs to that run"
+        monkeypatch.setattr(end_query, "_STARTED", time.monotonic())
+        assert EndQuery(straggler).missed() == [], "a process begins that knows nothing of that run"
+        monkeypatch.setenv(end_query.SINCE, str(time.time_ns() - 60 * 10**9))
+        assert EndQuery(straggler).missed(), "whoever started it says that it belongs to that run"
 
 
 def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):

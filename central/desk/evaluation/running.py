@@ -14,7 +14,7 @@ from teamslam.central.desk.evaluation.errors import (
     interpolate_truth,
     pose_errors,
 )
-from teamslam.central.fused import START_POSES
+from teamslam.central.fused_map import START_POSES
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.estimation.consistency import chi2_quantile, nees

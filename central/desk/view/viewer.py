@@ -9,8 +9,8 @@ import msgspec
 from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
 from teamslam.central.desk.view.export import Viewing, for_viewer
 from teamslam.team.containment import Boundary
+from teamslam.team.end_query import EndQuery
 from teamslam.team.shell import STATUS_S, WAIT_S, judge
-from teamslam.team.the_end import TheEnd
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Bus, Outgoing
 from teamslam.team.wire.messages import FusedMap, Status
@@ -31,7 +31,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
     bus.watch_alive()
     bus.declare_alive(NODE)
     published = 0
-    end = TheEnd(bus, NODE, ch.ENDS if peers else (ch.FINAL_MAP,))
+    end = EndQuery(bus, NODE, ch.ENDS if peers else (ch.FINAL_MAP,))
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None

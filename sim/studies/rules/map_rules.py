@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.fused import fused_message
+from teamslam.central.fused_map import fused_message
 from teamslam.sim.studies.rules.centre import ComparisonCentre, recorded_maps
 from teamslam.sim.studies.rules.map_fusion import fused_totally, kalman
 from teamslam.team import translate

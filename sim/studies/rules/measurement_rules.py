@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.fused import START_POSES, fused_message
+from teamslam.central.fused_map import START_POSES, fused_message
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.rules.centre import ComparisonCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
@@ -17,7 +17,7 @@ from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
-from teamslam.team.estimation.plausible import start_beyond
+from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.se2 import Pose, inverse
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

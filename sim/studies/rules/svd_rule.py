@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.fused import fused_message, version_entry
+from teamslam.central.fused_map import fused_message, version_entry
 from teamslam.central.join_messages import Tail
 from teamslam.central.node import CentralNode
 from teamslam.central.submap_fold import RecordedFields, SubmapFold
@@ -31,7 +31,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import named
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.plausible import start_beyond, submap_beyond
+from teamslam.team.estimation.plausibility import start_beyond, submap_beyond
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.store import Stream, SubmapStore

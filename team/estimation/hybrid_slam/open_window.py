@@ -23,7 +23,7 @@ from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
 from teamslam.team.estimation.hybrid_slam.window import Window
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.mount import of_base
-from teamslam.team.estimation.plausible import submap_beyond
+from teamslam.team.estimation.plausibility import submap_beyond
 from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.estimation.submap import LocalMap
 

@@ -20,7 +20,7 @@ from teamslam.team.wire.messages import KeptRequest
 from teamslam.team.wire.zenoh.access import access_control
 from teamslam.team.wire.zenoh.attachment import AttachmentError, unpack
 from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
-from teamslam.team.wire.zenoh.stored import StoredMessages
+from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 
 if TYPE_CHECKING:  # not needed without keys
     from teamslam.team.keys.credentials import Credentials

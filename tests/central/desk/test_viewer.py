@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from teamslam.central.desk.view.viewer import run_viewer
-from teamslam.team import the_end
+from teamslam.team import end_query
 from teamslam.team.shell import FaultyRunError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -20,7 +20,7 @@ FINAL = next(message for message in examples() if isinstance(message, m.FusedMap
 
 @pytest.mark.parametrize("lost", [(), ("r2",)])
 def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(lost, monkeypatch):
-    monkeypatch.setattr(the_end, "FINAL_S", 0.1)
+    monkeypatch.setattr(end_query, "FINAL_S", 0.1)
     final = msgspec.structs.replace(FINAL, final=True, lost=lost, withdrawn=())
     network = MemoryNetwork()
     router = MemoryBus(network)
@@ -45,7 +45,7 @@ def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(lost, m
 
 def test_a_viewer_of_a_team_with_a_centre_does_not_end_by_a_robots_own_map(monkeypatch):
     """The robot's map, which names r2 as lost, is there before the centre's."""
-    monkeypatch.setattr(the_end, "FINAL_S", 0.1)
+    monkeypatch.setattr(end_query, "FINAL_S", 0.1)
     true = msgspec.structs.replace(FINAL, final=True, lost=(), withdrawn=())
     forged = msgspec.structs.replace(true, lost=("r2",))
     network = MemoryNetwork()

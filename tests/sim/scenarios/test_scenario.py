@@ -18,7 +18,7 @@ from teamslam.sim.scenarios.scenario import (
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import former_names
 from teamslam.team.association import AssociationProfile
-from teamslam.team.driver.measured import MeasurementError, observations
+from teamslam.team.driver.measurement_messages import MeasurementError, observations
 from teamslam.team.pairs import PAIRS
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded

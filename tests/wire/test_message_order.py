@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.newer import further, is_newer_map, is_newer_prior, later_end
+from teamslam.team.wire.message_order import further, is_newer_map, is_newer_prior, later_end
 from tests import build
 from tests.support import example
 

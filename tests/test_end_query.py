@@ -2,7 +2,7 @@
 
 import pytest
 
-from teamslam.team.the_end import TheEnd
+from teamslam.team.end_query import EndQuery
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Sample
@@ -40,6 +40,6 @@ def bus():
     ids=["with a centre", "peers", "a driver", "by conclusions"],
 )
 def test_only_the_ends_that_the_team_has_are_taken(bus, ends, robot, taken):
-    end = TheEnd(bus, "robot/r2", ends, robot)
+    end = EndQuery(bus, "robot/r2", ends, robot)
     assert end.missed() == [Sample(key, encoded(FINAL), 3, 4, 5) for key in taken]
     assert end.missed() == [], "it asks again only after a while"

@@ -12,7 +12,7 @@ K = TypeVar("K", bound=Hashable)
 
 
 @dataclass
-class Patience(Generic[K]):
+class RequestTimes(Generic[K]):
     """Gaps by name, each with the time of its beginning and of its next request."""
 
     _gaps: dict[K, tuple[Hashable, float, float]] = field(default_factory=dict)

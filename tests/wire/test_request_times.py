@@ -2,13 +2,13 @@
 
 import itertools
 
-from teamslam.team.wire.patience import LONGEST_S, PATIENCE_S, Patience
+from teamslam.team.wire.request_times import LONGEST_S, PATIENCE_S, RequestTimes
 
 
 def asked(gap_of, seconds=40.0):
-    patience = Patience()
+    times = RequestTimes()
     times = [0.1 * tick for tick in range(round(10 * seconds))]
-    return [now for now in times if patience.due({"r1": gap_of(now)}, now)]
+    return [now for now in times if times.due({"r1": gap_of(now)}, now)]
 
 
 def test_a_gap_that_stands_is_asked_for_with_longer_and_longer_pauses():
@@ -24,6 +24,6 @@ def test_a_gap_that_changes_has_new_patience():
 
 
 def test_a_gap_that_was_closed_and_opens_again_has_new_patience():
-    patience = Patience()
-    assert patience.due({"r1": 3}, 0.0) == patience.due({}, 1.0) == patience.due({"r1": 3}, 2.0)
-    assert patience.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]
+    times = RequestTimes()
+    assert times.due({"r1": 3}, 0.0) == times.due({}, 1.0) == times.due({"r1": 3}, 2.0)
+    assert times.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]

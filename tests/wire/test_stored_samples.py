@@ -7,8 +7,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, replied
 from teamslam.team.wire.codec import WireError, encoded
-from teamslam.team.wire.zenoh import stored as stored_module
-from teamslam.team.wire.zenoh.stored import StoredMessages
+from teamslam.team.wire.zenoh import stored_samples as stored_module
+from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 from tests import build
 from tests.support import example
 

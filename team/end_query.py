@@ -30,7 +30,7 @@ def _forked() -> None:
 os.register_at_fork(after_in_child=_forked)
 
 
-class TheEnd:
+class EndQuery:
     """Query the router for the samples that end the team of this process.
 
     A restarted, stopped or disconnected process receives the end in this way. An end that is older
