@@ -6,9 +6,9 @@ from teamslam.team.wire.request_times import LONGEST_S, PATIENCE_S, RequestTimes
 
 
 def asked(gap_of, seconds=40.0):
-    times = RequestTimes()
+    requests = RequestTimes()
     times = [0.1 * tick for tick in range(round(10 * seconds))]
-    return [now for now in times if times.due({"r1": gap_of(now)}, now)]
+    return [now for now in times if requests.due({"r1": gap_of(now)}, now)]
 
 
 def test_a_gap_that_stands_is_asked_for_with_longer_and_longer_pauses():
@@ -24,6 +24,6 @@ def test_a_gap_that_changes_has_new_patience():
 
 
 def test_a_gap_that_was_closed_and_opens_again_has_new_patience():
-    times = RequestTimes()
-    assert times.due({"r1": 3}, 0.0) == times.due({}, 1.0) == times.due({"r1": 3}, 2.0)
-    assert times.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]
+    requests = RequestTimes()
+    assert requests.due({"r1": 3}, 0.0) == times.due({}, 1.0) == times.due({"r1": 3}, 2.0)
+    assert requests.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]
