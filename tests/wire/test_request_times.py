@@ -25,5 +25,5 @@ def test_a_gap_that_changes_has_new_patience():
 
 def test_a_gap_that_was_closed_and_opens_again_has_new_patience():
     requests = RequestTimes()
-    assert requests.due({"r1": 3}, 0.0) == times.due({}, 1.0) == times.due({"r1": 3}, 2.0)
+    assert requests.due({"r1": 3}, 0.0) == requests.due({}, 1.0) == requests.due({"r1": 3}, 2.0)
     assert requests.due({"r1": 3}, 2.0 + PATIENCE_S) == ["r1"]
