@@ -14,6 +14,7 @@ from teamslam.team.config import (
     NonNegative,
     Positive,
 )
+from teamslam.team.geodesy import Datum
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,8 +85,9 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
     thresholds for merging landmarks without identities, by kind of sensor. surveyed: landmarks at
-    known places, which fix the team's frame. localise: robots are localised in the loaded saved
-    map, which is neither changed nor extended; under `join`.
+    known places, which fix the team's frame. datum: latitude and longitude of that frame's origin,
+    where x is east and y is north: results are given in degrees, too. localise: robots are
+    localised in the loaded saved map, which is neither changed nor extended; under `join`.
     """
 
     fusion: FusionRule = "join"
@@ -107,6 +109,7 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     landmark_sigma: NonNegative = 0.0
     localise: bool = False
     surveyed: Annotated[tuple[SurveyedLandmark, ...], Meta(max_length=1000)] = ()
+    datum: Datum | None = None
 
     def __post_init__(self) -> None:
         if len({each.landmark for each in self.surveyed}) < len(self.surveyed):

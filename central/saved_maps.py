@@ -22,6 +22,8 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     displacements,
     maps_of,
 )
+from teamslam.team.geodesy import Datum
+from teamslam.team.saved_map import datum_bytes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
 
@@ -39,10 +41,11 @@ def save_map(
     name: str,
     before: Mapping[str, m.SavedMap],
     firsts: Collection[bytes],
+    datum: Datum | None = None,
 ) -> m.SavedMap:
     """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
     firsts: digest of the first submap of each robot's stream in the map, by which maps with
-    measurements in common are recognised.
+    measurements in common are recognised. datum: of the map's frame.
 
     With the biases c that all sensors share, the landmarks x are N(x̄ + S (c − c̄), P − S C Sᵀ) given
     c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out. One that moved by e, which
@@ -83,6 +86,7 @@ def save_map(
         sets=tuple(sorted({*firsts, *(one for each in earlier for one in each.sets)})),
         software=metadata.version("teamslam"),
         core=core.digest[:16],
+        datum=datum_bytes(datum),
     )
 
 

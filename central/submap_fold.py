@@ -31,6 +31,7 @@ from teamslam.central.localising import (
 from teamslam.central.monitor import NOTHING, finding
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
+from teamslam.central.survey import datum_of
 from teamslam.central.tick_fold import TickFold
 from teamslam.central.unnamed_landmarks import verdict_of
 from teamslam.team import translate
@@ -129,7 +130,9 @@ class SubmapFold:
         if self._final is None or not self._final[0].contributions:
             raise NothingToSaveError("there is no final map with a landmark")
         before = {saved.author: saved for saved in self.store.maps.values()}
-        return save_map(*self._final, name, before, self._first_submaps(self._final[0]))
+        fold, fused = self._final
+        datum = datum_of(self.config, fused, before.values())
+        return save_map(fold, fused, name, before, self._first_submaps(fold), datum)
 
     def _first_submaps(self, fold: Fold) -> list[bytes]:
         """List the digests of the first submaps of the robots' streams in the team's map.

@@ -5,12 +5,12 @@ landmark i ~ N(surveyed place, P_i) in the team's frame, independent of the othe
 an initial pose are placed by it; a landmark that contradicts the rest is separated from it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from teamslam.central.config import SurveyedLandmark
-from teamslam.team.config import GNSS, SURVEY
+from teamslam.central.config import CentralConfig, SurveyedLandmark
+from teamslam.team.config import GNSS, SURVEY, SURVEY_FRAME
 from teamslam.team.estimation.contribution import (
     STATION,
     SURVEYED,
@@ -22,10 +22,13 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.inter_robot import STATION_POSE
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
-from teamslam.team.saved_map import member_of
-from teamslam.team.wire.arrays import from_ids
-from teamslam.team.wire.messages import Submap
+from teamslam.team.geodesy import Datum
+from teamslam.team.saved_map import datum_in, member_of
+from teamslam.team.wire.arrays import floats, from_ids
+from teamslam.team.wire.messages import FusedMap, SavedMap, Submap
 
+FARTHEST_M = 2e5
+"""Largest coordinate in the tangent plane of a datum."""
 DIGEST = bytes(8)
 """The configuration names the survey, its submap names no other one."""
 
@@ -53,6 +56,20 @@ def station() -> tuple[Submap, InitialPoseFactor]:
     """Make the station of fixes, a submap without landmarks, and its exact start."""
     submap = member_of(GNSS, b"", np.zeros(0), np.zeros((0, 0)), b"", config=DIGEST)
     return submap, InitialPoseFactor(*STATION, STATION_POSE)
+
+
+def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -> Datum | None:
+    """Return the datum of a map's frame: that of the configuration, else of a loaded map in the
+    survey's frame.
+
+    None where the frame is not absolute, no datum is stated, or a landmark is farther than
+    FARTHEST_M from it, as with coordinates of a national grid.
+    """
+    places = floats(fused.means, "means")
+    if fused.frame != SURVEY_FRAME or np.abs(places).max(initial=0.0) > FARTHEST_M:
+        return None
+    loaded = (datum_in(each) for each in maps if each.frame == SURVEY_FRAME)
+    return config.datum or next((each for each in loaded if each is not None), None)
 
 
 def survey_warnings(fold: Fold) -> Iterator[str]:

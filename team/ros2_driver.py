@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from teamslam.team.containment import place_of
 from teamslam.team.driver.measurement_messages import MeasurementError
+from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from teamslam.team.ros2.decoding import (
     READERS,
@@ -26,14 +27,23 @@ from teamslam.team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from teamslam.team.ros2.frames import Frames, heading, misplaced
+from teamslam.team.ros2.frames import Frames, heading, misplaced, misplaced_antenna
 from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
 from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
-from teamslam.team.ros2.translator import Measured, Pose, Seen, Speeds, Translator
+from teamslam.team.ros2.translator import (
+    NO_DATUM,
+    Measured,
+    Pose,
+    Position,
+    Seen,
+    Speeds,
+    Translator,
+)
 from teamslam.team.wire.zenoh.foreign_keys import ForeignSample
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+FIX = "sensor_msgs/msg/NavSatFix"
 HELD = 1000
 """Messages of a topic whose type no token has told yet."""
 MOST_REASONS = 100
@@ -60,6 +70,10 @@ class Robot(Protocol):
     def sensor_mount(self) -> tuple[float, float, float] | None:
         """Where the robot's process has its sensor; None where that is not known."""
 
+    @property
+    def antenna(self) -> tuple[float, float] | None:
+        """Where the robot's process has its GNSS antenna; None where that is not known."""
+
     def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
         """Speeds since the last call."""
 
@@ -76,6 +90,9 @@ class Robot(Protocol):
     ) -> None:
         """Teammates."""
 
+    def fix(self, t: Decimal, x: float, y: float, covariance: ArrayLike | None) -> None:
+        """Position of the antenna."""
+
 
 class Ros2Driver:
     """Takes what is published on a robot's topics, and hands it to its driver.
@@ -83,6 +100,7 @@ class Ros2Driver:
     taken: messages by topic; dropped: by reason; lost: published, and never here. What waits is
     handed over in the order of its stamps, since topics come in no order among themselves.
     on_odometry: called with each odometry pose and its frames.
+    datum: origin of the plane of the team's fixes, which are dropped without one.
     name, others: the robot's name, and the topics of the others in the file, which may be its own,
     too: a detection there belongs to the robot from whose base its frame hangs.
     """
@@ -96,6 +114,7 @@ class Ros2Driver:
         name: str = "",
         others: Mapping[str, RobotTopics] | None = None,
         on_odometry: OnOdometry | None = None,
+        datum: Datum | None = None,
     ) -> None:
         self._robot = robot
         self._on_odometry = on_odometry
@@ -104,10 +123,12 @@ class Ros2Driver:
         frames = Frames()
         robots = {**(others or {}), name: topics}
         owners = Owners(robots, dict.fromkeys(robots, frames))
-        self._translator = Translator(topics, frames, name, owners)
+        self._translator = Translator(topics, frames, name, owners, datum)
         self._kinds = dict(topics.types)
         if topics.odometry:
             self._kinds.setdefault(topics.odometry, ODOMETRY)
+        if topics.fixes:
+            self._kinds.setdefault(topics.fixes, FIX)
         self._held: dict[str, deque[bytes]] = {}
         self._backlog = Backlog()
         self._translated: dict[str, deque[Measured]] = {}
@@ -118,7 +139,7 @@ class Ros2Driver:
         self.dropped: Counter[str] = Counter()
         self.lost = Lost()
         self._static = static_topics(topics.odometry)
-        self._names = {topics.odometry, *topics.detections, *self._static} - {""}
+        self._names = {topics.odometry, *topics.detections, topics.fixes, *self._static} - {""}
         self._silent = {topics.odometry} - {""}
         self._began_s = time.monotonic()
         self._undecided_at_s: float | None = None
@@ -256,6 +277,10 @@ class Ros2Driver:
                     ids = np.array(measured.names, dtype=np.int64)
                     blocks = [[[xx, xy], [xy, yy]] for xx, xy, yy in measured.covariances]
                     self._robot.observe_points(t, ids, points, blocks or None)
+            case Position():
+                stated = measured.covariance
+                P = None if stated is None else [stated[:2], stated[1:]]
+                self._robot.fix(t, measured.x, measured.y, P)
             case _:
                 pass
 
@@ -315,6 +340,11 @@ class Ros2Driver:
         configured = self._robot.sensor_mount
         if configured is not None and self.mounts:
             said += misplaced(self.mounts[0], configured)
+        there, antenna = self._robot.antenna, self._translator.antenna
+        if there is not None and antenna is not None:
+            said += misplaced_antenna(antenna, there)
+        if self._translator.dropped[NO_DATUM]:
+            said.append(f"{self._translator.dropped[NO_DATUM]:,} dropped: {NO_DATUM}")
         if question := self._translator.question():
             said.append(question)
         late_s = self._backlog.oldest_s

@@ -13,6 +13,7 @@ import numpy as np
 
 from teamslam.team.config import MAP, SURVEY, UNNAMED
 from teamslam.team.estimation.gaussian import packed, unpacked
+from teamslam.team.geodesy import Datum, geodetic_from_local
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
@@ -104,6 +105,18 @@ def member_of(
     )
 
 
+def datum_in(saved: m.SavedMap) -> Datum | None:
+    """Read the datum of a saved map; None: not stated."""
+    return Datum(*floats(saved.datum, "datum").tolist()) if saved.datum else None
+
+
+def datum_bytes(datum: Datum | None) -> bytes:
+    """Encode a datum as in `SavedMap.datum`."""
+    if datum is None:
+        return b""
+    return from_floats([datum.latitude_deg, datum.longitude_deg, datum.height_m])
+
+
 def map_name(text: str) -> str:
     """Check the name of a map; raises SavedMapError."""
     if re.fullmatch("[a-z][a-z0-9_]{0,31}", text) is None:
@@ -125,12 +138,18 @@ def map_figures(saved: m.SavedMap) -> dict[str, Any]:
     covariance = unpacked(floats(saved.covariance, "covariance"), 2 * len(numbers))
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 2).tolist()
     counts = ids(saved.counts, "counts").tolist()
+    datum, degrees = datum_in(saved), [dict[str, float]()] * len(numbers)
+    if datum is not None:
+        columns = ("latitude_deg", "longitude_deg")
+        places = geodetic_from_local(datum, np.array(points)).tolist()
+        degrees = [dict(zip(columns, each, strict=True)) for each in places]
     return {
         "name": saved.name,
         "frame": saved.frame,
         "stamp_s": saved.stamp_ns * 1e-9,
         "sets": [each.hex() for each in saved.sets],
         "biases": list(saved.biases),
+        **({} if datum is None else {"datum": msgspec.to_builtins(datum)}),
         "software": saved.software,
         "core": saved.core,
         "landmarks": [
@@ -141,9 +160,10 @@ def map_figures(saved: m.SavedMap) -> dict[str, Any]:
                 "sigma_x_m": sigma_x,
                 "sigma_y_m": sigma_y,
                 "submaps": count,
+                **place,
             }
-            for number, (x, y), (sigma_x, sigma_y), count in zip(
-                numbers, points, sigmas, counts, strict=True
+            for number, (x, y), (sigma_x, sigma_y), count, place in zip(
+                numbers, points, sigmas, counts, degrees, strict=True
             )
         ],
     }

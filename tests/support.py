@@ -450,6 +450,7 @@ def examples() -> Iterator[m.Message]:
         sets=(digest,),
         software="1.2.3",
         core="0123456789abcdef",
+        datum=from_floats([48.5, 9.25, 512.0]),
     )
     yield build.prior(
         stamp_ns=9_000,

@@ -133,6 +133,7 @@ def driver(
     ):
         translated = Ros2Driver(
             source, topics.robots[robot], topics.domain, name=robot, others=topics.robots,
+            datum=topics.datum,
             on_odometry=None if live is None else live.add_odometry,
         )  # fmt: skip
         with ForeignKeys(

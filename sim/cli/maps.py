@@ -116,11 +116,13 @@ def show(
     landmarks = figures.pop("landmarks")
     for key, value in figures.items():
         typer.echo(f"# {key}: {value}")
-    typer.echo("landmark,x,y,sigma_x,sigma_y,submaps")
+    placed = "latitude_deg" in landmarks[0]
+    typer.echo("landmark,x,y,sigma_x,sigma_y,submaps" + ",latitude,longitude" * placed)
     for each in landmarks:
+        place = f",{each['latitude_deg']:.9f},{each['longitude_deg']:.9f}" if placed else ""
         typer.echo(
             f"{each['landmark']},{each['x_m']:.4f},{each['y_m']:.4f},"
-            f"{each['sigma_x_m']:.4f},{each['sigma_y_m']:.4f},{each['submaps']}"
+            f"{each['sigma_x_m']:.4f},{each['sigma_y_m']:.4f},{each['submaps']}{place}"
         )
 
 

@@ -5,11 +5,15 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+
 from teamslam.sim.importing.bag_topics import UndecidedError, decide_topics, listing
 from teamslam.sim.importing.tables import RobotTables
+from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.bags import Bag, opened_bag
 from teamslam.team.ros2.decoding import (
     DamagedError,
+    FixRecord,
     OdometryRecord,
     Record,
     TransformsRecord,
@@ -26,21 +30,29 @@ from teamslam.team.ros2.translator import Translator
 class Imported:
     """Tables of a bag's robots.
 
-    notes: topics used and omitted, with reasons. messages: number read.
+    notes: topics used and omitted, with reasons. messages: number read. datum: origin of the plane
+    of the fixes, if there are any.
     """
 
     robots: list[RobotTables]
     notes: list[str] = field(default_factory=list)
     messages: int = 0
+    datum: Datum | None = None
 
 
-def import_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported:
+def import_bag(
+    path: Path, topics: Topics | None, robot: str | None, datum: Datum | None = None
+) -> Imported:
     """Tables of a bag; raises BagError, UndecidedError.
 
     topics: of each robot; None: from names and types if unambiguous. robot: name of the only robot.
+    datum: where the topics give none; None: the first fix.
     """
     with opened_bag(path) as bag:
         chosen = topics or decide_topics(bag, path, robot)
+        chosen = msgspec.structs.replace(
+            chosen, datum=chosen.datum or datum or _first_fix(bag, chosen)
+        )
         _check_present(chosen, bag, path)
         return _translated(bag, chosen, path)
 
@@ -48,7 +60,7 @@ def import_bag(path: Path, topics: Topics | None, robot: str | None) -> Imported
 def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
     present = {topic.name for topic in bag.topics}
     for name, robot in topics.robots.items():
-        for topic in (robot.odometry, *robot.detections, robot.truth):
+        for topic in (robot.odometry, *robot.detections, robot.fixes, robot.truth):
             if topic and topic not in present:
                 raise UndecidedError(
                     f"{path}: no topic {topic}, which {name} is to have; there are:\n"
@@ -61,7 +73,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
     tables = {name: RobotTables(name) for name in topics.robots}
     robots_by_topic: dict[str, list[str]] = {}
     for name, robot in topics.robots.items():
-        for topic in {robot.odometry, *robot.detections, robot.truth} - {""}:
+        for topic in {robot.odometry, *robot.detections, robot.fixes, robot.truth} - {""}:
             robots_by_topic.setdefault(topic, []).append(name)
     damaged: Counter[str] = Counter()
     first: dict[str, str] = {}
@@ -96,7 +108,19 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
         notes += [f"{name}: {note}" for note in translator.said]
         notes += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
         notes += _mounted(translator, tables[name])
-    return Imported(list(tables.values()), notes, sum(seen.values()))
+        tables[name].antenna = translator.antenna or (0.0, 0.0)
+    has_fixes = any("fixes" in each.rows for each in tables.values())
+    datum = topics.datum if has_fixes else None
+    return Imported(list(tables.values()), notes, sum(seen.values()), datum)
+
+
+def _first_fix(bag: Bag, topics: Topics) -> Datum | None:
+    """Datum at the first fix of any robot, rounded to 10⁻⁶ degrees."""
+    for record in _records(bag, {each.fixes for each in topics.robots.values()} - {""}):
+        if isinstance(record, FixRecord) and record.degrees is not None:
+            latitude, longitude = (round(each, 6) for each in record.degrees)
+            return Datum(latitude, longitude)
+    return None
 
 
 def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
@@ -106,7 +130,8 @@ def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
     frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
     owners = Owners(topics.robots, frames)
     translators = {
-        name: Translator(each, frames[name], name, owners) for name, each in topics.robots.items()
+        name: Translator(each, frames[name], name, owners, topics.datum)
+        for name, each in topics.robots.items()
     }
     if owners.shared:
         for name, each in topics.robots.items():

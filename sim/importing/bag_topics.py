@@ -20,7 +20,10 @@ from teamslam.team.ros2.translator import TAG
 ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
 WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
+FILTERED = ("filtered", "fused", "ekf", "ukf")
+"""Words for fixes that contain odometry."""
 PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
 """Initial topic words that name a part of a robot, not a robot."""
 SAMPLED_MESSAGES = 2000
@@ -83,12 +86,17 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
             )
         if not detections:
             warnings.append(f"{name}: no topic with detections of landmarks")
+        fixes = [t.name for t in found if t.kind == FIX and (space in (None, _namespace(t.name)))]
+        fixes = [each for each in fixes if not has_word(each, FILTERED)] or fixes
+        if len(fixes) > 1:
+            warnings.append(f"{name}: {len(fixes)} topics may be its fixes: {', '.join(fixes)}")
         if len(truth) > 1:
             warnings.append(f"{name}: {len(truth)} topics may be its truth")
         others[name] = odometry[1:]
         robots[name] = RobotTopics(
             odometry=odometry[0] if odometry else "/odom",
             detections=tuple(detections),
+            fixes=fixes[0] if fixes else "",
             truth=truth[0] if truth else "",
             base_frame=(bases[odometry[0]] if odometry else "") or "base_link",
         )
@@ -148,7 +156,7 @@ def _candidates(
     odometry.sort(
         key=lambda name: (has_word(name, FUSED_WORDS), not has_word(name, WHEEL_WORDS), name)
     )
-    other = (*ODOMETRY, *POSES, TRANSFORMS, "geometry_msgs/msg/TransformStamped")
+    other = (*ODOMETRY, *POSES, TRANSFORMS, FIX, "geometry_msgs/msg/TransformStamped")
     detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
     detections += [t.name for t in here if t.name in tagged]
     return odometry, detections, true
@@ -211,6 +219,7 @@ def as_toml(found: Proposal) -> str:
             'use = "pose"           # or "twist": speeds that hold until the next message',
             f"detections = [{detections}]",
         ]
+        lines += [f'fixes = "{topics.fixes}"'] if topics.fixes else []
         lines += [f'truth = "{topics.truth}"'] if topics.truth else []
         lines += [f'base_frame = "{topics.base_frame}"', ""]
     return "\n".join(lines)

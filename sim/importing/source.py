@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import tomli_w
 
@@ -24,6 +25,7 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.streams import StartPose, WorldStreams
+from teamslam.team.geodesy import Datum
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.ros2.bags import BagError, is_bag
@@ -217,7 +219,10 @@ def _bags(request: Request, folder: Path) -> Report:
         raise DatasetError("--robot names one robot: import bags of several one by one")
     try:
         topics = load_topics(request.ros2) if request.ros2 else None
-        found = [import_bag(path, topics, request.robot) for path in request.sources]
+        found, datum = [], None
+        for path in request.sources:
+            found.append(import_bag(path, topics, request.robot, datum))
+            datum = datum or found[-1].datum
     except (BagError, TopicsError) as error:
         raise DatasetError(str(error)) from None
     tables = [each for one in found for each in one.robots]
@@ -228,13 +233,17 @@ def _bags(request: Request, folder: Path) -> Report:
             "of topics, --ros2 FILE"
         )
     notes = [note for one in found for note in one.notes]
-    report = _written(tables, notes, request, folder)
+    report = _written(tables, notes, request, folder, datum)
     report.messages = sum(one.messages for one in found)
     return report
 
 
 def _written(
-    tables: Sequence[RobotTables], notes: list[str], request: Request, folder: Path
+    tables: Sequence[RobotTables],
+    notes: list[str],
+    request: Request,
+    folder: Path,
+    datum: Datum | None = None,
 ) -> Report:
     by_name = {each.robot: each for each in tables}
     if not any(kind in each.rows for each in tables for kind in MEASURED):
@@ -256,16 +265,32 @@ def _written(
         tables[0].rows["truth"] = list(trajectory(request.truth))
     for each in tables:
         each.write(folder)
-    mounted = [each for each in tables if any(each.mount)]
-    if mounted and not (folder / SCENARIO).exists():
-        robots = [
-            {"id": each.robot}
-            | ({"sensor": {"mount": list(each.mount)}} if any(each.mount) else {})
-            for each in tables
-        ]
-        document = {"base": "recorded", "world": {"path": "."}, "robots": robots}
-        (folder / SCENARIO).write_text(tomli_w.dumps(document), "utf-8")
-        notes.append(
-            f"{SCENARIO}: the models of `recorded`, with the sensors' places on the robots"
-        )
+    notes += _write_scenario(tables, datum, folder / SCENARIO)
     return Report([each.robot for each in tables], notes)
+
+
+def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Path) -> list[str]:
+    """Write the places of sensors and antennas on the robots, and the datum of the fixes, if there
+    are any, into a scenario that does not exist; returns notes.
+    """
+    robots = []
+    for each in tables:
+        own: dict[str, object] = {"id": each.robot}
+        if any(each.mount):
+            own["sensor"] = {"mount": list(each.mount)}
+        if any(each.antenna):
+            own["gnss"] = {"antenna": list(each.antenna)}
+        robots.append(own)
+    central = {} if datum is None else {"datum": msgspec.to_builtins(datum)}
+    places = f"datum {datum.latitude_deg}, {datum.longitude_deg}" if datum is not None else ""
+    if not central and all(len(own) == 1 for own in robots):
+        return []
+    if path.exists():
+        return [f"{path.name} exists and is kept: it needs [central.datum], {places}"] * bool(
+            places
+        )
+    document = {"base": "recorded", "world": {"path": "."}, "robots": robots}
+    document |= {"central": central} if central else {}
+    path.write_text(tomli_w.dumps(document), "utf-8")
+    notes = [f"{path.name}: the models of `recorded`, with the sensors' places on the robots"]
+    return notes + [f"fixes are east and north of the {places}"] * bool(places)

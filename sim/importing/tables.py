@@ -7,7 +7,7 @@ from pathlib import Path
 from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSES, SPEEDS
 from teamslam.sim.datasets.folder_writer import Row, seconds, write_table
 from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
-from teamslam.team.ros2.translator import Measured, Pose, Seen, Speeds
+from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 
 
 @dataclass
@@ -15,12 +15,14 @@ class RobotTables:
     """Rows of one robot's tables.
 
     columns: of tables that choose their columns. mount: sensor pose (x, y, yaw) on the base.
+    antenna: place (ahead, left) of the GNSS antenna on the base.
     """
 
     robot: str
     rows: dict[str, list[Row]] = field(default_factory=dict)
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antenna: tuple[float, float] = (0.0, 0.0)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
         """Append a row; columns of only some rows are empty in the others."""
@@ -39,6 +41,11 @@ class RobotTables:
             case Speeds():
                 row = (time, measured.forward, measured.yaw_rate)
                 self.add("odometry", ("t_s", *SPEEDS), row)
+            case Position(covariance=None):
+                self.add("fixes", ("t_s", *POINTS), (time, measured.x, measured.y))
+            case Position(covariance=(xx, xy, yy)):
+                columns = ("t_s", *POINTS, *POINT_COVARIANCE)
+                self.add("fixes", columns, (time, measured.x, measured.y, xx, xy, yy))
             case Seen(names=()):
                 self.add("observations", ("t_s", "landmark", *POINTS), (time, "", "", ""))
             case Seen(covariances=(_, *_)):

@@ -325,6 +325,12 @@ class Driver:
         models = self._node.models
         return None if models is None else models.sensor.mount
 
+    @property
+    def antenna(self) -> tuple[float, float] | None:
+        """The GNSS antenna's place on the robot (ahead, left) [m]; None: not yet announced."""
+        models = self._node.models
+        return None if models is None else models.gnss.antenna
+
     def status(self) -> m.Status:
         """The stream's state: counts, receivers' progress and problems."""
         return self._link.status()

@@ -83,13 +83,26 @@ class TagsRecord(NamedTuple):
     tags: tuple[Tag, ...]
 
 
+class FixRecord(NamedTuple):
+    """sensor_msgs/NavSatFix: latitude and longitude [deg] of the antenna, whose frame is `frame`.
+
+    degrees: None where the receiver reports no fix. covariance: (xx, xy, yy) [m²], x east and y
+    north; None where it is unknown.
+    """
+
+    stamp_ns: int
+    frame: str
+    degrees: tuple[float, float] | None
+    covariance: tuple[float, float, float] | None
+
+
 class TransformsRecord(NamedTuple):
     """tf2_msgs/TFMessage."""
 
     transforms: tuple[Transform, ...]
 
 
-Record = OdometryRecord | SpeedRecord | PoseRecord | TagsRecord | TransformsRecord
+Record = OdometryRecord | SpeedRecord | PoseRecord | TagsRecord | FixRecord | TransformsRecord
 
 FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryError, TypeError,
           AssertionError, AttributeError)  # fmt: skip
@@ -206,12 +219,28 @@ def _isaac(message: Any) -> TagsRecord:
     return _tags(message, tags, next(iter(frames), ""))
 
 
+def _fix(message: Any) -> FixRecord:
+    """A fix; position_covariance: of (east, north, up), row by row; type 0: unknown."""
+    stamp_ns, frame = _stamp_ns(message.header), message.header.frame_id.lstrip("/")
+    if message.status.status < 0:
+        return FixRecord(stamp_ns, frame, None, None)
+    latitude, longitude = _finite((message.latitude, message.longitude))
+    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        raise DamagedError(f"latitude {latitude:g}°, longitude {longitude:g}°")
+    covariance = None
+    if message.position_covariance_type != 0:
+        xx, xy, _, _, yy, *_ = _finite(np.asarray(message.position_covariance).ravel())
+        covariance = (xx, xy, yy) if xx > 0.0 and xx * yy > xy * xy else None
+    return FixRecord(stamp_ns, frame, (latitude, longitude), covariance)
+
+
 READERS: Mapping[str, Callable[[Any], Record]] = {
     "nav_msgs/msg/Odometry": _odometry,
     "geometry_msgs/msg/TwistStamped": _speeds,
     "geometry_msgs/msg/PoseStamped": lambda m: _pose(m, m.pose),
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _pose(m, m.pose.pose),
     "geometry_msgs/msg/TransformStamped": lambda m: TransformsRecord((_transform(m),)),
+    "sensor_msgs/msg/NavSatFix": _fix,
     "tf2_msgs/msg/TFMessage": lambda m: TransformsRecord(tuple(map(_transform, m.transforms))),
     "vision_msgs/msg/Detection3DArray": _vision,
     "isaac_ros_apriltag_interfaces/msg/AprilTagDetectionArray": _isaac,

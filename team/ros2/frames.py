@@ -166,3 +166,15 @@ def misplaced(here: Place, configured: Place) -> list[str]:
         f"({other}), so all landmarks are shifted: write mount = [{place}] into [defaults.sensor], "
         "or the robot's sensor, and start the team again"
     ]
+
+
+def misplaced_antenna(here: tuple[float, float], configured: tuple[float, float]) -> list[str]:
+    """A warning where the frames have the antenna elsewhere than the robot's scenario has it."""
+    if max(abs(a - b) for a, b in zip(here, configured, strict=True)) < SAME_PLACE:
+        return []
+    place, other = (", ".join(f"{value:.4g}" for value in each) for each in (here, configured))
+    return [
+        f"the antenna is at ({place}) on the base by its frames, and the scenario has it at "
+        f"({other}), so all fixes are shifted: write antenna = [{place}] into [defaults.gnss], or "
+        "the robot's gnss, and start the team again"
+    ]

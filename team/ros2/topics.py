@@ -1,4 +1,4 @@
-"""The topics of each robot's odometry, detections and truth, from a table of a TOML file."""
+"""The topics of each robot's odometry, detections, fixes and truth, from a table of a TOML file."""
 
 import tomllib
 from pathlib import Path
@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
+
+from teamslam.team.geodesy import Datum
 
 RobotName = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 
@@ -20,9 +22,11 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry: nav_msgs/Odometry, of which `use` takes the pose or the speeds (twist), which hold
     until the next message; geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
     odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
-    child frames are tags. truth: nav_msgs/Odometry or a pose, for the evaluation.
+    child frames are tags. fixes: sensor_msgs/NavSatFix, the antenna's position. truth:
+    nav_msgs/Odometry or a pose, for the evaluation.
     teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
     called otherwise; frames: those of its detections, where transforms do not tell whose they are;
+    antenna: its place (ahead, left) on the base, of tf_static if absent;
     names: whether the id (the class where it is empty) or the class names a
     detection of vision_msgs. mount: the sensor's pose (x, y, yaw) on the base and
     optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
@@ -32,6 +36,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     odometry: str = ""
     use: Literal["pose", "twist"] = "pose"
     detections: tuple[str, ...] = ()
+    fixes: str = ""
     truth: str = ""
     base_frame: str = "base_link"
     odometry_frame: str = "odom"
@@ -41,13 +46,19 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     types: dict[str, str] = {}
     names: Literal["id", "class"] = "id"
     mount: tuple[float, float, float] | None = None
+    antenna: tuple[float, float] | None = None
     optical: bool | None = None
 
 
 class Topics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The topics of each robot. domain: of ROS, for live robots."""
+    """The topics of each robot.
+
+    domain: of ROS, for live robots. datum: origin of the plane of all robots' fixes; None: the
+    first fix of a bag; live robots need it.
+    """
 
     robots: dict[RobotName, RobotTopics]
+    datum: Datum | None = None
     domain: Annotated[int, Meta(ge=0, le=232)] = 0
 
 

@@ -4,7 +4,11 @@ import re
 from collections import Counter
 from typing import NamedTuple
 
+import numpy as np
+
+from teamslam.team.geodesy import Datum, local_from_geodetic
 from teamslam.team.ros2.decoding import (
+    FixRecord,
     OdometryRecord,
     PoseRecord,
     Record,
@@ -21,6 +25,10 @@ from teamslam.team.ros2.topics import RobotTopics
 TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
 """A tag's name: its number, with its family before it (tag36h11:7) or alone."""
 
+NO_DATUM = (
+    "a fix, since there is no datum: give [datum] with latitude_deg and longitude_deg in the file "
+    "of topics, the same for all robots"
+)
 MOST_NAMED = 20
 """Frames that are not decided are told apart up to this number."""
 
@@ -55,14 +63,24 @@ class Seen(NamedTuple):
     covariances: tuple[tuple[float, float, float], ...] = ()
 
 
-Measured = Pose | Speeds | Seen
+class Position(NamedTuple):
+    """A fix of the antenna: (x, y) [m] east and north of the datum, covariance (xx, xy, yy)."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    covariance: tuple[float, float, float] | None
+
+
+Measured = Pose | Speeds | Seen | Position
 
 
 class Translator:
     """Takes one robot's messages in order of arrival; `dropped` counts those left out, by reason.
 
-    mounts: the sensors' mounts by frame, each from its first detection on. robot, owners: its name
-    among those that share its topics.
+    mounts: the sensors' mounts by frame, each from its first detection on. antenna: its place
+    (ahead, left) on the base from the first fix on. robot, owners: its name among those that share
+    its topics. datum: of fixes, which are dropped without one.
     """
 
     def __init__(
@@ -71,8 +89,11 @@ class Translator:
         frames: Frames | None = None,
         robot: str = "",
         owners: Owners | None = None,
+        datum: Datum | None = None,
     ) -> None:
         self.topics = topics
+        self.datum = datum
+        self.antenna: tuple[float, float] | None = None
         self.frames = Frames() if frames is None else frames
         self.robot = robot
         self.owners = Owners({robot: topics}, {robot: self.frames}) if owners is None else owners
@@ -95,6 +116,8 @@ class Translator:
             if isinstance(record, TransformsRecord):
                 self.owners.add_links([self.robot], self.links(record))
             found += self._detections(topic, record)
+        if topic == topics.fixes:
+            found += self._fix(record)
         if topic == topics.truth:
             found += self._truth(record)
         return found
@@ -145,6 +168,35 @@ class Translator:
             case _:
                 self.dropped["no pose in a message of the truth topic"] += 1
                 return []
+
+    def _fix(self, record: Record) -> list[Measured]:
+        if not isinstance(record, FixRecord):
+            self.dropped["no fix in a message of the fixes topic"] += 1
+            return []
+        if record.degrees is None:
+            self.dropped["a message of a receiver without a fix"] += 1
+            return []
+        if self.datum is None:
+            self.dropped[NO_DATUM] += 1
+            return []
+        if self.antenna is None:
+            self.antenna = self._antenna_at(record.frame)
+        ((x, y),) = local_from_geodetic(self.datum, np.array([record.degrees])).tolist()
+        return [Position(record.stamp_ns, x, y, record.covariance)]
+
+    def _antenna_at(self, frame: str) -> tuple[float, float]:
+        """Place (ahead, left) of the antenna's frame on the base."""
+        topics = self.topics
+        if topics.antenna is not None:
+            return topics.antenna
+        found = self.frames.base_from(frame, topics.base_frame)
+        if found is not None:
+            return float(found[1][0]), float(found[1][1])
+        self.said.append(
+            f"no transform from {frame or 'the frame without a name'} to {topics.base_frame}: the "
+            "antenna is taken to be at the base; give `antenna` if it is not"
+        )
+        return 0.0, 0.0
 
     def _detections(self, topic: str, record: Record) -> list[Measured]:
         match record:

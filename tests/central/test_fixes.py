@@ -7,13 +7,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.desk.verification.centre import recomputed_centre
+from teamslam.central.config import CentralConfig
+from teamslam.central.desk.export.take_home import take_home
+from teamslam.central.desk.verification.centre import recomputed_centre, recorded_map
 from teamslam.central.desk.verification.recorded import Recorded, identity
+from teamslam.central.survey import datum_of
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.config import GNSS, SURVEY_FRAME, Bounds, Gnss
 from teamslam.team.estimation.plausibility import sighting_beyond
+from teamslam.team.geodesy import Datum
+from teamslam.team.saved_map import datum_in, map_figures
 from teamslam.team.translate import sighting_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -23,6 +28,7 @@ from tests.central.test_survey import errors
 
 SIGMA_M = 0.3
 ANTENNA = (0.8, -0.5)
+DATUM = Datum(48.745, 9.105)
 UTM = np.array([399_000.0, 5_756_000.0])
 
 
@@ -59,7 +65,10 @@ def day(
         )
         for each in scenario.robots
     )
-    scenario = msgspec.structs.replace(scenario, seed=seed, world=world, robots=robots)
+    central = msgspec.structs.replace(scenario.central, datum=DATUM)
+    scenario = msgspec.structs.replace(
+        scenario, seed=seed, world=world, robots=robots, central=central
+    )
     streams = streams_of(scenario)
     own = tuple(
         with_fixes(each, seed, np.array(origin), jumps) if each.robot in fixed else each
@@ -134,3 +143,21 @@ def test_maps_with_fixes_are_recomputed_from_the_log():
     assert maps
     for each in maps:
         assert encoded(computed[identity(each.sample.key, each.message)]) == each.sample.payload
+
+
+def test_a_map_of_fixes_keeps_the_datum_where_its_frame_is_the_datums_plane():
+    recorded = Recorded()
+    recorded.take_all(day(3)[0])
+    assert take_home(recorded).datum == DATUM
+    saved = recorded_map(recorded, "site")
+    assert datum_in(saved) == DATUM
+    first = map_figures(saved)["landmarks"][0]
+    assert abs(first["latitude_deg"] - DATUM.latitude_deg) < 1e-3
+    later = msgspec.structs.replace(saved, name="later")
+    final = final_map(day(3)[0])
+    assert datum_of(CentralConfig(), final, [later]) == DATUM
+    assert (
+        datum_of(CentralConfig(datum=DATUM), msgspec.structs.replace(final, frame="r1/1"), [])
+        is None
+    )
+    assert datum_of(CentralConfig(datum=DATUM), final_map(day(3, origin=tuple(UTM))[0]), []) is None

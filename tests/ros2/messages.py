@@ -66,6 +66,29 @@ def detections(stamp_ns: int, frame: str, tags: Sequence[tuple[str, Any]]) -> An
     return T["vision_msgs/msg/Detection3DArray"](header=header(stamp_ns, frame), detections=found)
 
 
+def fix(
+    stamp_ns: int,
+    frame: str,
+    degrees: tuple[float, float],
+    covariance: tuple[float, float, float] | None = None,
+    status: int = 0,
+) -> Any:
+    """NavSatFix; covariance: (xx, xy, yy) of (east, north); None: unknown."""
+    block = np.zeros((3, 3))
+    if covariance is not None:
+        xx, xy, yy = covariance
+        block[:2, :2], block[2, 2] = [[xx, xy], [xy, yy]], 4.0
+    return T["sensor_msgs/msg/NavSatFix"](
+        header=header(stamp_ns, frame),
+        status=T["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=degrees[0],
+        longitude=degrees[1],
+        altitude=float("nan"),
+        position_covariance=block.ravel(),
+        position_covariance_type=0 if covariance is None else 2,
+    )
+
+
 def transforms(*each: tuple[int, str, str, Any, Sequence[float]]) -> Any:
     """(stamp, parent, child, translation, rotation) of each."""
     return T["tf2_msgs/msg/TFMessage"](

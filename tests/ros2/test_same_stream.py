@@ -9,6 +9,7 @@ from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.world.config import FolderWorld
 from teamslam.team.config import RobotConfig
 from teamslam.team.driver.driver import Driver
+from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.topics import RobotTopics, Topics
 from teamslam.team.ros2_driver import Ros2Driver
 from teamslam.team.wire import messages as m
@@ -20,6 +21,8 @@ from tests.teams import world_of
 
 S = 10**9
 ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
+FIX = "sensor_msgs/msg/NavSatFix"
+DATUM = Datum(48.7, 9.1)
 
 
 def drive() -> list[ros.Message]:
@@ -34,15 +37,19 @@ def drive() -> list[ros.Message]:
         if k % 3 == 0:
             seen = [(str(i), ros.pose(*random.normal(size=2))) for i in (3, 8, 11)]
             drove.append((at, "/tags", TAGS, ros.detections(at, "base_link", seen)))
+        if k % 5 == 0:
+            degrees = 48.7 + 1e-5 * random.normal(), 9.1 + 1e-5 * random.normal()
+            stated = (0.25, 0.0625, 0.5) if k % 2 else None
+            drove.append((at, "/fix", FIX, ros.fix(at, "base_link", degrees, stated)))
     return drove
 
 
 @pytest.mark.parametrize("use", ["pose", "twist"])
 def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
-    topics = RobotTopics(odometry="/odom", detections=("/tags",), use=use)
+    topics = RobotTopics(odometry="/odom", detections=("/tags",), fixes="/fix", use=use)
     drove = drive()
     bag = ros.write_bag(tmp_path / "bag", drove)
-    (tables,) = import_bag(bag, Topics(robots={"r1": topics}), None).robots
+    (tables,) = import_bag(bag, Topics(robots={"r1": topics}, datum=DATUM), None).robots
     tables.start((1.0, 2.0, 0.5))
     tables.write(tmp_path / "set")
     robot = Driver(
@@ -53,7 +60,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
         start=(1.0, 2.0, 0.5),
         patience_s=0.0,
     )
-    live = Ros2Driver(robot, topics)
+    live = Ros2Driver(robot, topics, datum=DATUM)
     for _, topic, kind, message in drove:
         package, _, name = kind.split("/")
         key = f"0{topic}/{package}::msg::dds_::{name}_/TypeHashNotSupported"
@@ -69,5 +76,5 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
     out = [each.message for _ in range(4) for each in world.publish(0.0)]
     expected = [each for each in out if isinstance(each, m.Measurement)]
     assert live.dropped == {}
-    assert len(expected) == 1 + 38 + 13
+    assert len(expected) == 1 + 38 + 13 + 7
     assert [encoded(each) for each in sent] == [encoded(each) for each in expected]

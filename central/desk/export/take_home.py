@@ -1,7 +1,8 @@
 """Write a run's map and paths as tables in common formats.
 
 `map.csv` and `map.json` have one landmark per row, `paths/<robot>.csv` and `.tum` one pose. Metres,
-seconds, radians, in the frame that the map names; numbers have all digits.
+seconds, radians, in the frame that the map names; numbers have all digits. With a datum each
+landmark has latitude and longitude, too, and `map.geojson` has landmarks and paths (RFC 7946).
 """
 
 import csv
@@ -13,6 +14,7 @@ from itertools import chain
 from pathlib import Path as FilePath
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from teamslam.central.desk.drawing import landmark_blocks
@@ -21,7 +23,9 @@ from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.central.desk.export.tum import seconds, write_tum
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.central.survey import datum_of
 from teamslam.team.config import UNNAMED
+from teamslam.team.geodesy import Datum, geodetic_from_local
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
@@ -29,6 +33,8 @@ from teamslam.team.wire.arrays import ids
 MAP_COLUMNS = (
     "id", "x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "measurements", "frame",
 )  # fmt: skip
+DEGREES = ("latitude_deg", "longitude_deg")
+"""Further columns of a map with a datum."""
 PATH_COLUMNS = (
     "t_s", "x_m", "y_m", "theta_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_xt_m_rad",
     "cov_yt_m_rad", "cov_tt_rad2",
@@ -37,15 +43,25 @@ PATH_COLUMNS = (
 
 @dataclass(frozen=True)
 class TakenHome:
-    """Robots' smoothed paths, and measurement counts of the landmarks in the log."""
+    """Robots' smoothed paths, measurement counts of the landmarks in the log, and the datum of the
+    final map's frame, if there is one.
+    """
 
     paths: Mapping[str, SmoothedPath]
     measurements: Mapping[int, int]
+    datum: Datum | None = None
 
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
     """Paths at keyframe rate and measurement counts; `progress` receives each robot's name."""
-    return TakenHome(smoothed_paths(found, progress), measurement_counts(found))
+    return TakenHome(smoothed_paths(found, progress), measurement_counts(found), _datum(found))
+
+
+def _datum(found: Recorded) -> Datum | None:
+    maps = [each for each in found.of(ch.FINAL_MAP) if isinstance(each, m.FusedMap)]
+    if not maps or "central" not in found.configured:
+        return None
+    return datum_of(found.central_config()[0], maps[-1], found.saved_maps.values())
 
 
 def measurement_counts(found: Recorded) -> Mapping[int, int]:
@@ -75,9 +91,12 @@ def _detections(submap: m.Message) -> Iterator[tuple[tuple[str, int, int, int], 
 
 
 def write_map(
-    fused: MapResult, measurements: Mapping[int, int], folder: FilePath
+    fused: MapResult,
+    measurements: Mapping[int, int],
+    folder: FilePath,
+    datum: Datum | None = None,
 ) -> list[FilePath]:
-    """Write map.csv and map.json; returns the files.
+    """Write map.csv and map.json, with latitude and longitude given a datum; returns the files.
 
     Covariances are 2 × 2 blocks; correlations between landmarks are in the log. The count of an
     unnamed landmark is absent if no submap reports it.
@@ -91,19 +110,52 @@ def write_map(
         count = measurements.get(landmark, None if landmark >= UNNAMED else 0)
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
         rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
+    columns = MAP_COLUMNS
+    if datum is not None:
+        columns = (*MAP_COLUMNS, *DEGREES)
+        for row, place in zip(rows, geodetic_from_local(datum, fused.means).tolist(), strict=True):
+            row.update(zip(DEGREES, place, strict=True))
     table, data = folder / "map.csv", folder / "map.json"
     with table.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.DictWriter(lines, MAP_COLUMNS, lineterminator="\n")
+        writer = csv.DictWriter(lines, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     whole = {
         "frame": fused.frame,
         "set": fused.digest,
         "final_map_sha256": fused.payload_sha256,
+        **({} if datum is None else {"datum": msgspec.to_builtins(datum)}),
         "landmarks": [{k: v for k, v in row.items() if k != "frame"} for row in rows],
     }
     data.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
     return [table, data]
+
+
+def write_geojson(
+    fused: MapResult, paths: Mapping[str, SmoothedPath], folder: FilePath, datum: Datum
+) -> FilePath:
+    """Write map.geojson: a point for each landmark, with sigma_m, the larger semi-axis of its
+    1 sigma ellipse, and a line for each path; returns the file.
+    """
+    places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
+    sigmas = np.sqrt(np.linalg.eigvalsh(landmark_blocks(fused.covariance))[:, 1]).tolist()
+    features = [
+        _feature("Point", place, {"landmark": landmark, "sigma_m": sigma})
+        for landmark, place, sigma in zip(fused.ids.tolist(), places, sigmas, strict=True)
+    ]
+    for robot, path in paths.items():
+        line = geodetic_from_local(datum, path.poses[:, :2])[:, ::-1].tolist()
+        if len(line) > 1:
+            features.append(_feature("LineString", line, {"robot": robot}))
+    file = folder / "map.geojson"
+    whole = {"type": "FeatureCollection", "features": features}
+    file.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    return file
+
+
+def _feature(kind: str, at: list[Any], properties: Mapping[str, Any]) -> dict[str, Any]:
+    geometry = {"type": kind, "coordinates": at}
+    return {"type": "Feature", "geometry": geometry, "properties": dict(properties)}
 
 
 def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[FilePath]:

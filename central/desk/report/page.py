@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from teamslam.central.desk.export.take_home import write_map, write_paths
+from teamslam.central.desk.export.take_home import write_geojson, write_map, write_paths
 from teamslam.central.desk.export.tum import write_trajectories
 from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import error_picture, map_picture
@@ -94,7 +94,10 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
     written = [page, data]
     if run.evaluation.map is not None:
         counts = {} if run.taken_home is None else run.taken_home.measurements
-        written += write_map(run.evaluation.map, counts, directory)
+        datum = None if run.taken_home is None else run.taken_home.datum
+        written += write_map(run.evaluation.map, counts, directory, datum)
+        if datum is not None:
+            written.append(write_geojson(run.evaluation.map, run.paths, directory, datum))
     if run.paths:
         write_paths(run.paths, directory / "paths")
         written.append(directory / "paths")

@@ -13,7 +13,7 @@ from teamslam.team.core import (
     check_packed_covariance,
     check_pose_covariance,
 )
-from teamslam.team.wire.arrays import Floats, Ids, Stamps, ids, stamps
+from teamslam.team.wire.arrays import Floats, Ids, Stamps, floats, ids, stamps
 from teamslam.team.wire.messages.base import (
     Author,
     Bias,
@@ -295,7 +295,9 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     single robots are part of the covariance. counts: number of submaps of each landmark, those of
     earlier days included. frame: as in FusedMap. sets: digests of the first submap of each robot's
     stream in it, on all days, ascending: two maps with a stream in common cannot be joined.
-    software, core: version of the program, digest of the native core.
+    software, core: version of the program, digest of the native core. datum: latitude [deg],
+    longitude [deg] and height [m] of the frame's origin on WGS84, x east and y north; empty: not
+    stated.
     """
 
     name: Name
@@ -309,6 +311,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     sets: Annotated[tuple[Digest, ...], Meta(max_length=MOST_SETS)]
     software: Text
     core: Text
+    datum: Floats = b""
 
     @property
     def author(self) -> str:
@@ -332,3 +335,8 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
             raise ValueError("not ascending: sets")
         if not self.sets:
             raise ValueError("out of bounds: a map of no set")
+        if self.datum:
+            check_finite(self.datum, "datum", 3)
+            latitude, longitude, _ = floats(self.datum, "datum")
+            if abs(latitude) > 89.0 or abs(longitude) > 180.0:
+                raise ValueError(f"out of bounds: datum at {latitude:g}°, {longitude:g}°")

@@ -14,6 +14,7 @@ from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,
     measurement_counts,
     take_home,
+    write_geojson,
     write_map,
     write_paths,
 )
@@ -21,6 +22,7 @@ from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team.config import UNNAMED
+from teamslam.team.geodesy import Datum, local_from_geodetic
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
@@ -28,6 +30,8 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests.sim.logs import scenario, streams
 from tests.support import fused_map, submap
+
+DATUM = Datum(48.745, 9.105, 400.0)
 
 
 @pytest.fixture(scope="module")
@@ -127,3 +131,21 @@ def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_count
         found.take(Sample(ch.SUBMAP.key("alpha"), encoded(each), each.stamp_ns, 0, 0))
     found.take(Sample(ch.FINAL_MAP.key(), encoded(fused_map(memberships=(of,))), 0, 0, 0))
     assert measurement_counts(found) == {UNNAMED + 1: 3 + 4, UNNAMED + 2: 7}
+
+
+def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_path):
+    home = take_home(recorded_of(log))
+    assert home.datum is None  # its frame is that of the start poses
+    fused = evaluate(log).map
+    write_map(fused, home.measurements, tmp_path, DATUM)
+    with (tmp_path / "map.csv").open() as lines:
+        rows = list(csv.DictReader(lines))
+    degrees = [[float(row["latitude_deg"]), float(row["longitude_deg"])] for row in rows]
+    back = local_from_geodetic(DATUM, np.array(degrees))
+    np.testing.assert_allclose(back, fused.means, atol=1e-5)
+    found = json.loads(write_geojson(fused, home.paths, tmp_path, DATUM).read_text())
+    points = [each for each in found["features"] if each["geometry"]["type"] == "Point"]
+    assert [each["geometry"]["coordinates"][::-1] for each in points] == degrees
+    lines = [each for each in found["features"] if each["geometry"]["type"] == "LineString"]
+    assert [each["properties"]["robot"] for each in lines] == ["r1", "r2"]
+    assert len(lines[0]["geometry"]["coordinates"]) == len(home.paths["r1"].poses)
