@@ -36,10 +36,9 @@ class Datum(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     height_m: Annotated[float, Meta(ge=-1e4, le=1e5)] = 0.0
 
 
-def _earth_centred(
-    latitude: Float[np.ndarray, " n"], longitude: Float[np.ndarray, " n"], height_m: float
-) -> Float[np.ndarray, "n 3"]:
-    """Earth-centred coordinates p [m] of points at latitudes and longitudes [rad]."""
+def _earth_centred(angles: Float[np.ndarray, "n 2"], height_m: float) -> Float[np.ndarray, "n 3"]:
+    """Earth-centred coordinates p [m] of points at (latitude, longitude) [rad]."""
+    latitude, longitude = angles.T
     s, c = np.sin(latitude), np.cos(latitude)
     N = A_M / np.sqrt(1.0 - E2 * s * s)
     across = (N + height_m) * c
@@ -52,8 +51,8 @@ def local_from_geodetic(
 ) -> Float[np.ndarray, "n 2"]:
     """Map (latitude, longitude) [deg] to (east, north) [m] from the datum."""
     origin = np.radians([[datum.latitude_deg, datum.longitude_deg]])
-    (at,) = _earth_centred(*origin.T, datum.height_m)
-    points = _earth_centred(*np.radians(degrees).T, datum.height_m) - at
+    (at,) = _earth_centred(origin, datum.height_m)
+    points = _earth_centred(np.radians(degrees), datum.height_m) - at
     (sin_lat, sin_lon), (cos_lat, cos_lon) = np.sin(origin[0]), np.cos(origin[0])
     axes = np.array([[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]])
     found: Float[np.ndarray, "n 2"] = points @ axes.T

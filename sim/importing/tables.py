@@ -44,8 +44,11 @@ class RobotTables:
             case Position(covariance=None):
                 self.add("fixes", ("t_s", *POINTS), (time, measured.x, measured.y))
             case Position(covariance=(xx, xy, yy)):
-                columns = ("t_s", *POINTS, *POINT_COVARIANCE)
-                self.add("fixes", columns, (time, measured.x, measured.y, xx, xy, yy))
+                self.add(
+                    "fixes",
+                    ("t_s", *POINTS, *POINT_COVARIANCE),
+                    (time, measured.x, measured.y, xx, xy, yy),
+                )
             case Seen(names=()):
                 self.add("observations", ("t_s", "landmark", *POINTS), (time, "", "", ""))
             case Seen(covariances=(_, *_)):

@@ -156,8 +156,6 @@ def test_a_map_of_fixes_keeps_the_datum_where_its_frame_is_the_datums_plane():
     later = msgspec.structs.replace(saved, name="later")
     final = final_map(day(3)[0])
     assert datum_of(CentralConfig(), final, [later]) == DATUM
-    assert (
-        datum_of(CentralConfig(datum=DATUM), msgspec.structs.replace(final, frame="r1/1"), [])
-        is None
-    )
-    assert datum_of(CentralConfig(datum=DATUM), final_map(day(3, origin=tuple(UTM))[0]), []) is None
+    config = CentralConfig(datum=DATUM)
+    assert datum_of(config, msgspec.structs.replace(final, frame="r1/1"), []) is None
+    assert datum_of(config, final_map(day(3, origin=tuple(UTM))[0]), []) is None

@@ -110,7 +110,7 @@ def write_map(
         count = measurements.get(landmark, None if landmark >= UNNAMED else 0)
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
         rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
-    columns = MAP_COLUMNS
+    columns: tuple[str, ...] = MAP_COLUMNS
     if datum is not None:
         columns = (*MAP_COLUMNS, *DEGREES)
         for row, place in zip(rows, geodetic_from_local(datum, fused.means).tolist(), strict=True):
