@@ -10,7 +10,7 @@ from teamslam.team import core, translate
 from teamslam.team.config import BIASES, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.contribution import is_map, is_survey
+from teamslam.team.estimation.contribution import is_absolute, is_map
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import Island
@@ -112,7 +112,7 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     if fold.main_key is None:
         return ()
     graph = fold.main.graph
-    earlier = [each for each in maps_of(graph) if not is_survey(each.contribution.stream)]
+    earlier = [each for each in maps_of(graph) if not is_absolute(each.contribution.stream)]
     if not earlier:
         return ()
     island, found = fold.main, dict[int, m.LandmarkChange]()
@@ -127,7 +127,7 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     placed = Counter(node for each in graph.submaps for node in each.landmarks.tolist())
     condensed = set() if graph.condensed is None else {*graph.condensed.nodes.tolist()}
     former: dict[int, int] = {}
-    old: set[int] = {id_ for stream, id_ in graph.former if not is_survey(stream)}
+    old: set[int] = {id_ for stream, id_ in graph.former if not is_absolute(stream)}
     for saved in earlier:
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
         for each in displacements(island, saved):

@@ -15,8 +15,8 @@ from teamslam.team.estimation.contribution import (
     STATION,
     SURVEYED,
     InitialPoseFactor,
+    is_absolute,
     is_map,
-    is_survey,
     named,
 )
 from teamslam.team.estimation.inter_robot import STATION_POSE
@@ -79,7 +79,7 @@ def survey_warnings(fold: Fold) -> Iterator[str]:
     if not fold.contributions:
         return
     for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):
-        if not is_survey(stream):
+        if not is_absolute(stream):
             yield (
                 f"{named(stream)} contains a survey, which central.surveyed counts a second time: "
                 "leave that out"

@@ -42,7 +42,7 @@ from teamslam.central.withdrawal import (
 )
 from teamslam.team.config import BIASES
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Contribution, Stream, is_survey, whole_of
+from teamslam.team.estimation.contribution import Contribution, Stream, is_absolute, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
@@ -463,6 +463,6 @@ class TickFold:
         parts += [(key[1:3], key[3]) for key in fold.refused]
         for part, sequence in parts:
             stream = whole_of(part)
-            if not is_survey(stream):
+            if not is_absolute(stream):
                 last[stream] = max(last.get(stream, -1), sequence)
         return {stream: last[stream] for stream in sorted(last)}

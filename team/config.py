@@ -316,11 +316,13 @@ class Bounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Gnss(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A receiver of absolute positions (fixes), in the frame of the survey.
 
-    antenna: (ahead [m], left [m]) on the robot. sigma_m: standard deviation of a fix without a
-    covariance, of an error that is independent from one pose node to the next.
+    antenna: (ahead [m], left [m]) on the robot. delay_s: a fix stamped t is the antenna's position
+    at t − delay_s; the motion at t is taken as constant over the delay. sigma_m: standard deviation
+    of a fix without a covariance, of an error that is independent from one pose node to the next.
     """
 
     antenna: tuple[float, float] = (0.0, 0.0)
+    delay_s: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
     sigma_m: Annotated[float, Meta(gt=0.0, le=1e6)] = 3.0
 
 

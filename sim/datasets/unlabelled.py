@@ -6,7 +6,8 @@ detections.csv    t_s,range_m,bearing_rad[,diameter_m], or step,x_m,y_m,c_xx,c_x
 labels.csv        landmark: row by row of detections.csv, -1 for clutter       (optional)
 reference_landmarks.csv, gps.csv                                               (optional)
 
-Labels, reference and GPS are for scoring: no estimator sees them.
+Labels, reference and GPS are for scoring: no estimator sees them, except the GPS with
+`world.fixes`.
 """
 
 from dataclasses import replace
@@ -126,13 +127,20 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     if world.identities == "known":
         seen = _name_by_labels(seen)
     gps_ns, gps = _positions(root)
+    fixes_ns, fixes = np.empty(0, np.int64), np.zeros((0, 5))
+    if world.fixes:
+        if gps_ns is None:
+            raise DatasetError(f"{root}: no gps.csv in it, and world.fixes is true")
+        inside = (gps_ns >= start_ns) & (gps_ns <= end_ns)
+        fixes_ns = gps_ns[inside]
+        fixes = np.hstack((gps[inside], np.full((len(fixes_ns), 3), np.nan)))
     notes = [f"{outside} scans are outside the time of the odometry"] if outside else []
     if form == CAR:
         notes += pace_notes(intervals.duration_ns)
     whole = RobotStream(
         robot="r1",
         start_ns=start_ns,
-        start=StartPose(np.zeros(3), None),
+        start=None if world.fixes else StartPose(np.zeros(3), None),
         intervals=intervals,
         landmark_detections=seen,
         teammate_detections=no_detections(),
@@ -140,6 +148,8 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
         notes=tuple(notes),
         positions_ns=gps_ns,
         positions=gps,
+        fixes_ns=fixes_ns,
+        fixes=fixes,
     )
     if world.duration_s is None:
         return whole
@@ -249,6 +259,7 @@ def _piece(
     mine = seen.within(begin_ns + (index > 0), end_ns)
     truth_ns, truth = _cut_values(whole.truth_ns, whole.truth, begin_ns, end_ns, back)
     gps_ns, gps = _cut_values(whole.positions_ns, whole.positions, begin_ns, end_ns, back)
+    fixed = (whole.fixes_ns > begin_ns - (index == 0)) & (whole.fixes_ns <= end_ns)
     return RobotStream(
         robot=names[index],
         start_ns=zero_ns,
@@ -262,6 +273,8 @@ def _piece(
         notes=(*whole.notes, f"it begins {back * 1e-9:.2f} s into the log"),
         positions_ns=gps_ns,
         positions=gps,
+        fixes_ns=whole.fixes_ns[fixed] - back,
+        fixes=whole.fixes[fixed],
     )
 
 

@@ -160,13 +160,15 @@ class UnlabelledWorld(
 
     path: folder. Several robots each drive a piece of the log from an unknown initial pose.
     duration_s: limit from the first measurement. identities: "known" uses the labels as identities,
-    for comparison.
+    for comparison. fixes: the rows of gps.csv are measurements, and no initial pose is known in
+    their frame.
     """
 
     path: str = ""
     unknown_starts: tuple[str, ...] = ()
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     identities: Identities = "hidden"
+    fixes: bool = False
 
 
 class GraphWorld(

@@ -45,8 +45,8 @@ STATION: Stream = (GNSS, 0)
 """Stream of the station from which fixes are measured: an exact pose without landmarks."""
 
 
-def is_survey(stream: Stream) -> bool:
-    """Whether a stream has the surveyed landmarks, or is the station of the fixes."""
+def is_absolute(stream: Stream) -> bool:
+    """Whether a stream is of absolute positions: the surveyed landmarks or the fixes' station."""
     return stream in (SURVEYED, STATION)
 
 
@@ -77,7 +77,7 @@ def named(stream: Stream) -> str:
     """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
     if stream == STATION:
         return "the fixes"
-    if is_survey(stream):
+    if is_absolute(stream):
         return "the surveyed landmarks"
     if is_map(stream):
         return f"the saved map {stream[0].removeprefix(MAP)}"

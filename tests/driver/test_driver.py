@@ -442,3 +442,16 @@ def test_the_pages_scenario_is_a_live_team_and_its_calls_are_the_drivers(tmp_pat
         takes = list(inspect.signature(getattr(Driver, call)).parameters)[1:]
         said = re.sub(r"\(ahead, left, turn\)", "increment", arguments).split(", ")
         assert takes == [argument.partition("=")[0] for argument in said]
+
+
+def test_a_fix_becomes_a_message_with_its_position_and_its_covariance_if_stated(alone):
+    robot = alone()
+    robot.odometry(10.0, 0.0, 0.0)
+    robot.fix(10.5, 399_000.25, 5_756_000.5)
+    robot.fix(10.75, 1.0, 2.0, [[0.25, 0.125], [0.125, 0.5]])
+    robot.odometry(11.0, 0.1, 0.0)
+    first, second = [each for each in messages(robot) if isinstance(each, m.Fix)]
+    assert (first.stamp_ns, second.stamp_ns) == (10_500_000_000, 10_750_000_000)
+    assert floats(first.position, "position").tolist() == [399_000.25, 5_756_000.5]
+    assert first.covariance == b""
+    assert floats(second.covariance, "covariance").tolist() == [0.25, 0.125, 0.5]

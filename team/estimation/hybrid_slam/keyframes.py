@@ -232,7 +232,7 @@ class Segmenter:
         keyframes = []
         while (next_ns := grid.next_ns) <= until_ns:
             self._go_on_to(next_ns, over)
-            if grid.reach(self._odometry):
+            if grid.reach(self._odometry, over):
                 keyframes.append(replace(self._keyframe_at(next_ns, *NOTHING), is_node=True))
         return keyframes
 

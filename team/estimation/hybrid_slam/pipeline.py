@@ -48,7 +48,9 @@ class HybridSlam:
         front = config.front_end
         with_nodes = front.node_s > 0.0 and config.fusion == "join"
         self._config, self._incarnation = config, incarnation
-        self._grid = PoseGrid(config.sensor, front, config.gnss.antenna) if with_nodes else None
+        self._grid = None
+        if with_nodes:
+            self._grid = PoseGrid(config.sensor, front, config.gnss, config.motion)
         self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
         self._window_ns = _nanoseconds(front.window_s)
         self._standing_ns = _nanoseconds(front.standing_s)

@@ -5,16 +5,18 @@ A robot does not know when it is observed, so all robots place nodes at the same
 multiples of node_s. An inter-robot measurement belongs to the nearest grid time, if that lies in
 the open window and within sighting_s. The observer's odometry carries it to that node; several
 measurements of one teammate at one node are reduced to one. At each node only the fix nearest in
-time is used; the odometry carries the antenna to the node.
+time is used; the odometry carries the antenna to the node. The antenna of a fix that is delayed
+by d is where it was d earlier, seen from the robot at the fix's stamp: T⁻¹ a with the motion T over
+d.
 """
 
 from bisect import insort
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import GNSS, FrontEnd, Sensor
+from teamslam.team.config import GNSS, FrontEnd, Gnss, MotionModel, Sensor
 from teamslam.team.estimation.inter_robot import (
     BASE,
     CarriedPoint,
@@ -26,9 +28,11 @@ from teamslam.team.estimation.inter_robot import (
     reduced,
 )
 from teamslam.team.estimation.models import Increment, scanned
+from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Float
 
+NO_GNSS, NO_MOTION = Gnss(), MotionModel()
 NEVER_NS = 2**62
 """Behind every stamp."""
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
@@ -69,10 +73,16 @@ class PoseGrid:
     """
 
     def __init__(
-        self, sensor: Sensor, front_end: FrontEnd, antenna: tuple[float, float] = (0.0, 0.0)
+        self,
+        sensor: Sensor,
+        front_end: FrontEnd,
+        gnss: Gnss = NO_GNSS,
+        motion: MotionModel = NO_MOTION,
     ) -> None:
         self._sensor = sensor
-        self._antenna = CarriedPoint(np.array(antenna), np.zeros((2, 2)))
+        self._motion = motion
+        self._delay_ns = round(gnss.delay_s * 1e9)
+        self._antenna = CarriedPoint(np.array(gnss.antenna), np.zeros((2, 2)))
         self._fixes: dict[int, tuple[_Look, CarriedPoint]] = {}
         self._grid_ns = round(front_end.node_s * 1e9)
         self._near_ns = round(front_end.sighting_s * 1e9)
@@ -140,13 +150,15 @@ class PoseGrid:
         look_ns = self._uncovered[0].stamp_ns if self._uncovered else NEVER_NS
         self.next_ns = min(look_ns, self._node_ns if self._node_ns <= self._last_ns else NEVER_NS)
 
-    def reach(self, odometry: core.Odometry) -> bool:
-        """Note that the observer is at `next_ns`, where its odometry has brought it; True if that
-        is a pose node (which comes before measurements).
+    def reach(self, odometry: core.Odometry, over: OdometryInterval) -> bool:
+        """Note that the observer is at `next_ns`, in the interval `over` of its odometry; True if
+        that is a pose node (which comes before measurements).
         """
         is_node = self.next_ns == self._node_ns <= self._last_ns
         if not is_node:
             look = self._uncovered.pop(0)
+            if look.fix is not None and self._delay_ns:
+                look = replace(look, seen=self._delayed_antenna(over))
             if look.stamp_ns < look.node_ns:
                 self._ahead.append(look)
                 odometry.mark_sighting()
@@ -161,6 +173,13 @@ class PoseGrid:
         self._node_ns += self._grid_ns
         self._find_next()
         return True
+
+    def _delayed_antenna(self, over: OdometryInterval) -> CarriedPoint:
+        """Place the antenna, at the time of a delayed fix, in the robot's frame at its stamp."""
+        lasting_ns = abs(self._delay_ns)
+        moved = over.gone_on(over.end_ns, lasting_ns).part(self._motion, lasting_ns, 0)
+        carry = carried_on if self._delay_ns > 0 else carried_back
+        return carry(self._antenna, moved)
 
     def sightings(self) -> tuple[NodeSighting, ...]:
         """The window's inter-robot measurements and fixes, by node and teammate, without those

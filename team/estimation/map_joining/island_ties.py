@@ -30,6 +30,8 @@ MOST_POINTS = 24
 """Most points for which more than the best heading is tried: more points do not fit at two
 headings, and would make the search slow.
 """
+MOST_FIXES = 60
+"""Most fixes by which islands are aligned: the work grows with the cube of their number."""
 HOPELESS = 100.0
 """Rise of χ² above the best heading's beyond which a heading is not tried."""
 
@@ -63,23 +65,28 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
     return found
 
 
-def without_jumps(
+def sound_ties(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> tuple[list[SharedPoint], list[InterRobotFactor]]:
-    """Separate the fixes that no rigid motion places together with most of the others; the robust
-    loss discounts them once the islands are one.
+    """Return the points by which islands are aligned, and the fixes that are left out of it.
+
+    At most MOST_FIXES fixes are used, evenly spaced in time. Of these, those that no rigid motion
+    places together with most of the others are left out; the robust loss discounts them once the
+    islands are one.
     """
-    fixes = [each for each in tied if each.seen is not None and each.seen.is_fix]
-    if len(fixes) <= LEAST_AGREEING:
+    every = [each for each in tied if each.seen is not None and each.seen.is_fix]
+    if len(every) <= LEAST_AGREEING:
         return list(tied), []
+    fixes = every[:: -(-len(every) // MOST_FIXES)]
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in fixes])
     in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in fixes])
     limit = chi2_limit(2, 1.0 - main.settings.alignment_confidence)
     agree = agreeing(*in_main, *in_other, limit).tolist()
-    jumps = [each for each, is_one in zip(fixes, agree, strict=True) if not is_one]
-    seen = [each.seen for each in jumps if each.seen is not None]
-    dropped = {id(each) for each in jumps}
-    return [each for each in tied if id(each) not in dropped], seen
+    sound = {id(each) for each, is_one in zip(fixes, agree, strict=True) if is_one}
+    aside = [each for each in every if id(each) not in sound]
+    out = {id(each) for each in aside}
+    seen = [each.seen for each in aside if each.seen is not None]
+    return [each for each in tied if id(each) not in out], seen
 
 
 def aligned_by(

@@ -29,8 +29,8 @@ from teamslam.team.estimation.map_joining.island_ties import (
     SharedPoint,
     aligned_by,
     headings_that_fit,
+    sound_ties,
     ties,
-    without_jumps,
 )
 from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
 from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
@@ -90,8 +90,9 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     if isinstance(apart, Waits):
         return apart
     main, other = apart
-    tied, jumps = without_jumps(main, other, ties(main.graph, other.graph, waiting))
-    waiting = [each for each in waiting if each not in jumps]
+    tied, aside = sound_ties(main, other, ties(main.graph, other.graph, waiting))
+    out = {each.key for each in aside}
+    waiting = [each for each in waiting if each.key not in out]
     seen = sum(tie.seen is not None for tie in tied)
     shared = SharedPoints(len(tied) - seen, seen)
     found = aligned_by(main, other, tied)
@@ -110,8 +111,9 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
         return Waits(why, after_search=True)
     if not is_solvable(search.best.island):
         return Waits(f"{shared}, with which the map has no solution", after_search=True)
-    left = tuple(sorted((*left, *jumps), key=lambda each: each.key))
-    return Merge(search.best, left, _words(other, shared, search, rise))
+    words = _words(other, shared, search, rise)
+    island, left = sighted(search.best.island, sorted((*left, *aside), key=lambda each: each.key))
+    return Merge(search.best._replace(island=island), left, words)
 
 
 def _without_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team import core
-from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.config import FrontEnd, Gnss, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import POSE_JITTER
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
@@ -277,3 +277,23 @@ def test_a_running_gaussian_is_the_windows_without_its_pose_nodes():
     assert running.mean.tobytes() == bare.mean.tobytes()
     assert running.sensitivity.tobytes() == bare.sensitivity.tobytes()
     assert running.covariance.tobytes() == bare.covariance.tobytes()
+
+
+@pytest.mark.parametrize("delay_s", [0.4, -0.4])
+@pytest.mark.parametrize("fixed_s", [1.7, 2.3])
+def test_a_delayed_fix_is_of_the_antenna_where_it_was_by_the_delay_before_its_stamp(
+    delay_s, fixed_s
+):
+    antenna = np.array([0.8, -0.5])
+    grid = PoseGrid(Sensor(), FRONT, Gnss(antenna=tuple(antenna), delay_s=delay_s), MOTION)
+    segmenter = Segmenter(MOTION, Sensor(), 0.0, grid)
+    segmenter.begin(0)
+    position = CarriedPoint(np.array([10.0, 20.0]), np.eye(2))
+    assert grid.fix(round(fixed_s * SECOND), 3, position) is None
+    drive(segmenter, 5.0, 100_000_000)
+    (found,) = grid.sightings()
+    (x, y, turn), (x0, y0, turn0) = arc(fixed_s - delay_s), arc(2.0)
+    true = x + 1j * y + complex(*antenna) * np.exp(1j * turn)
+    expected = (true - (x0 + 1j * y0)) * np.exp(-1j * turn0)
+    assert found.stamp_ns == 2 * SECOND
+    np.testing.assert_allclose(found.point, [expected.real, expected.imag], atol=1e-9)
