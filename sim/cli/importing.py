@@ -120,10 +120,9 @@ def _as_read(folder: Path) -> list[str]:
     """Measurements of each robot, and notes on unusable rows."""
     from teamslam.central.desk.evaluation.clocks import separate_times_warning
     from teamslam.sim.datasets.tables import DatasetError
-    from teamslam.sim.scenarios.scenario import load, with_options
-    from teamslam.sim.scenarios.source import scenario_beside, streams_of
+    from teamslam.sim.scenarios.source import open_data_set
 
-    streams = streams_of(with_options(load(scenario_beside(folder)), dataset=folder))
+    streams, _, _ = open_data_set(folder)
     if not any(len(stream.intervals.end_ns) for stream in streams.streams):
         raise DatasetError(
             "no robot has odometry, so there is nothing to run: `--columns FILE` names the files "

@@ -21,8 +21,8 @@ from teamslam.sim.importing.columns import MEASURED, load_map
 from teamslam.sim.importing.files import import_files, trajectory
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.recorded.streams import measurements_in
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.source import open_data_set
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.streams import StartPose, WorldStreams
 from teamslam.team.geodesy import Datum
@@ -95,7 +95,11 @@ def _own_form(request: Request, folder: Path) -> Report:
             f"{option}: {source} has its robots' names and tables already; it goes with CSV files "
             "of other columns and with bags"
         )
-    streams, scenario, notes = _log(source) if is_own_log(source) else _data_set(source)
+    if is_own_log(source):
+        streams, scenario, notes = _log(source)
+    else:
+        streams, scenario, missing = open_data_set(source)
+        notes = [] if missing is None else [missing]
     robots = {stream.robot: stream for stream in streams.streams}
     for name, (x, y, theta, *sigmas) in request.starts.items():
         robot = _started(name, robots)
@@ -206,12 +210,6 @@ def _log(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
         return *measurements_in(path), lacks
     except LogError as error:
         raise DatasetError("; ".join([*lacks, str(error)])) from None
-
-
-def _data_set(path: Path) -> tuple[WorldStreams, Scenario, list[str]]:
-    scenario = with_options(load(scenario_beside(path)), dataset=path)
-    scenario, missing = with_present_robots(scenario)
-    return streams_of(scenario), scenario, [] if missing is None else [missing]
 
 
 def _bags(request: Request, folder: Path) -> Report:

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.recorded.world import Samples
-from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.scenarios.source import open_data_set
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import Channel, channel_of
@@ -19,9 +18,9 @@ class DataSetRun:
     """
 
     def __init__(self, path: Path) -> None:
-        scenario, _ = with_present_robots(with_options(load(scenario_beside(path)), dataset=path))
+        streams, scenario, _ = open_data_set(path)
         self.path = path
-        self._samples = list(run_team(scenario, streams_of(scenario)))
+        self._samples = list(run_team(scenario, streams))
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
         """Samples of these channels; None: all."""

@@ -11,11 +11,11 @@ from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_files import robots_of, scenario_in
 from teamslam.sim.datasets.graph import graph_world
 from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
-from teamslam.sim.datasets.tables import open_data_set
+from teamslam.sim.datasets.tables import open_data_set as open_files
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
-from teamslam.sim.datasets.utias import present_robots, utias
+from teamslam.sim.datasets.utias import ROBOTS, present_robots, utias
 from teamslam.sim.scenarios.checks import ScenarioError
-from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import (
     FolderWorld,
     GraphWorld,
@@ -72,6 +72,19 @@ def scenario_beside(path: str | Path) -> str:
     return "utias" if kind == "utias" else "recorded"
 
 
+def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]:
+    """Streams of all robots of a data set, its scenario, and a note on robots without files.
+
+    Raises DatasetError, ScenarioError.
+    """
+    own, robots = scenario_beside(path), None
+    if own == "utias":
+        with open_files(str(path), UTIAS_MARKER) as files:
+            robots = max(ROBOTS, *present_robots(files))
+    scenario, missing = with_present_robots(with_options(load(own), robots=robots, dataset=path))
+    return streams_of(scenario), scenario, missing
+
+
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     """Remove robots without files in the data set; also returns a note on them.
 
@@ -83,7 +96,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
     if isinstance(world, FolderWorld):
         present = set(robots_of(world.path))
     else:
-        with open_data_set(world.path, UTIAS_MARKER) as files:
+        with open_files(world.path, UTIAS_MARKER) as files:
             present = {f"r{number}" for number in present_robots(files)}
     remaining = tuple(robot for robot in scenario.robots if robot.id in present)
     missing = [robot.id for robot in scenario.robots if robot.id not in present]

@@ -21,7 +21,12 @@ from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options
-from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.scenarios.source import (
+    open_data_set,
+    scenario_beside,
+    streams_of,
+    with_present_robots,
+)
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
@@ -577,3 +582,13 @@ def test_in_the_real_set_1_landmarks_11_and_17_are_put_right():
     for landmark in (11, 17):
         assert np.percentile(np.abs(range_errors(mended, landmark)), 90) < 0.5
         assert np.percentile(np.abs(range_errors(raw, landmark)), 50) > 0.5
+
+
+def test_all_robots_of_a_set_are_read_also_beyond_five(tmp_path):
+    world = with_options(load("waypoints"), robots=6)
+    world = msgspec.structs.replace(world, world=msgspec.structs.replace(world.world, steps=3))
+    write_utias(streams_of(world), tmp_path)
+    streams, scenario, missing = open_data_set(tmp_path)
+    assert missing is None
+    assert [each.robot for each in streams.streams] == [f"r{k}" for k in range(1, 7)]
+    assert len(scenario.robots) == 6
