@@ -12,6 +12,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import messages as m
 from tests.trials.stress_world import StressWorld, write
 
+TEAM = ("r1", "r2", "r3")
 CAUSES = ("clock_offset", "odometry_scale", "bearing_offset", "range_offset")
 
 
@@ -40,10 +41,12 @@ FAULTS: dict[str, tuple[StressWorld, str, float, set[str]]] = {
         StressWorld(seed=1, bearing_offset={"r2": 0.05}), "bearing_offset", 0.05, {"r2"},
     ),
     "odometry +5 %": (
-        StressWorld(seed=1, odometry_scale=1.05), "odometry_scale", -0.048, {"r1", "r2", "r3"},
+        StressWorld(seed=1, odometry_scale=dict.fromkeys(TEAM, 1.05)),
+        "odometry_scale", -0.048, {"r1", "r2", "r3"},
     ),
     "odometry -5 %": (
-        StressWorld(seed=1, odometry_scale=0.95), "odometry_scale", 0.053, {"r1", "r2", "r3"},
+        StressWorld(seed=1, odometry_scale=dict.fromkeys(TEAM, 0.95)),
+        "odometry_scale", 0.053, {"r1", "r2", "r3"},
     ),
 }  # fmt: skip
 

@@ -26,7 +26,7 @@ from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
+from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld()
 ALL = ("r1", "r2", "r3")
@@ -68,8 +68,8 @@ CASES: Mapping[str, Case] = {
     "clock-0.1": _case("clock_offset", late={"r2": 0.1}),
     "clock-0.2": _case("clock_offset", late={"r2": 0.2}),
     "clock-0.5": _case("clock_offset", late={"r2": 0.5}),
-    "odometry+5": _case("odometry_scale", odometry_scale=1.05),
-    "odometry-5": _case("odometry_scale", odometry_scale=0.95),
+    "odometry+5": _case("odometry_scale", odometry_scale=dict.fromkeys(ALL, 1.05)),
+    "odometry-5": _case("odometry_scale", odometry_scale=dict.fromkeys(ALL, 0.95)),
     "bearing": _case("bearing_offset", bearing_offset=dict.fromkeys(ALL, 0.05)),
     "mirrored": _case("mirrored", mirrored=("r2",)),
     "carried-15": _carried(15.0, 2.0),
@@ -86,6 +86,23 @@ CASES: Mapping[str, Case] = {
     "corridor": _case(corridor=True),
     "1-hz": _case(step_s=1.0),
     "100-hz": _case(step_s=0.01, seconds=100.0),
+    "two-moved": _case(
+        "landmark_moved",
+        landmarks=20,
+        moved=(MovedLandmark(7, (0.5, 0.0), HALF_S), MovedLandmark(12, (-0.4, 0.7), 100.0)),
+    ),
+    "outliers-burst": _case(*NOISE, bursts=(Burst("r2", 100.0, 130.0, 1.0, 0.5),)),
+    "clock-and-scale": _case("clock_offset", late={"r2": 0.2}, odometry_scale={"r2": 1.05}),
+    "one-of-five-mirrored": _case("mirrored", robots=5, mirrored=("r4",)),
+    "carried-twice": _case(
+        "carried_off",
+        carried_off=(CarriedOff("r2", 5.0, 0.7, 100.0), CarriedOff("r2", 5.0, 0.7, 200.0)),
+    ),
+    "odometry-of-one": _case("odometry_scale", odometry_scale={"r2": 1.05}),
+    "bearing-of-one": _case("bearing_offset", bearing_offset={"r2": 0.05}),
+    "range-of-one": _case("range_offset", range_offset={"r2": 0.3}),
+    "yaw-bias": _case(*NOISE, yaw_bias={"r2": 0.02}),
+    "mirrored-alone": _case("mirrored", robots=1, mirrored=("r1",)),
 }
 
 

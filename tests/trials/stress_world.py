@@ -42,19 +42,31 @@ class MovedLandmark:
 
 
 @dataclass(frozen=True)
+class Burst:
+    """A robot's detections have wild bearings and ranges for a while, all by the same errors."""
+
+    robot: str
+    from_s: float
+    to_s: float
+    metres: float
+    radians: float
+
+
+@dataclass(frozen=True)
 class StressWorld:
     """A world and its faults.
 
     late: by robot, the time by which its detections are stamped after the truth [s].
-    odometry_scale: factor on the logged speeds. bearing_offset: added to all bearings [rad], by
-    robot. mirrored: robots whose bearings have the wrong sign. same_id: pairs (a, b): landmark b
-    is measured with the identity of a. noise: factor on the noise of odometry and sensor. grid:
-    landmarks are a grid of so many by so many, 5 m apart; 0: spread at random. clutter: number of
-    false detections in each scan, without identities. tails: degrees of freedom of Student's t of
-    the sensor's errors; 0: normal. correlated_s: time over which the sensor's errors are
-    correlated, half of their variance; 0: none. corridor: whether the landmarks are in the outer
-    fifths of the square alone. step_s: time between two odometry intervals; scans come every half
-    second, or with each interval where that is longer.
+    odometry_scale: factor on the logged speeds, by robot. yaw_bias: added to the logged yaw rates
+    [rad/s], by robot. bearing_offset, range_offset: added to all bearings [rad] and ranges [m], by
+    robot. bursts: spans of wild detections. mirrored: robots whose bearings have the wrong sign.
+    same_id: pairs (a, b): landmark b is measured with the identity of a. noise: factor on the noise
+    of odometry and sensor. grid: landmarks are a grid of so many by so many, 5 m apart; 0: spread
+    at random. clutter: number of false detections in each scan, without identities. tails: degrees
+    of freedom of Student's t of the sensor's errors; 0: normal. correlated_s: time over which the
+    sensor's errors are correlated, half of their variance; 0: none. corridor: whether the landmarks
+    are in the outer fifths of the square alone. step_s: time between two odometry intervals; scans
+    come every half second, or with each interval where that is longer.
     """
 
     seed: int = 1
@@ -67,8 +79,11 @@ class StressWorld:
     starts: bool = True
     carried_off: tuple[CarriedOff, ...] = ()
     late: Mapping[str, float] = field(default_factory=dict)
-    odometry_scale: float = 1.0
+    odometry_scale: Mapping[str, float] = field(default_factory=dict)
+    yaw_bias: Mapping[str, float] = field(default_factory=dict)
     bearing_offset: Mapping[str, float] = field(default_factory=dict)
+    range_offset: Mapping[str, float] = field(default_factory=dict)
+    bursts: tuple[Burst, ...] = ()
     moved: tuple[MovedLandmark, ...] = ()
     mirrored: tuple[str, ...] = ()
     outlier_share: float = 0.0
@@ -150,6 +165,7 @@ def _robot(
 ) -> None:
     place.mkdir(exist_ok=True)
     step_s = world.step_s
+    scale, yaw_bias = world.odometry_scale.get(name, 1.0), world.yaw_bias.get(name, 0.0)
     count = round(world.seconds / step_s)
     pose = np.array(
         [*rng.uniform(-0.4 * world.half_m, 0.4 * world.half_m, 2), rng.uniform(-pi, pi)]
@@ -180,7 +196,7 @@ def _robot(
         sigma_turn = np.sqrt(0.01**2 * way + 0.005**2 * step_s + 0.05**2 * abs(angle))
         slip = world.noise * sigma_way * rng.standard_normal() / step_s
         twist = world.noise * sigma_turn * rng.standard_normal() / step_s
-        logged.append((world.odometry_scale * (speed + slip), turn + twist))
+        logged.append((scale * (speed + slip), turn + twist + yaw_bias))
     times = step_s * np.arange(count + 1)
     rows = [
         f"{t:.3f},{float(v)!r},{float(w)!r}" for t, (v, w) in zip(times[:-1], logged, strict=True)
@@ -218,10 +234,14 @@ def _scans(
     late = world.late.get(name, 0.0)
     sign = -1.0 if name in world.mirrored else 1.0
     alias = {b: a for a, b in world.same_id}
+    bursts = [each for each in world.bursts if each.robot == name]
     rows, labels = [], []
     every, drawn = world.scan_every, _errors(world, rng)
     for k in range(every, len(path) - every - math.ceil(max(late, 0.0) / world.step_s), every):
         stamp, pose = k * world.step_s + late, path[k]
+        wild = [each for each in bursts if each.from_s <= k * world.step_s < each.to_s]
+        further = world.range_offset.get(name, 0.0) + sum(each.metres for each in wild)
+        aside = world.bearing_offset.get(name, 0.0) + sum(each.radians for each in wild)
         next(drawn)
         now = points.copy()
         for each in world.moved:
@@ -233,9 +253,9 @@ def _scans(
         for i in np.flatnonzero(ranges < world.reach_m).tolist():
             sigma = np.hypot(0.05, 0.02 * ranges[i])
             along, across = drawn.send(True)
-            z = ranges[i] + world.noise * sigma * along
+            z = ranges[i] + world.noise * sigma * along + further
             b = bearings[i] + world.noise * 0.02 * across
-            b = sign * (b + world.bearing_offset.get(name, 0.0))
+            b = sign * (b + aside)
             if rng.random() < world.outlier_share:
                 z, b = rng.uniform(0.5, world.reach_m), rng.uniform(-pi, pi)
             b, z = (b + pi) % (2 * pi) - pi, max(z, 0.01)
