@@ -163,16 +163,18 @@ def _shared_errors(
 
     Their standard deviation is the larger of two: the stated one times the root of a covariance
     scale above 1, and that from the scatter of the submaps. Errors that change slowly look like a
-    shared one, but the submaps scatter about it. The standard deviation of a large error grows by
-    the error of its sensitivities, which vanishes with it.
+    shared one, but the submaps scatter about it. Of that scatter, known from few independent
+    submaps, an error must exceed as many as chance does equally rarely (Student's t). The standard
+    deviation of a large error grows by the error of its sensitivities, which vanishes with it.
     """
     for found in biases:
         (robot, _), bias, value, stated = found
         error, sigma = _ERRORS.get(bias), stated * math.sqrt(max(scale, 1.0))
         if error is None or sigma == 0.0 or abs(value) <= max(error.least, SIGMAS * sigma):
             continue
-        sigma = max(sigma, scatter_of(fold, found))
-        if abs(value) > SIGMAS * sigma:
+        scatter = scatter_of(fold, found)
+        least, sigma = SIGMAS * sigma, max(sigma, scatter.sigma)
+        if abs(value) > max(least, _student(SIGMAS, scatter.freedom) * scatter.sigma):
             yield m.Diagnosis(
                 cause=error.cause,
                 robot=robot,
@@ -181,6 +183,16 @@ def _shared_errors(
                 evidence=(value / sigma) ** 2,
                 remedy=error.remedy.format(value=value, factor=1.0 + value),
             )
+
+
+def _student(sigmas: float, freedom: float) -> float:
+    """Return the multiple of an estimated standard deviation that chance exceeds as rarely as that
+    of an exact one: t ≈ √(ν (exp(z²/ν) − 1)) (Wallace 1959).
+    """
+    if freedom == math.inf:
+        return sigmas
+    freedom = max(freedom, 1.0)
+    return math.sqrt(freedom * core.expm1(sigmas**2 / freedom))
 
 
 def clock_remedy(late_s: float) -> str:

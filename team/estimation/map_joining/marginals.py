@@ -32,6 +32,8 @@ BELIEVED = 0.5
 
 STEP = 0.1
 """Step of a derivative along a bias, in its standard deviations."""
+MOST_CORRELATED = 0.97
+"""Largest correlation of a submap's error with that of the next one."""
 
 
 class LandmarkMap(NamedTuple):
@@ -145,15 +147,27 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
     return found
 
 
-def scatter_of(fold: Fold, of: BiasEstimate) -> float:
+class Scatter(NamedTuple):
+    """Standard deviation of a shared error by the scatter of the submaps, and the degrees of
+    freedom of its square.
+    """
+
+    sigma: float
+    freedom: float
+
+
+def scatter_of(fold: Fold, of: BiasEstimate) -> Scatter:
     """Estimate the standard deviation of a bias from the scatter of the submaps' contributions.
 
     With c = A⁻¹u, where u picks the bias, submap k moves the estimate by s_k = −c · ∇(w χ²_k)/2.
-    Errors that last longer than a window correlate the s_k of a stream: the variance is
+    Errors that last longer than a window correlate the s_k of a stream, here as an autoregressive
+    process of first order with the coefficient ρ: of all streams the variance and its degrees of
+    freedom are
 
-        Σ_streams Σ_l (1 − |l|/(L + 1)) Σ_k s_k s_{k+l},   L = ⌊4 (n/100)^(2/9)⌋,
+        g Σ_k s_k²,   (Σ_r v_r)²/(g Σ_r v_r²/n_r),   g = (1 + ρ)/(1 − ρ),
 
-    with n submaps of the stream (Newey and West 1987, 1994). Independent errors with the submaps'
+    with v_r = Σ s_k² of the n_r submaps of stream r (Welch 1947). ρ is that of all streams, less
+    its bias in short series (Kendall 1954), at least 0. Independent errors with the submaps'
     covariances give `of.sigma`. Condensed submaps are not counted.
     """
     key = of.stream, of.bias
@@ -170,14 +184,23 @@ def scatter_of(fold: Fold, of: BiasEstimate) -> float:
     chains: dict[Stream, list[tuple[int, int]]] = {}
     for k, each in enumerate(graph.submaps):
         chains.setdefault(each.contribution.stream, []).append((each.contribution.sequence, k))
-    variance = 0.0
-    for _, chain in sorted(chains.items()):
-        s = moves[[k for _, k in sorted(chain)]]
-        lags = math.floor(4.0 * (len(s) / 100.0) ** (2.0 / 9.0))
-        for lag in range(min(lags, len(s) - 1) + 1):
-            share = (1.0 if lag == 0 else 2.0) * (1.0 - lag / (lags + 1.0))
-            variance += share * float((s[lag:] * s[: len(s) - lag]).sum())
-    return math.sqrt(max(variance, 0.0))
+    return scatter_of_series(
+        [moves[[k for _, k in sorted(chain)]] for _, chain in sorted(chains.items())]
+    )
+
+
+def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
+    """Estimate the standard deviation of the sum of several autoregressive series of mean 0."""
+    squares = np.array([(s * s).sum() for s in chains])
+    total = float(squares.sum())
+    if total == 0.0:
+        return Scatter(0.0, math.inf)
+    counts = np.array([len(s) for s in chains])
+    rho = math.fsum(float((s[1:] * s[:-1]).sum()) for s in chains) / total
+    rho = min(max(rho + (1.0 + 3.0 * rho) / float(counts.sum()), 0.0), MOST_CORRELATED)
+    longer = (1.0 + rho) / (1.0 - rho)
+    freedom = total**2 / (longer * float((squares * squares / counts).sum()))
+    return Scatter(math.sqrt(longer * total), freedom)
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
