@@ -34,6 +34,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 )
 from teamslam.team.estimation.map_joining.marginals import terms
 from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
+from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.estimation.se2 import compose, inverse, wrapped
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64
@@ -70,6 +71,8 @@ RESOLVED = 1.5
 """Least size of an effect in standard deviations of one submap."""
 AT_ONCE = 32
 """Number of places about which a scan evaluates the observations at once."""
+POSE = 3
+"""Degrees of freedom of a jump."""
 LEAST_SIDE = 2
 """Least number of submaps on each side of a split."""
 PROPOSED = 3
@@ -78,6 +81,8 @@ ROUNDS = 6
 """Most causes that are accepted."""
 
 
+NO_ID = -1
+"""In place of an id: a node that is no named landmark."""
 ALL = slice(None)
 """Every observation."""
 
@@ -109,48 +114,60 @@ class Hypothesis(NamedTuple):
 def sights_of(island: Island) -> dict[int, Sights]:
     """Tabulate the observations of each named landmark by the submaps of the graph."""
     graph, state = island.graph, island.state
-    id_of = {node: id_ for id_, node in graph.landmarks.items() if id_ < UNNAMED}
-    rows: dict[int, list[tuple[int, int, int, float, float, float, float, float]]] = {}
+    id_of = np.full(len(graph.fixed), NO_ID)
+    for id_, node in graph.landmarks.items():
+        if id_ < UNNAMED:
+            id_of[node] = id_
     order = sorted(range(len(graph.submaps)), key=lambda at: graph.submaps[at].contribution.key)
-    for at in order:
-        each = graph.submaps[at]
-        local, start = each.contribution.local, int(each.nodes[0])
-        count = len(local.ids)
-        if not count:
-            continue
-        mean = local.mean[-2 * count :].copy()
-        of_biases = each.nodes[len(each.nodes) - len(each.biases) :]
-        for row, bent, node in zip(
-            each.sensitivity, each.curvature, of_biases.tolist(), strict=True
-        ):
-            value = state[graph.offset[node]]
-            mean += value * (row + 0.5 * value * bent)[-2 * count :]
-        x, y, heading = (float(n) for n in state[graph.offset[start] : graph.offset[start] + 3])
-        s, c = core.sin_and_cos(heading)
-        dx, dy = c * mean[::2] - s * mean[1::2], s * mean[::2] + c * mean[1::2]
-        own = each.contribution.factor.landmarks * island.settings.covariance_factor
-        xx = c * c * own[:, 0] - 2.0 * c * s * own[:, 1] + s * s * own[:, 2]
-        yy = s * s * own[:, 0] + 2.0 * c * s * own[:, 1] + c * c * own[:, 2]
-        xy = c * s * (own[:, 0] - own[:, 2]) + (c * c - s * s) * own[:, 1]
-        if not graph.fixed[start]:
-            P = graph.pattern.block(island.selected_covariance, start, start)
-            xx = xx + P[0, 0] - 2.0 * dy * P[0, 2] + dy * dy * P[2, 2]
-            yy = yy + P[1, 1] + 2.0 * dx * P[1, 2] + dx * dx * P[2, 2]
-            xy = xy + P[0, 1] + dx * P[0, 2] - dy * P[1, 2] - dx * dy * P[2, 2]
-        for k, node in enumerate(each.landmarks.tolist()):
-            if node in id_of:
-                rows.setdefault(id_of[node], []).append(
-                    (at, each.contribution.end_ns, k, x + dx[k], y + dy[k], xx[k], xy[k], yy[k])
-                )
+    order = [at for at in order if len(graph.submaps[at].contribution.local.ids)]
+    if not order:
+        return {}
+    joined = [graph.submaps[at] for at in order]
+    of = np.repeat(np.arange(len(order)), [len(each.landmarks) for each in joined])
+    local = np.concatenate([_landmarks_of(each, island) for each in joined])
+    starts = np.array([int(each.nodes[0]) for each in joined])
+    at = graph.offset[starts]
+    x, y, heading = state[at], state[at + 1], state[at + 2]
+    s, c = core.sin_and_cos(heading)
+    s, c = s[of], c[of]
+    dx, dy = c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1]
+    own = np.concatenate([each.contribution.factor.landmarks for each in joined])
+    own = own * island.settings.covariance_factor
+    xx = c * c * own[:, 0] - 2.0 * c * s * own[:, 1] + s * s * own[:, 2]
+    yy = s * s * own[:, 0] + 2.0 * c * s * own[:, 1] + c * c * own[:, 2]
+    xy = c * s * (own[:, 0] - own[:, 2]) + (c * c - s * s) * own[:, 1]
+    free = [not graph.fixed[start] for start in starts.tolist()]
+    poses = np.zeros((len(order), 3, 3))
+    for k in np.flatnonzero(free).tolist():
+        start = int(starts[k])
+        poses[k] = graph.pattern.block(island.selected_covariance, start, start)
+    P = poses[of]
+    xx = xx + P[:, 0, 0] - 2.0 * dy * P[:, 0, 2] + dy * dy * P[:, 2, 2]
+    yy = yy + P[:, 1, 1] + 2.0 * dx * P[:, 1, 2] + dx * dx * P[:, 2, 2]
+    xy = xy + P[:, 0, 1] + dx * P[:, 0, 2] - dy * P[:, 1, 2] - dx * dy * P[:, 2, 2]
+    points, spread = np.column_stack([x[of] + dx, y[of] + dy]), np.column_stack([xx, xy, yy])
+    places = np.array(order, np.int64)[of]
+    end_ns = np.array([each.contribution.end_ns for each in joined], np.int64)[of]
+    ids = id_of[np.concatenate([each.landmarks for each in joined])]
+    by_id = np.argsort(ids, kind="stable")
+    groups = np.split(by_id, np.flatnonzero(np.diff(ids[by_id])) + 1)
     return {
-        id_: Sights(
-            np.array([row[0] for row in found], np.int64),
-            np.array([row[1] for row in found], np.int64),
-            np.array([row[3:5] for row in found]),
-            np.array([row[5:8] for row in found]),
-        )
-        for id_, found in sorted(rows.items())
+        int(ids[group[0]]): Sights(places[group], end_ns[group], points[group], spread[group])
+        for group in groups
+        if ids[group[0]] != NO_ID
     }
+
+
+def _landmarks_of(joined: Joined, island: Island) -> Float[np.ndarray, "n 2"]:
+    """Return a submap's landmarks in its frame, at the state's shared errors."""
+    graph, local = island.graph, joined.contribution.local
+    mean = local.mean[-2 * len(local.ids) :].copy()
+    of_biases = joined.nodes[len(joined.nodes) - len(joined.biases) :]
+    rows = zip(joined.sensitivity, joined.curvature, of_biases.tolist(), strict=True)
+    for row, bent, node in rows:
+        value = island.state[graph.offset[node]]
+        mean += value * (row + 0.5 * value * bent)[-len(mean) :]
+    return mean.reshape(-1, 2)
 
 
 class _Two(NamedTuple):
@@ -234,6 +251,11 @@ def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _
         float(_chi2_about(sights, _centre(sights, own))[own].sum()) for own in (~second, second)
     )
     return _Two(second, one - sum(parts) - price)
+
+
+def _about_one_place(sights: Sights) -> float:
+    """Evaluate the χ² about one place: no split removes more."""
+    return float(_chi2_about(sights, median(sights.points)).sum())
 
 
 def change_of(sights: Sights) -> _Two | None:
@@ -328,16 +350,18 @@ def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, "
 
 def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the most likely hypotheses of a landmark with two places."""
-    sights = sights_of(base.island)
+    sights, enough = sights_of(base.island), base.scale * level
     proposals: list[tuple[float, int, SplitCause, Bool[np.ndarray, " n"]]] = []
     for id_, own in sights.items():
-        if len(own.places) >= 2 * LEAST_SIDE:
-            if (moved := change_of(own)) is not None:
-                proposals.append((moved.evidence, id_, MOVED, moved.second))
-            shared = clusters_of(own, base.scale)
-            if shared is not None and not _is_misread(base, id_, own, shared.second):
-                proposals.append((shared.evidence, id_, SHARED, shared.second))
-    proposals = [each for each in proposals if each[0] > base.scale * level]
+        if len(own.places) < 2 * LEAST_SIDE or _about_one_place(own) <= enough:
+            continue
+        moved, shared = change_of(own), clusters_of(own, base.scale)
+        if moved is not None and moved.evidence > enough:
+            proposals.append((moved.evidence, id_, MOVED, moved.second))
+        if shared is None or shared.evidence <= enough:
+            continue
+        if not _is_misread(base, id_, own, shared.second):
+            proposals.append((shared.evidence, id_, SHARED, shared.second))
     proposals.sort(key=lambda each: (-each[0], each[1], each[2]))
     graph = base.island.graph
     for _, id_, cause, second in proposals[: 2 * PROPOSED]:
@@ -370,8 +394,10 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
-    """Solve the hypotheses that a robot was carried off before, in or after a submap that disagrees
+    """Solve the hypotheses that a robot was carried off in, before or after a submap that disagrees
     with the rest.
+
+    A jump at a seam removes no more cost than the graph without the submap, which is solved first.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -390,21 +416,22 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         back = compose(finish, inverse(own.end_pose))
         new = len(graph.fixed)
         before = _begin_ns(island, at)
-        trials = [(split(island, end, {at}, compose(begin, own.end_pose)), stamp, 3)]
-        if before:
-            trials.append((split(island, start, {at}, back), before, 3))
-        trials.append((without(island, [at]), stamp, len(own.mean)))
-        for k, (trial, when, dof) in enumerate(trials):
-            found = resolved(trial)
+        dropped = resolved(without(island, [at]))
+        trials = [(dropped, stamp, len(own.mean))]
+        if dropped is None or base.cost - dropped[1] > base.scale * (level + 2.0 * POSE):
+            at_end = split(island, end, {at}, compose(begin, own.end_pose))
+            trials.append((resolved(at_end), stamp, POSE))
+            if before:
+                trials.append((resolved(split(island, start, {at}, back)), before, POSE))
+        for k, (found, when, dof) in enumerate(trials):
             if found is None:
                 continue
             solved, cost = found
-            if dof == 3:
-                jump, P = (
-                    _difference(solved, new, end) if k == 0 else _difference(solved, start, new)
-                )
-            else:
+            if k == 0:
                 jump, P = _motion_beyond(solved, start, end, own)
+            else:
+                nodes = (new, end) if k == 1 else (start, new)
+                jump, P = _difference(solved, *nodes)
             sigma = np.sqrt(np.diagonal(P) * base.scale)
             yield Hypothesis(
                 CARRIED_OFF,
