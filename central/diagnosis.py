@@ -31,6 +31,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     BiasEstimate,
     scatter_of,
     terms,
+    unbounded_costs,
 )
 from teamslam.team.wire import messages as m
 
@@ -131,7 +132,8 @@ def diagnose(
             for each in accepted
             if each.subject not in mirrored and not _is_bent(each, shared)
         ]
-        left = finding(Agreement(0.0, 0.0, {}, tuple(terms(island).submaps)), normal, final=final)
+        costs = unbounded_costs(island) if final else terms(island).submaps
+        left = finding(Agreement(0.0, 0.0, {}, tuple(costs)), normal, final=final)
         noise = [_noise(*each) for each in left.misscaled if each.robot not in mirrored]
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))

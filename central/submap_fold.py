@@ -216,11 +216,10 @@ class SubmapFold:
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
         biases = marginals.bias_estimates(fold)
-        found = (
-            NOTHING
-            if agreement is None
-            else finding(agreement, self.config.normal_scale, final=final)
-        )
+        found = NOTHING
+        if agreement is not None:
+            judged = marginals.with_unbounded_costs(agreement, fold) if final else agreement
+            found = finding(judged, self.config.normal_scale, final=final)
         self.finding = found.with_biases(biases)
         figures = self.finding.figures
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))

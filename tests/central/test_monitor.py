@@ -22,7 +22,10 @@ def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
     submaps = [claim(s) if claim else s for s in world.submaps]
     fold = joined_with(submaps, world.starts, (), settings, len(submaps))
     solved = converged(fold, settings)
-    return finding(marginals.joint_cost(solved), normal, final=final)
+    agreement = marginals.joint_cost(solved)
+    if final:
+        agreement = marginals.with_unbounded_costs(agreement, solved)
+    return finding(agreement, normal, final=final)
 
 
 def with_covariance_times(factor, of):

@@ -99,10 +99,14 @@ class Sights(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A cause with the graph that has it, solved: what it removes, and its degrees of freedom."""
+    """A cause with the graph that has it, solved: what it removes, and its degrees of freedom.
+
+    robots: those that observe the less frequent place of a landmark, or jump.
+    """
 
     cause: SplitCause
     subject: int | str
+    robots: frozenset[str]
     at_ns: int
     value: tuple[float, ...]
     sigma: tuple[float, ...]
@@ -222,7 +226,7 @@ def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
     """Whether both places have enough observations: a share of STRAY, or two that agree with each
     other and are most of those that are elsewhere. Misread ones are scattered.
     """
-    few = second if 2 * int(second.sum()) <= len(second) else ~second
+    few = _less_frequent(second)
     count = int(few.sum())
     if count < LEAST_SIDE:
         return False
@@ -231,6 +235,11 @@ def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
     elsewhere = _chi2_about(sights, _centre(sights, ~few)) > LANDMARK_GATE
     agree = elsewhere & (_chi2_about(sights, _centre(sights, few)) < LANDMARK_GATE)
     return int(agree.sum()) >= max(LEAST_SIDE, SPOILT * int(elsewhere.sum()))
+
+
+def _less_frequent(second: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Return the observations of the less frequent of two places."""
+    return second if 2 * int(second.sum()) <= len(second) else ~second
 
 
 def _price(second: Bool[np.ndarray, " n"]) -> float:
@@ -348,6 +357,11 @@ def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, "
     )
 
 
+def _robots_of(island: Island, places: Places) -> frozenset[str]:
+    """Return the robots of some submaps of the graph."""
+    return frozenset(island.graph.submaps[at].contribution.robot for at in places.tolist())
+
+
 def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the most likely hypotheses of a landmark with two places."""
     sights, enough = sights_of(base.island), base.scale * level
@@ -384,6 +398,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         yield Hypothesis(
             cause,
             id_,
+            _robots_of(base.island, own.places[_less_frequent(second)]),
             _begin_ns(base.island, int(own.places[first])) if cause == MOVED else 0,
             tuple(shift.tolist()),
             tuple(sigma.tolist()),
@@ -436,6 +451,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
             yield Hypothesis(
                 CARRIED_OFF,
                 robot,
+                frozenset({robot}),
                 when,
                 tuple(jump.tolist()),
                 tuple(sigma.tolist()),
@@ -497,6 +513,7 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     yield Hypothesis(
         SHARED,
         id_of[node],
+        _robots_of(island, np.array(spoilt)),
         0,
         tuple(farthest.tolist()),
         tuple(sigma.tolist()),
@@ -538,20 +555,43 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
         best = max(found, key=lambda each: each.evidence / each.dof)
         accepted.append(best)
         base = _solved(best.island, final_cost(best.island))
-    return _told_apart(accepted), base.island
+    return _told_apart(accepted, base, level), base.island
 
 
-def _told_apart(accepted: list[Hypothesis]) -> list[Hypothesis]:
-    """Drop repetitions, and the apparent jumps of a robot with another fault.
+def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
+    """Drop repetitions, and the apparent effects of another fault.
 
-    A robot that seems to have been carried off at several places, or beside one number of two
-    landmarks, which bends paths, was not.
+    A robot that seems to have been carried off beside one number of two landmarks, which bends
+    paths, was not. Nor was one at several places, unless a submap before or after each agrees with
+    the map: its measurements were wild for a while, and a second place of a landmark that it
+    alone observes is one of them.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
-    is_bent = any(each.cause == SHARED for each in accepted)
-    found: dict[int | str, Hypothesis] = {}
+    wild = {
+        each.robots
+        for each in accepted
+        if each.cause == CARRIED_OFF
+        and jumps.count(each.subject) > 1
+        and not _is_beside_sound(each, base, level)
+    }
+    is_bent = any(each.cause == SHARED and each.robots not in wild for each in accepted)
+    found: dict[tuple[int | str, int], Hypothesis] = {}
     for each in accepted:
         is_jump = each.cause == CARRIED_OFF
-        if not (is_jump and (is_bent or jumps.count(each.subject) > 1)):
-            found.setdefault(each.subject, each)
+        if not (is_jump and is_bent) and each.robots not in wild:
+            found.setdefault((each.subject, each.at_ns if is_jump else 0), each)
     return list(found.values())
+
+
+def _is_beside_sound(jump: Hypothesis, base: _Solved, level: float) -> bool:
+    """Whether a submap of the robot that ends or begins at a jump agrees with the map: the other
+    one may have a scan beyond the jump.
+    """
+    island = base.island
+    costs = zip(island.graph.submaps, terms(island).submaps, strict=True)
+    return any(
+        cost.chi2 <= base.scale * (cost.dof + level)
+        for at, (joined, cost) in enumerate(costs)
+        if joined.contribution.robot == jump.subject
+        and jump.at_ns in (joined.contribution.end_ns, _begin_ns(island, at))
+    )
