@@ -11,7 +11,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import messages as m
-from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
+from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(robots=2, landmarks=12, half_m=10.0, seconds=120.0)
 TEAM = StressWorld(landmarks=15, half_m=12.0, seconds=100.0)
@@ -55,6 +55,19 @@ def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
     assert (found.cause, found.robot) == ("carried_off", "r2")
     assert math.hypot(*found.value[:2]) == pytest.approx(4.0, abs=0.5)
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
+
+
+def test_a_robot_that_was_carried_off_twice_is_named_with_both_times(tmp_path):
+    off = CarriedOff("r2", 5.0, 0.7, 40.0), CarriedOff("r2", 5.0, 0.7, 70.0)
+    found = diagnosed(scenario(replace(TEAM, carried_off=off), tmp_path))
+    assert {(each.cause, each.robot) for each in found} == {("carried_off", "r2")}
+    assert sorted(each.at_ns * 1e-9 for each in found) == pytest.approx([40.0, 70.0], abs=10.0)
+
+
+def test_wild_measurements_of_a_robot_for_a_while_are_no_fault_of_landmarks(tmp_path):
+    wild = Burst("r2", 40.0, 70.0, 1.0, 0.5)
+    found = diagnosed(scenario(replace(TEAM, bursts=(wild,)), tmp_path))
+    assert not [each for each in found if each.landmark is not None]
 
 
 def test_a_mirrored_robot_is_named_as_mirrored(tmp_path):
