@@ -1,6 +1,8 @@
 """Commands that recompute a log: rerun and verify-ledger."""
 
 import math
+import os
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -288,7 +290,7 @@ def _verify(path: Path, json_file: Path | None) -> None:
     warn_of_holes(log)
     began = time.monotonic()
     with failing(FAILED, RerunError, at=path):
-        result = verify(log)
+        result = verify(log, _processes())
     elapsed_s = time.monotonic() - began
     _print_verification(result, elapsed_s)
     figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
@@ -300,6 +302,11 @@ def _verify(path: Path, json_file: Path | None) -> None:
     if result.first is not None:
         what = "the log lacks what is needed" if result.first.lacks else "the first difference"
         fail(f"{what}: {result.first}", FAILED)
+
+
+def _processes() -> int:
+    """Number of processes that recompute a log; where fork is unsafe or absent, one."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
 
 
 def _print_verification(result: "Verification", elapsed_s: float) -> None:

@@ -7,8 +7,11 @@ submaps of the map's version vector; the exchanges of a feedback rule from the r
 maps. So an error is located in one message; its successors are judged by its recorded bytes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 
 from teamslam.central.desk.verification.centre import recomputed_centre, recomputed_peer
 from teamslam.central.desk.verification.differences import FieldDifference, first_difference
@@ -110,20 +113,27 @@ class Verification:
         return sum(c.messages for c in self.channels)
 
 
-def verify(log: Log) -> Verification:
-    """Recompute a log and compare; raises RerunError, LogError."""
+Part = Callable[[], Mapping[Identity, m.Message]]
+"""Messages of one node, recomputed from the log alone."""
+
+
+def verify(log: Log, processes: int = 1) -> Verification:
+    """Recompute a log and compare; raises RerunError, LogError.
+
+    processes: most processes that recompute nodes at a time. More than one are forked, so this
+    process must have no other thread that holds a lock.
+    """
     here = provenance()
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
     found = recorded(log)
     recomputed: dict[Identity, m.Message] = {}
     others = _others(log, found)
-    for robot in found.robots:
-        if robot not in others:
-            recomputed |= recomputed_robot(found, robot)
-    recomputed |= recomputed_centre(found)
-    for robot in found.robots:
-        if robot not in others:
-            recomputed |= recomputed_peer(found, robot)
+    own = [robot for robot in found.robots if robot not in others]
+    parts: list[Part] = [partial(recomputed_robot, found, robot) for robot in own]
+    parts.append(partial(recomputed_centre, found))
+    parts += [partial(recomputed_peer, found, robot) for robot in own]
+    for messages in _computed(parts, processes):
+        recomputed |= messages
     results = []
     for channel in CHECKED:
         of_channel = found.outputs_of(channel)
@@ -134,6 +144,32 @@ def verify(log: Log) -> Verification:
     span_s = (max(s[1] for s in spans) - min(s[0] for s in spans)) * 1e-9 if spans else 0.0
     count = sum(map(len, found.measurements.values()))
     return Verification(tuple(results), other, count, span_s, found.unsound)
+
+
+def _computed(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Identity, m.Message]]:
+    """Messages of the parts, in their order."""
+    if processes == 1:
+        yield from (part() for part in parts)
+        return
+    pool = ProcessPoolExecutor(processes, get_context("fork"), _inherit, (parts,))
+    try:
+        # The last begins first: the centre takes longest.
+        begun = [pool.submit(_compute_part, number) for number in reversed(range(len(parts)))]
+        yield from (each.result() for each in reversed(begun))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+_inherited: Sequence[Part] = ()
+
+
+def _inherit(parts: Sequence[Part]) -> None:
+    global _inherited
+    _inherited = parts
+
+
+def _compute_part(number: int) -> Mapping[Identity, m.Message]:
+    return _inherited[number]()
 
 
 def _others(log: Log, found: Recorded) -> frozenset[str]:

@@ -82,6 +82,7 @@ def test_every_recomputable_message_of_a_run_comes_out_again(log):
     } | {ch.TEAM_POSE.name}  # the others are what peers say
     assert counts(result).keys() == recomputable - silent
     assert counts(result)["submap"] == (12, 12)
+    assert verify(log, processes=2) == result
 
 
 @pytest.mark.parametrize(
@@ -233,12 +234,13 @@ def test_a_log_with_a_dead_robot_comes_out_again(tmp_path):
     assert all_equal(verify(written(tmp_path / "log.mcap", said(team))))
 
 
-def test_a_log_without_a_configuration_can_not_be_computed(samples, tmp_path):
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_log_without_a_configuration_can_not_be_computed(processes, samples, tmp_path):
     bare = [
         s for s in samples if s.key != ch.ROBOT_CONFIG.key("robot/r1") and "config" not in s.key
     ]
     with pytest.raises(RerunError, match="no configuration of robot/r1"):
-        verify(written(tmp_path / "log.mcap", bare))
+        verify(written(tmp_path / "log.mcap", bare), processes)
 
 
 def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(log, samples, tmp_path):
