@@ -129,7 +129,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
     gps_ns, gps = _positions(root)
     fixes_ns, fixes = np.empty(0, np.int64), np.zeros((0, 5))
     if world.fixes:
-        if gps_ns is None:
+        if gps_ns is None or gps is None:
             raise DatasetError(f"{root}: no gps.csv in it, and world.fixes is true")
         inside = (gps_ns >= start_ns) & (gps_ns <= end_ns)
         fixes_ns = gps_ns[inside]
