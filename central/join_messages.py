@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from teamslam.central.config import CentralConfig
+from teamslam.central.fixes import fix_warnings
 from teamslam.central.fused_map import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
 from teamslam.central.sent_priors import in_main_island
@@ -189,6 +190,7 @@ def reasons(
         *_worded(refusals(fold)),
         *(words for words in fold.warnings if not words.startswith(RIVAL)),
         *survey_warnings(fold),
+        *fix_warnings(fold),
         *_lost(shown),
         *_repeated(shown),
         *_left_out(fold, shown, landmark_submaps),

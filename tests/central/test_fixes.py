@@ -82,6 +82,7 @@ def test_fixes_of_one_robot_place_a_team_without_known_starts():
     fused = final_map(samples)
     assert fused.frame == SURVEY_FRAME
     assert {each.robot for each in fused.members} == {"r1", "r2"}
+    assert not any("fixes" in each for each in fused.reasons)
     rmse, nees = errors(fused, streams)
     assert rmse < 0.3
     assert nees < 2.0

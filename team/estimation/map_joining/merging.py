@@ -104,7 +104,10 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     others = [placed(main, other, place, ())[0] for place in _places(main, other, tied)]
     search = searched([both, *(replace(both, state=each.state) for each in others)])
     rise = search.best.cost - minimum(main).cost - minimum(other).cost
-    why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
+    # Fixes whose errors drift agree with the alignment one by one (`sound_ties`), not together.
+    are_fixes = all(tie.seen is not None and tie.seen.is_fix for tie in tied)
+    if not are_fixes:
+        why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
     if why is None and search.second is not None and search.ambiguous:
         why = _ambiguous(shared, search, search.second, graph.streams[min(other.graph.streams)][0])
     if why is not None:
