@@ -16,6 +16,8 @@ from teamslam.team.config import (
 )
 from teamslam.team.geodesy import Datum
 
+ClassName = Annotated[str, Meta(pattern="^[A-Za-z][A-Za-z0-9_ -]{0,31}$")]
+
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Prior standard deviations of the errors shared by all robots, beside each robot's own; 0:
@@ -86,7 +88,8 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     submaps, inter-robot measurements and initial poses beyond them are refused. association:
     thresholds for merging landmarks without identities, by kind of sensor. surveyed: landmarks at
     known places, which fix the team's frame. datum: latitude and longitude of that frame's origin,
-    where x is east and y is north: results are given in degrees, too. localise: robots are
+    where x is east and y is north: results are given in degrees, too. classes: names of the
+    landmarks' classes by their numbers 0, 1, …, in tables and reports. localise: robots are
     localised in the loaded saved map, which is neither changed nor extended; under `join`.
     """
 
@@ -110,9 +113,12 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     localise: bool = False
     surveyed: Annotated[tuple[SurveyedLandmark, ...], Meta(max_length=1000)] = ()
     datum: Datum | None = None
+    classes: Annotated[tuple[ClassName, ...], Meta(max_length=64)] = ()
 
     def __post_init__(self) -> None:
         if len({each.landmark for each in self.surveyed}) < len(self.surveyed):
             raise ValueError("surveyed names each landmark once")
+        if len(set(self.classes)) < len(self.classes):
+            raise ValueError("classes names each class once")
         if self.surveyed and self.fusion != "join":
             raise ValueError("surveyed landmarks need the rule join")

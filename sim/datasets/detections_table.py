@@ -1,7 +1,8 @@
 """Detections without identities in a robot's folder of a data set.
 
 r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m in the scans that
-                    have them; class: reported class 0, 1, …, right with class_probability (0.95)
+                    have them; class: reported class 0, 1, …, or its name in central.classes,
+                    right with class_probability (0.95)
 r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for scoring (optional)
 """
 
@@ -30,10 +31,10 @@ LABELS = ("landmark",)
 FILES = ("detections.csv", "labels.csv")
 
 
-def detections_of(place: File, robot: str) -> Detections | None:
+def detections_of(place: File, robot: str, classes: Sequence[str] = ()) -> Detections | None:
     """A robot's detections without identities, or None. Raises DatasetError.
 
-    Rows of one time are a scan; ids are labels, or NO_LABEL.
+    Rows of one time are a scan; ids are labels, or NO_LABEL. classes: their names.
     """
     table = _read(place, FILES[0], robot, COLUMNS)
     if table is None or not len(table):
@@ -50,7 +51,7 @@ def detections_of(place: File, robot: str) -> Detections | None:
         labels_of(_read(place, FILES[1], robot, LABELS), len(table)),
         covariances_of(table, POLAR_COVARIANCE) if table.has(*POLAR_COVARIANCE) else None,
         table.known_numbers("diameter_m")[:, 0] if table.has("diameter_m") else None,
-        _classes_of(table) if table.has(CLASS) else None,
+        _classes_of(table, classes) if table.has(CLASS) else None,
     )
 
 
@@ -83,16 +84,24 @@ def scans_of(
     )
 
 
-def _classes_of(table: CsvTable) -> Float[np.ndarray, "R C"]:
+def _classes_of(table: CsvTable, names: Sequence[str]) -> Float[np.ndarray, "R C"]:
     """Compute ln P(reported | class): p for the reported class, (1 − p)/(C − 1) for others."""
-    reported = table.numbers(CLASS)[:, 0]
+    number_of = {name: str(number) for number, name in enumerate(names)}
+    cells = [number_of.get(cell.strip(), cell) for cell in table.columns[CLASS]]
+    for row, cell in enumerate(cells):
+        if cell.strip()[:1].isalpha():
+            known = ", ".join(names) or "none"
+            raise table.error(
+                row, CLASS, f"{cell!r} is no name in central.classes, which has {known}"
+            )
+    reported = CsvTable(table.name, {CLASS: cells}, table.lines).numbers(CLASS)[:, 0]
     right = table.numbers(RIGHT)[:, 0] if table.has(RIGHT) else np.full(len(table), USUAL_RIGHT)
     is_class = (reported >= 0) & (reported < MOST_CLASSES) & (reported == np.floor(reported))
     for row in np.flatnonzero(~is_class)[:1].tolist():
         raise table.error(row, CLASS, f"no class: give a whole number from 0 to {MOST_CLASSES - 1}")
     for row in np.flatnonzero((right <= 0.0) | (right >= 1.0))[:1].tolist():
         raise table.error(row, RIGHT, "not between 0 and 1")
-    count = max(2, int(reported.max()) + 1)
+    count = max(2, int(reported.max()) + 1, len(names))
     is_reported = reported[:, np.newaxis] == np.arange(count)
     others = ((1.0 - right) / (count - 1))[:, np.newaxis]
     return np.asarray(np.log(np.where(is_reported, right[:, np.newaxis], others)))

@@ -59,8 +59,10 @@ REQUIRED = {
 }
 
 
-def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
-    """Read these robots' measurements; raises DatasetError.
+def folder(
+    world: FolderWorld, robots: Sequence[RobotConfig], classes: Sequence[str] = ()
+) -> WorldStreams:
+    """Read these robots' measurements; raises DatasetError. classes: names of detections' classes.
 
     Odometry stamps are shifted by the robot's clock_offset_s, which the robot corrects.
     """
@@ -74,7 +76,7 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
                 f"{world.path}: no robot {', '.join(missing)} in it, but {', '.join(folders)}: "
                 "give --robots, or a scenario with its names"
             )
-        streams = [_stream(name, folders[name], world, clocks) for name in clocks]
+        streams = [_stream(name, folders[name], world, clocks, classes) for name in clocks]
         surveyed = _table(root, "landmarks", "")
         unused = left_out(root, folders, TABLES)
     if world.duration_s is not None:
@@ -101,7 +103,13 @@ def folder(world: FolderWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     )
 
 
-def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, int]) -> RobotStream:
+def _stream(
+    robot: str,
+    place: File,
+    world: FolderWorld,
+    clocks: Mapping[str, int],
+    classes: Sequence[str],
+) -> RobotStream:
     odometry, observed, sighted, fixed, truth, start = (
         _table(place, kind, robot)
         for kind in ("odometry", "observations", "sightings", "fixes", "truth", "start")
@@ -114,7 +122,7 @@ def _stream(robot: str, place: File, world: FolderWorld, clocks: Mapping[str, in
         notes.append("no odometry: only its observations are used")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
-    unnamed = detections_of(place, robot)
+    unnamed = detections_of(place, robot, classes)
     if unnamed is not None and driven is not None:
         unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:

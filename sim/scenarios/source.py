@@ -1,7 +1,7 @@
 """Streams of a scenario's world of any kind."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,13 @@ from teamslam.sim.world.config import (
 from teamslam.sim.world.identities import Hiding, with_hidden_identities
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
-from teamslam.team.config import RobotConfig
 from teamslam.team.pairs import NEEDS_MAP
 
-READERS: Mapping[type, Callable[[Any, Sequence[RobotConfig]], WorldStreams]] = {
-    UtiasWorld: utias,
-    FolderWorld: folder,
-    UnlabelledWorld: lambda world, robots: unlabelled(world, len(robots)),
-    GraphWorld: lambda world, robots: graph_world(world, len(robots)),
+READERS: Mapping[type, Callable[[Any, Scenario], WorldStreams]] = {
+    UtiasWorld: lambda world, scenario: utias(world, scenario.robots),
+    FolderWorld: lambda world, scenario: folder(world, scenario.robots, scenario.central.classes),
+    UnlabelledWorld: lambda world, scenario: unlabelled(world, len(scenario.robots)),
+    GraphWorld: lambda world, scenario: graph_world(world, len(scenario.robots)),
 }
 """Reader of each kind of data set."""
 
@@ -54,7 +53,7 @@ def streams_of(scenario: Scenario) -> WorldStreams:
         hiding = Hiding(tagged, world.missed, world.clutter, world.visible_to_m)
         hides = world.identities == "hidden" or world.missed > 0.0
         return with_hidden_identities(streams, hiding, seed) if hides else streams
-    streams = READERS[type(world)](world, scenario.robots)
+    streams = READERS[type(world)](world, scenario)
     hides = world.identities == "hidden" and not isinstance(world, UnlabelledWorld)
     return with_hidden_identities(streams, Hiding(), scenario.seed) if hides else streams
 

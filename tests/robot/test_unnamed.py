@@ -148,6 +148,17 @@ def test_a_tables_class_is_a_column_of_the_confusion_matrix(tmp_path):
         detections_of(table(tmp_path / "r2", 1, "2.5"), "r2")
 
 
+def test_a_class_may_have_a_name_and_all_robots_have_the_classes_that_are_named(tmp_path):
+    names = ("tree", "pole", "sign")
+    seen = detections_of(table(tmp_path / "r1", "pole", "tree", 1), "r1", names)
+    assert seen.classes is not None
+    assert np.exp(seen.classes).round(3).tolist() == [
+        [0.025, 0.95, 0.025], [0.95, 0.025, 0.025], [0.025, 0.95, 0.025],
+    ]  # fmt: skip
+    with pytest.raises(DatasetError, match=r"line 2.*'bush' is no name in central.classes, which "):
+        detections_of(table(tmp_path / "r2", "bush"), "r2", names)
+
+
 def test_a_driver_gives_probabilities_and_a_wrong_shape_is_named():
     given = [[0.9, 0.1], [0.2, 0.8]]
     seen = measurement_messages.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given)

@@ -9,10 +9,11 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path as FilePath
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
@@ -24,8 +25,10 @@ from teamslam.central.desk.export.tum import seconds, write_tum
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.survey import datum_of
+from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.geodesy import Datum, geodetic_from_local
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
@@ -35,6 +38,11 @@ MAP_COLUMNS = (
 )  # fmt: skip
 DEGREES = ("latitude_deg", "longitude_deg")
 """Further columns of a map with a datum."""
+CLASSES = ("class", "class_probability")
+"""Further columns of a map whose landmarks have classes."""
+NO_CLASSES: Mapping[int, tuple[str, float]] = MappingProxyType({})
+Member: TypeAlias = tuple[str, int, int, int]
+"""(robot, incarnation, sequence, number) of a submap's landmark."""
 PATH_COLUMNS = (
     "t_s", "x_m", "y_m", "theta_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_xt_m_rad",
     "cov_yt_m_rad", "cov_tt_rad2",
@@ -44,17 +52,48 @@ PATH_COLUMNS = (
 @dataclass(frozen=True)
 class TakenHome:
     """Robots' smoothed paths, measurement counts of the landmarks in the log, and the datum of the
-    final map's frame, if there is one.
+    final map's frame, if there is one. classes: name and probability of a landmark's likeliest
+    class, where detections have classes.
     """
 
     paths: Mapping[str, SmoothedPath]
     measurements: Mapping[int, int]
     datum: Datum | None = None
+    classes: Mapping[int, tuple[str, float]] = field(default_factory=dict)
 
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
     """Paths at keyframe rate and measurement counts; `progress` receives each robot's name."""
-    return TakenHome(smoothed_paths(found, progress), measurement_counts(found), _datum(found))
+    counts, classes = measurement_counts(found), landmark_classes(found)
+    return TakenHome(smoothed_paths(found, progress), counts, _datum(found), classes)
+
+
+def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
+    """Name (else number) and probability of the likeliest class of each unnamed landmark.
+
+    P(c) ∝ Π P(reports | c) over its submaps' landmarks, for classes that are equally frequent.
+    """
+    config = None if "central" not in found.configured else found.central_config()[0]
+    names = () if config is None else config.classes
+    rows: dict[Member, Float[np.ndarray, " C"]] = {}
+    for submap in found.of(ch.SUBMAP):
+        assert isinstance(submap, m.Submap)
+        own = [each for each, _ in _detections(submap)]
+        rows |= zip(own, translate.classes_of(submap, len(own)), strict=True)
+    most = max((len(each) for each in rows.values()), default=0)
+    sums: dict[int, Float[np.ndarray, " C"]] = {}
+    for member, identity in _members(found):
+        row = rows.get(member, np.zeros(0))
+        if len(row):
+            full = np.full(most, row.min())
+            full[: len(row)] = row
+            sums[identity] = sums.get(identity, np.zeros(most)) + full
+    classes = {}
+    for identity, row in sums.items():
+        best = int(np.argmax(row))
+        name = names[best] if best < len(names) else str(best)
+        classes[identity] = name, float(1.0 / np.exp(row - row[best]).sum())
+    return classes
 
 
 def _datum(found: Recorded) -> Datum | None:
@@ -73,16 +112,22 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
                 named = ids(message.ids, "ids")
                 counts.update(named[named < UNNAMED].tolist())
     seen = dict(chain.from_iterable(map(_detections, found.of(ch.SUBMAP))))
+    for member, identity in _members(found):
+        counts[identity] += seen.get(member, 0)
+    return counts
+
+
+def _members(found: Recorded) -> Iterator[tuple[Member, int]]:
+    """The submaps' landmarks that are in the final map, each with its number there."""
     for fused in found.of(ch.FINAL_MAP)[-1:]:
         assert isinstance(fused, m.FusedMap)
         for of in fused.memberships:
             columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
             for sequence, local, identity in np.transpose(columns).tolist():
-                counts[identity] += seen.get((of.robot, of.incarnation, sequence, local), 0)
-    return counts
+                yield (of.robot, of.incarnation, sequence, local), identity
 
 
-def _detections(submap: m.Message) -> Iterator[tuple[tuple[str, int, int, int], int]]:
+def _detections(submap: m.Message) -> Iterator[tuple[Member, int]]:
     assert isinstance(submap, m.Submap)
     numbers = ids(submap.ids, "ids")
     unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()
@@ -95,8 +140,10 @@ def write_map(
     measurements: Mapping[int, int],
     folder: FilePath,
     datum: Datum | None = None,
+    classes: Mapping[int, tuple[str, float]] = NO_CLASSES,
 ) -> list[FilePath]:
-    """Write map.csv and map.json, with latitude and longitude given a datum; returns the files.
+    """Write map.csv and map.json, with latitude and longitude given a datum, and with classes where
+    there are some; returns the files.
 
     Covariances are 2 × 2 blocks; correlations between landmarks are in the log. The count of an
     unnamed landmark is absent if no submap reports it.
@@ -111,8 +158,12 @@ def write_map(
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
         rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
     columns: tuple[str, ...] = MAP_COLUMNS
+    if classes:
+        columns += CLASSES
+        for row in rows:
+            row.update(zip(CLASSES, classes.get(row["id"], (None, None)), strict=True))
     if datum is not None:
-        columns = (*MAP_COLUMNS, *DEGREES)
+        columns += DEGREES
         for row, place in zip(rows, geodetic_from_local(datum, fused.means).tolist(), strict=True):
             row.update(zip(DEGREES, place, strict=True))
     table, data = folder / "map.csv", folder / "map.json"

@@ -12,6 +12,7 @@ from teamslam.central.desk.evaluation.errors import pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,
+    landmark_classes,
     measurement_counts,
     take_home,
     write_geojson,
@@ -31,6 +32,8 @@ from teamslam.team.wire.codec import encoded
 from tests.sim.logs import scenario, streams
 from tests.support import fused_map, submap
 
+LIKELY = np.array([[[0.3, 0.7], [0.5, 0.5]], [[0.1, 0.9], [0.9, 0.1]]])
+"""P(reports | class) of the two landmarks of two submaps."""
 DATUM = Datum(48.745, 9.105, 400.0)
 
 
@@ -114,6 +117,7 @@ def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_count
             counts=table(3 + i, 7),
             seen=b"",
             keyframes=0,
+            classes=from_floats(np.log(LIKELY[i]).ravel()),
         )
         for i in range(2)
     ]
@@ -131,15 +135,21 @@ def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_count
         found.take(Sample(ch.SUBMAP.key("alpha"), encoded(each), each.stamp_ns, 0, 0))
     found.take(Sample(ch.FINAL_MAP.key(), encoded(fused_map(memberships=(of,))), 0, 0, 0))
     assert measurement_counts(found) == {UNNAMED + 1: 3 + 4, UNNAMED + 2: 7}
+    first, other = (landmark_classes(found)[UNNAMED + k] for k in (1, 2))
+    assert first == ("1", pytest.approx(0.63 / (0.63 + 0.03)))
+    assert other == ("0", pytest.approx(0.9))
 
 
 def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_path):
     home = take_home(recorded_of(log))
     assert home.datum is None  # its frame is that of the start poses
     fused = evaluate(log).map
-    write_map(fused, home.measurements, tmp_path, DATUM)
+    classes = {int(fused.ids[0]): ("tree", 0.75)}
+    write_map(fused, home.measurements, tmp_path, DATUM, classes)
     with (tmp_path / "map.csv").open() as lines:
         rows = list(csv.DictReader(lines))
+    assert (rows[0]["class"], rows[0]["class_probability"]) == ("tree", "0.75")
+    assert rows[1]["class"] == ""
     degrees = [[float(row["latitude_deg"]), float(row["longitude_deg"])] for row in rows]
     back = local_from_geodetic(DATUM, np.array(degrees))
     np.testing.assert_allclose(back, fused.means, atol=1e-5)

@@ -19,7 +19,7 @@ from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.config import UnlabelledWorld
-from teamslam.sim.world.streams import NO_LABEL, OBSERVATIONS, ODOMETRY
+from teamslam.sim.world.streams import FIXES, NO_LABEL, OBSERVATIONS, ODOMETRY
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import messages as m
@@ -102,6 +102,26 @@ def test_a_car_keeps_its_steering_and_gps_and_what_nobody_has_labelled(car):
     assert set(stream.landmark_detections.ids.tolist()) == {NO_LABEL}
     assert stream.landmark_detections.signatures.tolist() == [0.3] * 7
     assert stream.positions.tolist() == [[1.0, 2.0], [4.0, 5.0]]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_gps_gives_fixes_if_asked_for_and_then_no_start_is_known(car, count):
+    world = UnlabelledWorld(path=str(car), fixes=True)
+    parts = unlabelled(world, count).streams
+    assert all(part.start is None for part in parts)
+    fixes = np.concatenate([part.fixes for part in parts])
+    assert fixes[:, :2].tolist() == [[1.0, 2.0], [4.0, 5.0]]
+    assert np.isnan(fixes[:, 2:]).all()
+    plain = streams(car, count).streams
+    assert [len(part.fixes) for part in plain] == [0] * count
+    for part, without in zip(parts, plain, strict=True):
+        assert (part.kinds == FIXES).sum() == len(part.fixes)
+        assert np.array_equal(
+            part.landmark_detections.stamps_ns, without.landmark_detections.stamps_ns
+        )
+    (car / "gps.csv").unlink()
+    with pytest.raises(DatasetError, match=r"no gps\.csv"):
+        unlabelled(world, count)
 
 
 @pytest.mark.parametrize("count", [2, 4])
