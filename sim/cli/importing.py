@@ -29,7 +29,10 @@ def import_(
         ),
     ],
     output: Annotated[Path | None, output_option("Folder for the data set.")] = None,
-    robot: Annotated[str | None, typer.Option(help="The robot's name, if it is one.")] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="The robot's name, if it is one; it may be added to a data set."),
+    ] = None,
     start: Annotated[
         list[str] | None,
         typer.Option(
@@ -52,14 +55,23 @@ def import_(
     import re
 
     from teamslam.sim.datasets.folder_files import ROBOT_NAME
+    from teamslam.sim.importing.addition import add_robot, takes_robot
     from teamslam.sim.importing.source import Request, import_data, proposal
 
     if output is None:
-        fail(proposal(source[0]) + "give the folder for the data set: -o FOLDER", WRONG_USE)
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        fail(f"{output} is not empty: give a new folder", WRONG_USE)
+        if text := proposal(source[0]):
+            typer.echo(text)
+            return
+        fail("give the folder for the data set: -o FOLDER", WRONG_USE)
     if robot is not None and not re.fullmatch(ROBOT_NAME, robot):
         fail(f"--robot {robot}: a small letter, then small letters, digits and _", WRONG_USE)
+    adds = robot is not None and takes_robot(output, robot)
+    if output.exists() and not adds and (not output.is_dir() or any(output.iterdir())):
+        fail(
+            f"{output} is not empty: give a new folder, or --robot with a new name to add a robot "
+            "to a data set",
+            WRONG_USE,
+        )
     began = time.monotonic()
     request = Request(
         sources=source,
@@ -70,11 +82,11 @@ def import_(
         truth=truth,
     )
     try:
-        report = import_data(request, output)
+        report = add_robot(request, output) if adds else import_data(request, output)
         elapsed_s = time.monotonic() - began
         notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
     except BaseException:  # remove a partial data set, whose folder the next attempt may use
-        shutil.rmtree(output, ignore_errors=True)
+        shutil.rmtree(output / robot if adds and robot else output, ignore_errors=True)
         raise
     for note in notes:
         typer.echo(note)

@@ -48,6 +48,14 @@ def propose_topics(path: Path) -> str:
         return _question(path, bag, _proposed(bag, None))
 
 
+def propose_assignment(path: Path) -> str:
+    """Proposed assignment file of a bag's topics, with warnings as comments; raises BagError."""
+    with opened_bag(path) as bag:
+        found = _proposed(bag, None)
+        topics = [*listing(bag.topics).splitlines(), *found.warnings]
+        return "".join(f"# {line.strip()}\n" for line in topics) + as_toml(found)
+
+
 def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
     """Topics of each robot by names and types; raises UndecidedError if ambiguous."""
     found = _proposed(bag, robot)
@@ -57,12 +65,19 @@ def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
 
 
 def _question(path: Path, bag: Bag, found: Proposal) -> str:
+    if found.warnings:
+        head = f"{path}: the topics are ambiguous.\n"
+    else:
+        head = f"{path}: `teamslam import {path} -o FOLDER` imports these topics as below.\n"
     return (
-        f"{path}: the topics are ambiguous.\n{listing(bag.topics)}\n"
+        head
+        + f"{listing(bag.topics)}\n"
         + "".join(f"{doubt}\n" for doubt in found.warnings)
+        + ("" if found.warnings else "For other roles: ")
         + "Write it into a file, as topics.toml, beginning with this:\n\n"
         + as_toml(found)
-        + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml\n"
+        + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml (where there is no "
+        "such file, this writes it)\n"
     )
 
 

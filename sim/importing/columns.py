@@ -1,19 +1,18 @@
-"""Column maps from a user's columns to ours, and proposals for them."""
+"""Column maps from a user's columns to ours."""
 
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
 from teamslam.sim.datasets import detections_table, folder
 from teamslam.sim.datasets.csv_table import CsvTable
-from teamslam.sim.datasets.folder_tables import DEGREE, POINT_COVARIANCE, POINTS, POLAR, POSES
+from teamslam.sim.datasets.folder_files import ROBOT_NAME
+from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,6 +35,21 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Map = dict[str, Table]
+"""Tables of one robot by kind."""
+
+
+class ColumnMap(msgspec.Struct, frozen=True):
+    """A team's column map. shared: tables of every robot. robots: tables of single robots, which
+    replace shared ones of the same kind.
+    """
+
+    shared: Map
+    robots: dict[str, Map]
+
+    def tables_of(self, robot: str) -> Map:
+        """Tables of a robot."""
+        return self.shared | self.robots.get(robot, {})
+
 
 TABLES: Mapping[str, Sequence[str]] = {
     **folder.TABLES,
@@ -48,86 +62,45 @@ REQUIRED: Mapping[str, Sequence[str]] = {
     "detections": ("t_s",),
     "labels": detections_table.LABELS,
 }
-SYNONYMS: Mapping[str, str] = {
-    "t_s": "t time times timestamp stamp sec secs seconds ts epoch unix unix_time header_stamp",
-    "forward_m_s": "v vx v_x vel vel_x speed velocity forward forward_speed forward_velocity "
-    "forward_vel linear linear_x lin_x linear_vel linear_velocity linear_velocity_x lin_vel "
-    "ground_speed longitudinal longitudinal_speed speed_x velocity_x",
-    "yaw_rate_rad_s": "w w_z wz omega omega_z yaw_rate yaw_vel yaw_velocity turn_rate turning_rate "
-    "rotation_rate rot_rate rot_vel heading_rate theta_dot yaw_dot dtheta_dt vth vtheta v_theta "
-    "angular angular_z ang_z angular_speed angular_vel angular_velocity angular_velocity_z ang_vel "
-    "gyro gyro_z gyr gyr_z gz gyro_yaw imu_gyro imu_gyro_z imu_yaw_rate "
-    "imu_angular_velocity_z",
-    "x_m": "x pos_x x_pos px easting east",
-    "y_m": "y pos_y y_pos py northing north",
-    "theta_rad": "theta yaw heading phi psi orientation angle_z rot_z",
-    "dx_m": "dx delta_x",
-    "dy_m": "dy delta_y",
-    "dtheta_rad": "dtheta dyaw delta_theta delta_yaw dphi dheading delta_heading",
-    "wheel_speed_m_s": "rear_wheel_speed wheel_speed wheel_velocity",
-    "steering_rad": "steering steering_angle steer steer_angle",
-    "landmark": "id ids tag tag_id marker marker_id barcode landmark_id lm lm_id subject feature "
-    "feature_id beacon beacon_id fiducial fiducial_id aruco aruco_id apriltag apriltag_id target "
-    "target_id",
-    "teammate": "robot robot_id other other_robot teammate_id neighbour neighbor",
-    "range_m": "range ranges r distance dist rho rng",
-    "bearing_rad": "bearing bearings beta angle azimuth brg",
-}
-"""Column names as words, separated by nothing, a mark or a capital letter."""
-UNITS = {
-    "s": "1", "sec": "1", "ms": "1e-3", "msec": "1e-3", "us": "1e-6", "usec": "1e-6", "ns": "1e-9",
-    "nsec": "1e-9", "nanos": "1e-9", "m": "1", "mm": "1e-3", "cm": "1e-2", "km": "1e3",
-    "rad": "1", "radians": "1", "deg": DEGREE, "degrees": DEGREE,
-    "m_s": "1", "mps": "1", "cm_s": "1e-2", "mm_s": "1e-3", "km_h": "0.2777777777777778",
-    "kmh": "0.2777777777777778", "kph": "0.2777777777777778", "rad_s": "1", "rad_sec": "1",
-    "rps": "1", "deg_s": DEGREE, "deg_sec": DEGREE, "dps": DEGREE,
-}  # fmt: skip
-"""Factor to our unit, by the unit at the end of a column name."""
-LARGEST_S = 1e11
-"""Times from here on are no seconds: as Unix times, 1e11 s is in the year 5138, 1e11 ms in 1973."""
 KINDS = tuple(TABLES)
 MEASURED = ("odometry", "observations", "sightings", "detections")
-PROPOSED = (*MEASURED, "truth", "landmarks", "start")
-FILE_NAMES: Mapping[str, Sequence[str]] = {
-    "odometry": ("odom", "wheel", "encoder"),
-    "observations": ("observ", "tags", "detection", "marker"),
-    "detections": ("detection", "cone", "pole", "tree", "corner", "feature"),
-    "sightings": ("sighting",),
-    "truth": (),
-    "landmarks": ("landmark",),
-    "start": ("start",),
-}
-"""Parts of file names that indicate a table kind."""
-PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "truth", "gt", "tag",
-            "marker", "landmark", "twist", "encoder", "measured", "measurement", "header",
-            "field", "true", "groundtruth", "ref", "reference", "mocap", "optitrack",
-            "vicon")  # fmt: skip
-"""Prefixes of column names that repeat the file's kind: odom_x, pose.position.y."""
 
 
-def load_map(path: Path) -> Map:
+def load_map(path: Path) -> ColumnMap:
     """Read a TOML column map; raises DatasetError."""
     try:
-        found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Map)
+        document = tomllib.loads(path.read_text("utf-8"))
+        robots = msgspec.convert(document.pop("robots", {}), dict[str, Map])
+        found = ColumnMap(msgspec.convert(document, Map), robots)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: can not be read: {error}") from None
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
         raise DatasetError(
             f"{path}: no map of columns: {error}; docs/your_data.md has one"
         ) from None
-    for kind, table in found.items():
+    for name, tables in [("", found.shared), *found.robots.items()]:
+        if name and not re.fullmatch(ROBOT_NAME, name):
+            raise DatasetError(
+                f"{path}: [robots.{name}]: no robot's name: a small letter, then small letters, "
+                "digits and _ (32 at most)"
+            )
+        _check_tables(tables, f"{path}: {name}: " if name else f"{path}: ")
+    return found
+
+
+def _check_tables(tables: Map, place: str) -> None:
+    for kind, table in tables.items():
         if kind not in TABLES:
-            raise DatasetError(f"{path}: no table {kind}; known: {', '.join(KINDS)}")
+            raise DatasetError(f"{place}no table {kind}; known: {', '.join(KINDS)}")
         for ours in table.columns:
             if ours not in TABLES[kind]:
                 known = ", ".join(TABLES[kind])
-                raise DatasetError(f"{path}: {kind} has no column {ours}; known: {known}")
+                raise DatasetError(f"{place}{kind} has no column {ours}; known: {known}")
         if kind == "observations" and "landmark" not in table.columns:
             raise DatasetError(
-                f"{path}: observations need the column landmark; measurements without identities "
+                f"{place}observations need the column landmark; measurements without identities "
                 "are [detections]"
             )
-    return found
 
 
 def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
@@ -148,134 +121,3 @@ def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[st
             numbers = table.numbers(column.column)[:, 0] * column.scale + column.offset
             found[ours] = [repr(number) for number in numbers.tolist()]
     return found
-
-
-class _Guess(NamedTuple):
-    """Probable table of a file: our columns, and whether names match; a higher rank is better."""
-
-    file: str
-    kind: str
-    columns: dict[str, str]
-    is_named: bool
-    rank: tuple[int, int]
-
-
-def propose_map(files: Mapping[str, CsvTable]) -> tuple[str, list[str]]:
-    """Propose a TOML map for these files as far as names allow; also returns missing columns."""
-    guesses: list[_Guess] = []
-    lacking: list[str] = []
-    for name, table in files.items():
-        header = list(table.columns)
-        found = _guesses(name, header)
-        guesses += found
-        if not found:
-            lacking.append(f"{name}: no table of ours by its columns' names: {', '.join(header)}")
-    best: dict[str, _Guess] = {}
-    for guess in sorted(guesses, key=lambda each: each.rank, reverse=True):  # stable
-        best.setdefault(guess.kind, guess)
-    lines: list[str] = []
-    for guess in guesses:
-        kind, columns = guess.kind, guess.columns
-        if best[kind] is not guess:
-            lacking.append(f"{guess.file}: might be {kind}, too")
-            continue
-        columns |= _clock(columns.get("t_s", ""), files[guess.file])
-        lines += [f"[{kind}]", f'files = ["{guess.file}"]', f"[{kind}.columns]"]
-        lines += [f"{ours} = {text}" for ours, text in columns.items()] + [""]
-        lacking += [
-            f"{guess.file}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns
-        ]
-    return "\n".join(lines), lacking
-
-
-def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
-    """Table with most of these columns, then by file name; and truth, if odometry has reference
-    columns.
-
-    Reference files and columns are no measurements.
-    """
-    reference = [each for each in header if has_word(each, TRUTH_WORDS)]
-    is_reference = has_word(Path(name).stem, TRUTH_WORDS)
-    own = [each for each in header if each not in reference]
-    found = [
-        guess
-        for kind in PROPOSED
-        if not (is_reference and kind in MEASURED)
-        and (guess := _guess(name, kind, own if kind in MEASURED else header)) is not None
-    ]
-    if not found:
-        return []
-    best = max(found, key=lambda g: (g.is_named, g.kind in MEASURED, len(g.columns)))
-    if best.kind != "odometry" or not reference:
-        return [best]
-    clock = [each for each in own if _near("t_s", [each])]
-    truth = _guess(name, "truth", [*clock, *reference])
-    return [best] if truth is None else [best, truth]
-
-
-def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
-    """Columns of a table kind in a file; None if incomplete."""
-    found = {ours: near for ours in TABLES[kind] if (near := _near(ours, header)) is not None}
-    columns = _of_one_form(kind, found)
-    whole = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
-    if kind == "detections":
-        whole &= any(all(ours in columns for ours in form) for form in (POLAR, POINTS))
-    named = any(word in name.lower() for word in FILE_NAMES[kind])
-    named |= kind == "truth" and has_word(Path(name).stem, TRUTH_WORDS)
-    rank = int(named), -int(has_word(Path(name).stem, FUSED_WORDS))
-    return _Guess(name, kind, columns, named, rank) if whole else None
-
-
-def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
-    """Columns of one measurement form only."""
-    left_out: Sequence[str] = ()
-    if kind == "odometry" and "forward_m_s" in columns:
-        left_out = POSES
-    elif "range_m" in columns:
-        left_out = POINTS
-    return {ours: theirs for ours, theirs in columns.items() if ours not in left_out}
-
-
-def _near(ours: str, header: Sequence[str]) -> str | None:
-    """Column with a name close to ours, if any."""
-    names = {_joined(name) for name in SYNONYMS.get(ours, "").split()}
-    names.add(_joined(_without_unit(ours)[0]))
-    for theirs in header:
-        bare, scale = _without_unit(theirs)
-        if theirs == ours or _joined(bare) in names or _joined(_without_prefix(bare)) in names:
-            if scale == "1" or theirs == ours:
-                return f'"{theirs}"'
-            return f'{{ column = "{theirs}", scale = {scale} }}'
-    return None
-
-
-def _without_unit(name: str) -> tuple[str, str]:
-    """Lower-case column name without unit, and the unit's factor."""
-    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
-    plain = re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
-    for unit in sorted(UNITS, key=len, reverse=True):
-        if plain.endswith(f"_{unit}"):
-            return plain.removesuffix(f"_{unit}"), UNITS[unit]
-    return plain, "1"
-
-
-def _without_prefix(name: str) -> str:
-    first, _, rest = name.partition("_")
-    return _without_prefix(rest) if rest and first in PREFIXES else name
-
-
-def _joined(name: str) -> str:
-    return name.replace("_", "")
-
-
-def _clock(chosen: str, table: CsvTable) -> dict[str, str]:
-    """Time column with a scale, if its name has no unit and its numbers are no seconds."""
-    cells = table.columns.get(chosen.strip('"'), [])
-    try:
-        largest = abs(float(cells[0]))
-    except (IndexError, ValueError):
-        return {}
-    power = 0
-    while largest >= LARGEST_S and power < 9:
-        largest, power = largest * 1e-3, power + 3
-    return {"t_s": f"{{ column = {chosen}, scale = 1e-{power} }}"} if power else {}

@@ -1,7 +1,7 @@
 """Import CSV files with foreign column names, and trajectories."""
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import atan2
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from teamslam.sim.datasets.folder_tables import (
     POSES,
 )
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns, propose_map
+from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns
+from teamslam.sim.importing.proposal import propose_map, proposed_kinds
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
@@ -25,48 +26,59 @@ QUATERNION = 8
 """Columns of a TUM trajectory: t x y z qx qy qz qw."""
 
 
-def import_files(
-    paths: Sequence[Path],
-    columns: Map | None,
-    robot: str,
-    everyones: Collection[str] = (),
-    command: str = "",
-) -> tuple[RobotTables, list[str]]:
-    """Import one robot's tables from CSV files; also returns notes on the files.
+def read_files(paths: Sequence[Path], *, tum: bool) -> dict[str, CsvTable]:
+    """Read one robot's files by name; with `tum` a file in TUM's format is its odometry.
 
-    A file in TUM's format is its odometry, unless a map names it.
-    everyones: file names of all robots; a table whose files only other robots have is omitted.
-    command: command line to repeat with a map. Raises DatasetError; without a map its text proposes
-    one, unless every column has our name.
+    Raises DatasetError.
     """
     files: dict[str, CsvTable] = {}
     for path in paths:
         poses = _tum_table(path)
-        name = path.name if poses is None or columns is not None else "odometry.csv"
+        name = path.name if poses is None or not tum else "odometry.csv"
         files[name] = read_table(path, str(path)) if poses is None else poses
     if len(files) < len(paths):
         raise DatasetError(
             "two files have the same name, or two are trajectories of TUM: import them for one "
             "robot each"
         )
-    chosen = _by_names(files, command) if columns is None else columns
+    return files
+
+
+def import_files(
+    files: Mapping[str, CsvTable], chosen: Map, robot: str, everyones: Collection[str] = ()
+) -> tuple[RobotTables, list[str]]:
+    """Import one robot's tables from CSV files by a map; also returns notes on the files.
+
+    everyones: file names of all robots; a table whose files only other robots have is omitted.
+    Raises DatasetError, also for an unused file that is probably an omitted table.
+    """
     tables = RobotTables(robot)
     notes: list[str] = []
     used: set[str] = set()
+    omitted: set[str] = set()
     for kind, table in chosen.items():
         lacking = [each for each in table.files if not any(n.endswith(each) for n in files)]
         if lacking and all(any(n.endswith(each) for n in everyones) for each in lacking):
             notes.append(f"no {', '.join(lacking)}: no {kind}")
+            omitted.add(kind)
             continue
         notes += _take(kind, table, files, tables, used)
-    unused = [name for name in files if name not in used]
+    unused = {name: table for name, table in files.items() if name not in used}
     if "odometry" in chosen:
         _refuse_second_robot(chosen["odometry"].files, used, unused)
+    if unused and (omitted & proposed_kinds(unused) or (omitted and not used)):
+        raise DatasetError(
+            f"{robot}: the map names no {' and no '.join(sorted(omitted))} among its files "
+            f"{', '.join(files)}. Add its own tables to the map, beginning with this:\n\n"
+            + propose_map({robot: unused}, own=True)
+        )
     notes += [f"{name}: not used: the map does not name it" for name in unused]
     return tables, notes
 
 
-def _refuse_second_robot(endings: Sequence[str], used: set[str], unused: Sequence[str]) -> None:
+def _refuse_second_robot(
+    endings: Sequence[str], used: Collection[str], unused: Collection[str]
+) -> None:
     """Raise DatasetError for an unused file that is called as the odometry, after another prefix:
     `jackal_odometry.csv` beside `husky_odometry.csv`.
     """
@@ -75,33 +87,27 @@ def _refuse_second_robot(endings: Sequence[str], used: set[str], unused: Sequenc
         prefix, *behind = re.split("[_-]", name, maxsplit=1)
         if behind and behind[0] in rest:
             raise DatasetError(
-                f"{name}: odometry of a second robot, {prefix}, which the map does not name. Put "
+                f"{name}: odometry of a second robot, {prefix}, which the map does not name. Give "
+                f"each robot tables of its own in the map, as [robots.{prefix}.odometry]; or put "
                 "the files of each robot into a folder of its name, and import the folder above; "
                 "or import the files of one robot, with --robot"
             )
 
 
-def _by_names(files: dict[str, CsvTable], command: str) -> Map:
-    """Map of files with our column names; raises DatasetError with a proposal."""
+def map_by_names(files: Mapping[str, CsvTable]) -> Map | None:
+    """Map of files whose names and columns are all ours; None: some are not."""
     found: Map = {}
     for name, table in files.items():
         kind = Path(name).stem
         ours = kind in TABLES and set(table.columns) <= set(TABLES[kind])
         if not ours or not all(table.has(each) for each in REQUIRED[kind]):
-            text, lacking = propose_map(files)
-            raise DatasetError(
-                f"{name}: its columns are {', '.join(table.columns)}. Which are what? "
-                "Write it into a file, as columns.toml, beginning with this:\n\n"
-                + text
-                + "".join(f"# {line}\n" for line in lacking)
-                + f"\nand type: {command} --columns columns.toml"
-            )
+            return None
         found[kind] = Table((name,), {column: column for column in table.columns})
     return found
 
 
 def _take(
-    kind: str, table: Table, files: dict[str, CsvTable], tables: RobotTables, used: set[str]
+    kind: str, table: Table, files: Mapping[str, CsvTable], tables: RobotTables, used: set[str]
 ) -> list[str]:
     side_by_side: list[CsvTable] = []
     for ending in table.files:

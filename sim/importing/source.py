@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import tomli_w
 
+from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
 from teamslam.sim.datasets.folder_tables import POSES
 from teamslam.sim.datasets.folder_writer import write_folder
@@ -16,9 +17,10 @@ from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.bag import import_bag
-from teamslam.sim.importing.bag_topics import propose_topics
-from teamslam.sim.importing.columns import MEASURED, load_map
-from teamslam.sim.importing.files import import_files, trajectory
+from teamslam.sim.importing.bag_topics import propose_assignment, propose_topics
+from teamslam.sim.importing.columns import MEASURED, ColumnMap, load_map
+from teamslam.sim.importing.files import import_files, map_by_names, read_files, trajectory
+from teamslam.sim.importing.proposal import propose_map, split_by_robot, write_proposal
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.recorded.streams import measurements_in
 from teamslam.sim.scenarios.scenario import Scenario
@@ -78,7 +80,7 @@ def import_data(request: Request, folder: Path) -> Report:
         and source.suffix in (".csv", ".txt", ".tsv", ".tum")
         and not is_graph(source)
     ):
-        return _csv({request.robot or ONE_ROBOT: list(request.sources)}, request, folder)
+        return _csv({request.robot or "": list(request.sources)}, request, folder)
     if source.is_dir() and (request.columns or len(request.sources) > 1 or _is_foreign(source)):
         return _csv(_files_by_robot(request), request, folder)
     if len(request.sources) > 1:
@@ -133,7 +135,8 @@ def _is_foreign(source: Path) -> bool:
 
 
 def _files_by_robot(request: Request) -> dict[str, list[Path]]:
-    """CSV files of each robot: of a folder, of its sub-folders, or of each given folder.
+    """CSV files of each robot: of a folder ("" if nothing names its robot), of its sub-folders, or
+    of each given folder.
 
     Files beside the robots' folders (true landmarks) belong to every robot.
     """
@@ -152,11 +155,11 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
         if inner:
             found |= {name: [*files, *common] for name, files in inner.items()}
         elif len(request.sources) == 1:
-            found[request.robot or ONE_ROBOT] = common
+            found[request.robot or ""] = common
         else:
             found[source.name] = common
     for name in found:
-        if not re.fullmatch(ROBOT_NAME, name):
+        if name and not re.fullmatch(ROBOT_NAME, name):
             raise DatasetError(
                 f"{name}: no robot's name: a small letter, then small letters, digits and _ (32 at "
                 "most); rename the folder"
@@ -164,17 +167,78 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
     return found
 
 
-def _csv(files: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
-    columns = load_map(request.columns) if request.columns else None
-    everyones = {path.name for paths in files.values() for path in paths}
+def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
+    """Import CSV files of each robot; those of "" are of the robots that map or names have."""
+    is_given = request.columns is not None and request.columns.exists()
+    read = {robot: read_files(of, tum=not is_given) for robot, of in paths.items()}
+    if is_given:
+        assert request.columns is not None
+        columns = load_map(request.columns)
+        robots = _files_by_map(read, columns, request.columns)
+        maps = {robot: columns.tables_of(robot) for robot in robots}
+    else:
+        robots = {robot or ONE_ROBOT: files for robot, files in read.items()}
+        found = {robot: map_by_names(files) for robot, files in robots.items()}
+        maps = {robot: own for robot, own in found.items() if own is not None}
+        if len(maps) < len(robots) or request.columns is not None:
+            raise _question(split_by_robot(read.get("", {})) or robots, request, folder)
+    everyones = {name for files in read.values() for name in files}
+    tables, notes = [], list[str]()
+    for robot, files in robots.items():
+        of, noted = import_files(files, maps[robot], robot, everyones)
+        tables.append(of)
+        notes += noted if len(robots) == 1 else [f"{robot}: {note}" for note in noted]
+    used = {name for files in robots.values() for name in files}
+    notes += [f"{name}: not used: the map does not name it" for name in sorted(everyones - used)]
+    return _written(tables, notes, request, folder)
+
+
+def _files_by_map(
+    read: Mapping[str, Mapping[str, CsvTable]], columns: ColumnMap, path: Path
+) -> Mapping[str, Mapping[str, CsvTable]]:
+    """Files of each robot: of "" those that the map names for the robot; raises DatasetError."""
+    if "" not in read:
+        for robot in columns.robots:
+            if robot not in read:
+                raise DatasetError(
+                    f"{path}: [robots.{robot}]: no files of such a robot; there are "
+                    f"{', '.join(read)}"
+                )
+        return read
+    if not columns.robots:
+        return {ONE_ROBOT: read[""]}
+    endings = {
+        robot: tuple(name for table in columns.tables_of(robot).values() for name in table.files)
+        for robot in columns.robots
+    }
+    return {
+        robot: {name: table for name, table in read[""].items() if name.endswith(ending)}
+        for robot, ending in endings.items()
+    }
+
+
+def _question(
+    robots: Mapping[str, Mapping[str, CsvTable]], request: Request, folder: Path
+) -> DatasetError:
+    """Proposal of a map, which is also written to the file that `--columns` names."""
+    proposed = propose_map(robots)
+    if request.columns is not None:
+        return DatasetError(write_proposal(proposed, request.columns))
+    name, table = next(
+        (name, table)
+        for files in robots.values()
+        if map_by_names(files) is None
+        for name, table in files.items()
+        if map_by_names({name: table}) is None
+    )
     command = f"teamslam import {' '.join(map(str, request.sources))} -o {folder}"
     command += f" --robot {request.robot}" if request.robot else ""
-    tables, notes = [], list[str]()
-    for robot, paths in files.items():
-        of, found = import_files(paths, columns, robot, everyones, command)
-        tables.append(of)
-        notes += found if len(files) == 1 else [f"{robot}: {note}" for note in found]
-    return _written(tables, notes, request, folder)
+    return DatasetError(
+        f"{name}: its columns are {', '.join(table.columns)}. Which are what? "
+        f"Write it into a file, as columns.toml, beginning with this:\n\n{proposed}"
+        f"\nand type: {command} --columns columns.toml (where there is no such file, this writes "
+        "it)"
+    )
 
 
 def proposal(path: Path) -> str:
@@ -216,6 +280,9 @@ def _bags(request: Request, folder: Path) -> Report:
     if len(request.sources) > 1 and request.robot:
         raise DatasetError("--robot names one robot: import bags of several one by one")
     try:
+        if request.ros2 is not None and not request.ros2.exists():
+            proposed = "\n".join(map(propose_assignment, request.sources))
+            raise DatasetError(write_proposal(proposed, request.ros2))
         topics = load_topics(request.ros2) if request.ros2 else None
         found, datum = [], None
         for path in request.sources:

@@ -110,6 +110,86 @@ def test_the_truth_of_several_robots_has_its_remedy_named(tmp_path):
     assert "name the file as [truth] in the map of columns" in str(result.exception)
 
 
+SPEEDS = "stamp_ms,speed,gyro_dps\n0,1,90\n1000,2,0\n2000,0,0\n"
+MARKERS = "stamp_ms,marker,forward_mm,left_mm\n1000,7,2000,0\n"
+TAGS = "t,id,range,bearing_deg\n1,7,2,90\n"
+
+
+def team_files(folder: Path, layout: str) -> Path:
+    """Files of ann and bob, whose columns differ: by prefix, by suffix, or in folders."""
+    for robot, files in {
+        "ann": {"odom": TRACK, "tags": TAGS},
+        "bob": {"wheels": SPEEDS, "markers": MARKERS},
+    }.items():
+        for name, text in files.items():
+            path = folder / layout.format(robot=robot, name=name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+    return folder
+
+
+def check_team(folder: Path) -> None:
+    ann, bob = read(folder).streams
+    assert (ann.robot, bob.robot) == ("ann", "bob")
+    assert bob.intervals.yaw_rate.tolist() == pytest.approx([np.pi / 2, 0.0])
+    assert ann.landmark_detections.bearings.tolist() == pytest.approx([np.pi / 2])
+    assert bob.landmark_detections.points == pytest.approx(np.array([[2.0, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    "layout", ["{robot}_{name}.csv", "{name}-{robot}.csv", "{robot}/{name}.csv"]
+)
+def test_robots_with_other_columns_have_tables_of_their_own_in_one_map(tmp_path, layout):
+    logs, columns = team_files(tmp_path / "logs", layout), tmp_path / "columns.toml"
+    command = (logs, "-o", tmp_path / "set", "--columns", columns)
+    first = run(*command)
+    assert isinstance(first.exception, DatasetError)
+    assert "no such file, so a proposal is written to it" in str(first.exception)
+    assert "[robots.bob.odometry]" in columns.read_text()
+    result = run(*command)
+    assert result.exit_code == 0, result.output
+    check_team(tmp_path / "set")
+    unknown = columns.read_text().replace("[robots.bob", "[robots.eve")
+    columns.write_text(unknown)
+    refused = run(logs, "-o", tmp_path / "eve", "--columns", columns)
+    if "/" in layout:
+        assert "[robots.eve]: no files of such a robot" in str(refused.exception)
+    columns.write_text(unknown.replace("[robots.eve", "[robots.Bob"))
+    refused = run(logs, "-o", tmp_path / "bob", "--columns", columns)
+    assert "[robots.Bob]: no robot's name" in str(refused.exception)
+
+
+def test_a_robot_whose_files_no_table_of_the_map_has_is_refused_with_its_tables(tmp_path):
+    logs, columns = team_files(tmp_path / "logs", "{robot}/{name}.csv"), tmp_path / "columns.toml"
+    columns.write_text(ODOMETRY)
+    refused = run(logs, "-o", tmp_path / "set", "--columns", columns).exception
+    assert "bob: the map names no odometry among its files" in str(refused)
+    assert '[robots.bob.odometry]\nfiles = ["wheels.csv"]' in str(refused)
+
+
+def test_a_robot_is_added_to_a_data_set(tmp_path):
+    logs = team_files(tmp_path / "logs", "{robot}/{name}.csv")
+    for robot in ("ann", "bob"):
+        columns = tmp_path / f"{robot}.toml"
+        run(logs / robot, "-o", tmp_path / "new", "--robot", robot, "--columns", columns)
+        arguments = (logs / robot, "-o", tmp_path / "set", "--robot", robot, "--columns", columns)
+        result = run(*arguments)
+        assert result.exit_code == 0, result.output
+        assert "add a robot" in run(*arguments).output
+        if robot == "ann":
+            scenario = tmp_path / "set" / "scenario.toml"
+            scenario.write_text('base = "recorded"\n[world]\npath = "."\n[[robots]]\nid = "ann"\n')
+    check_team(tmp_path / "set")
+    assert "scenario.toml: bob is added to its robots" in result.output
+    columns.write_text(columns.read_text().replace("wheels.csv", "none.csv"))
+    failed = run(logs / "bob", "-o", tmp_path / "set", "--robot", "cat", "--columns", columns)
+    assert isinstance(failed.exception, DatasetError)
+    assert sorted(each.name for each in tmp_path.iterdir()) == [
+        "ann.toml", "bob.toml", "logs", "set",
+    ]  # fmt: skip
+    check_team(tmp_path / "set")
+
+
 @pytest.mark.parametrize("place", ["", "ann"])
 def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
