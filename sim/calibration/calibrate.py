@@ -37,6 +37,7 @@ from teamslam.sim.calibration.figures import (
 )
 from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
 from teamslam.sim.calibration.own import marker_spread, own_constants
+from teamslam.sim.calibration.stretches import LEAST_SPANS, moving_stretches, too_short
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import MotionModel, MotionNoise
@@ -86,6 +87,9 @@ def calibrate_models(
 
     Raises CalibrationError for insufficient measurements.
     """
+    stretches = moving_stretches(stream for _, world in worlds for stream in world.streams)
+    if stretches < LEAST_SPANS:
+        raise CalibrationError(too_short(stretches))
     if all(world.landmarks is not None and true_paths(world.streams) for _, world in worlds):
         found = _calibrate_by_truth(worlds, scenario, progress)
     else:

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from teamslam.central.desk.evaluation.errors import on_circle
 from teamslam.sim.calibration.data import Reference, poses_at, sinc
 from teamslam.sim.calibration.figures import CalibrationError, huber
-from teamslam.sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S
+from teamslam.sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S, too_short
 from teamslam.team.shapes import Float
 
 STEPS = 40
@@ -142,8 +142,8 @@ def fit_motion(
     moving = np.abs(spans.speed).mean(axis=1) * SPAN_S > LEAST_WAY_M
     if np.count_nonzero(moving) < LEAST_SPANS:
         raise CalibrationError(
-            f"{np.count_nonzero(moving)} stretches of {SPAN_S:.0f} s of motion with a known path, "
-            f"{LEAST_SPANS} needed: record more, or give several data sets at once"
+            f"{too_short(int(np.count_nonzero(moving)))} A stretch counts where the path is known "
+            "throughout: by truth, or by landmarks in sight"
         )
     limit = np.inf if yaw_rate_limit is None else yaw_rate_limit
     way, rotation = spans.way, np.abs(spans.rates(1.0, limit)).sum(axis=1) * STEP_S

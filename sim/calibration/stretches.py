@@ -14,6 +14,16 @@ LEAST_WAY_M = 0.05
 """Least logged path [m] of a moving stretch."""
 
 
+def too_short(stretches: int) -> str:
+    """Error for data with this number of moving stretches, and the remedy."""
+    return (
+        f"calibrate needs {LEAST_SPANS} stretches of {SPAN_S:.0f} s with motion, of all robots "
+        f"together, and these data have {stretches}: give several data sets at once, record "
+        f"{SPAN_S * (LEAST_SPANS - stretches) / 60.0:.1f} minutes more, or write known figures "
+        "into a scenario (docs/your_data.md, Noise)."
+    )
+
+
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
     """Number of whole stretches of SPAN_S in which a robot's odometry moves.
 

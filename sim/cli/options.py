@@ -3,10 +3,12 @@
 import json
 import logging
 import math
+import os
 import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from errno import EACCES
 from ipaddress import ip_address
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +35,16 @@ MOST_HOLES = 5
 """Most log gaps that a command prints; `teamslam log check` prints all."""
 WRONG_USE = 2
 FAILED = 1
+
+
+def check_folder(path: Path) -> None:
+    """Check before the work that a folder can be created and written; fails else."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK):
+            raise PermissionError(EACCES, os.strerror(EACCES))
+    except OSError as error:
+        fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
 
 
 def _either(names: object) -> str:

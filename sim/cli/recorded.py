@@ -16,6 +16,7 @@ from teamslam.sim.cli.options import (
     Keys,
     LogArgument,
     SpeedText,
+    check_folder,
     connect_bus,
     count_noun,
     fail,
@@ -129,7 +130,10 @@ def report(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Write page, pictures, tables and figures of a run from its log."""
+    """Write page, pictures, tables and figures of a run from its log.
+
+    Exit status 1 if the log is cut: its figures are of the part before the cut.
+    """
     from rich.console import Console
 
     from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
@@ -139,7 +143,7 @@ def report(
     from teamslam.team.recording.reader import open_log
 
     output = output or _folder_of(log)
-    _check_folder(output)
+    check_folder(output)
     width_in = _width(width, look)
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
@@ -171,7 +175,12 @@ def report(
     except OSError as error:
         fail(f"-o {output}: can not write: {error.strerror}; give another folder", FAILED)
     write_json(json_file, figures)
-    _hint_if_cut(opened)
+    if not opened.complete:
+        fail(
+            f"{opened.path} is cut, so the report is of the part before the cut: `teamslam repair "
+            f"{opened.path} -o FIXED.mcap` completes the log",
+            FAILED,
+        )
 
 
 def _folder_of(log: Path) -> Path:
@@ -192,14 +201,6 @@ def _width(text: str | None, look: Look | None) -> float | None:
         return parsed_width(text)
     except ValueError as error:
         fail(f"--width {error}", WRONG_USE)
-
-
-def _check_folder(path: Path) -> None:
-    """Check before the work that the folder can be created."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
 
 
 @app.command(cls=Command, epilog="teamslam repair team.mcap -o whole.mcap")

@@ -20,6 +20,7 @@ from teamslam.sim.cli.options import (
     Localise,
     LogArgument,
     MapFiles,
+    check_folder,
     check_localises,
     fail,
     failing,
@@ -149,6 +150,8 @@ def rerun(
         maps=tuple(map(str, map_ or ())),
         localise=localise,
     )
+    if output is not None:
+        check_folder(output)
     if not verify:
         _compare(log, changes, json_file, output)
     elif changes == Changes():
@@ -249,6 +252,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"
+    if changes.localise:
+        verdict = "the saved one, with poses and paths in its frame"
     if not plain:
         console.print(f"final map: {verdict}", highlight=False)
     figures = {
@@ -260,7 +265,6 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     }
     write_json(json_file, figures)
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
         picture = output / "maps.png"
         if draw_maps({"recorded": recorded, "recomputed": changed}, picture):
             console.print(f"wrote {picture}", highlight=False, soft_wrap=True)

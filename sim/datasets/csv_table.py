@@ -26,6 +26,14 @@ NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
 """Landmark name: a text with a final number."""
 
 
+class UnknownColumnError(DatasetError):
+    """A table has a column that its kind does not have; header: all its columns."""
+
+    def __init__(self, text: str, header: Sequence[str]) -> None:
+        super().__init__(text)
+        self.header = header
+
+
 @dataclass(frozen=True)
 class CsvTable:
     """Text cells of a table by column; lines: file line of each row, from 1.
@@ -208,9 +216,10 @@ def _check_header(header: list[str], name: str, known: Sequence[str] | None) -> 
                     f"{name}, line 1: {column!r} is a number, and the first line names the "
                     f"columns; put a line above it, as {','.join(known[:4])}"
                 )
-            raise DatasetError(
+            raise UnknownColumnError(
                 f"{name}, line 1: unknown column {column!r}; known: {', '.join(known)}. "
-                "`teamslam import` takes other names by a map of columns"
+                "`teamslam import` takes other names by a map of columns",
+                header,
             )
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from teamslam.sim.datasets import folder_tables as rows
-from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.csv_table import CsvTable, UnknownColumnError, read_table
 from teamslam.sim.datasets.detections_table import detections_of, together
 from teamslam.sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
 from teamslam.sim.datasets.folder_odometry import intervals_of
@@ -164,7 +164,17 @@ def _table(place: File, kind: str, robot: str) -> CsvTable | None:
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None
-    table = read_table(file, name_table(place, file, robot), TABLES[kind])
+    name = name_table(place, file, robot)
+    try:
+        table = read_table(file, name, TABLES[kind])
+    except UnknownColumnError as error:
+        of = [other for other, known in TABLES.items() if set(error.header) <= set(known)]
+        if not of:
+            raise
+        raise DatasetError(
+            f"{name}, line 1: its columns are those of {' or '.join(f'{o}.csv' for o in of)} "
+            f"({', '.join(error.header)}): rename the file"
+        ) from None
     for column in REQUIRED[kind]:
         if not table.has(column):
             raise table.fault(f"no column {column}; known: {', '.join(TABLES[kind])}")

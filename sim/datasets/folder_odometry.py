@@ -14,6 +14,7 @@ from teamslam.sim.datasets.folder_tables import (
 )
 from teamslam.sim.datasets.scans import on_circle
 from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
+from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.streams import Intervals, moved
 from teamslam.team.config import Bounds
 from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
@@ -30,6 +31,8 @@ WHIRLING_RAD_S = 2.0 * np.pi
 """Median yaw rate [rad/s] above which radians are improbable."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
 """Plausible median odometry interval in seconds."""
+IMPOSSIBLE_S = 60.0
+"""Median odometry interval [s] of no robot."""
 OFF_NS = 1_000_000
 """A duration deviates if it differs from the time since the previous row by more than this and by a
 hundredth.
@@ -90,21 +93,27 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
             _judge_speeds(rows, INCREMENTS, motions, duration)
     else:
         intervals = moved(ends, duration, steps, claims)
-    rows.notes += pace_notes(duration)
+    rows.notes += pace_notes(duration, table.name)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
 
 
-def pace_notes(duration_ns: Int64[np.ndarray, " I"]) -> list[str]:
-    """Note on odometry whose usual interval is implausible in seconds."""
+def pace_notes(duration_ns: Int64[np.ndarray, " I"], name: str = "") -> list[str]:
+    """Note on odometry whose usual interval is implausible in seconds.
+
+    Raises DatasetError for a table (name) whose usual interval is impossible.
+    """
     usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
     if SHORTEST_S <= usual_s <= LONGEST_S:
         return []
     usual = f"{usual_s:,.0f}" if usual_s > 1.0 else f"{usual_s:.3g}"
-    return [
+    note = (
         f"{PACE} {usual} s apart: times are taken for seconds; "
         f"{conversion('other units, as milliseconds', '1e-3')}"
-    ]
+    )
+    if name and usual_s > IMPOSSIBLE_S:
+        raise DatasetError(f"{name}, column t_s: {note}")
+    return [note]
 
 
 def _drop_other_clocks(rows: Rows) -> None:

@@ -138,6 +138,7 @@ def test_the_command_localises_a_log_again(tmp_path):
     run = CliRunner().invoke
     made = run(app, ["localise", "--map", str(site), str(log), "--json", str(result)])
     assert made.exit_code == 0, made.output
+    assert "final map: the saved one, with poses and paths in its frame" in made.output
     figures = json.loads(result.read_text())["recomputed"]
     assert figures["landmarks"] == 18
     assert {each["state"] for each in figures["changes"]} <= {"unchanged"}

@@ -56,6 +56,7 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
         (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
         (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
         (["launch", "thesis", "-o", "/dev/null"], ["/dev/null: File exists; give another path"]),
+        (["rerun", "none", "-o", "/dev/null"], ["-o /dev/null: File exists; give a folder"]),
         (["repair", "/dev/null", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
         (["record", "thesis", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
         (["experiment", "ma-6a"], ["ma-6a: give the sets with --dataset"]),

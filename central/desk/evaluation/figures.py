@@ -47,6 +47,7 @@ _ROBOT = {
     "measurements_used": "consumption.used",
     "measurements_rejected": "consumption.rejected",
     "measurements_open": "consumption.open",
+    "detections_rejected": "consumption.gated",
     "measurements_used_once": "consumption.each_once",
     "ledger": "consumption.ledger",
     "submaps": "consumption.submaps",

@@ -41,7 +41,7 @@ class Consumption:
 
     steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
     `Done`, else None and empty. each_once: no measurement lies in two submaps, and the ledger sums
-    to consumed.
+    to consumed. gated: detections of used scans that their windows rejected as outliers.
     """
 
     steps: int
@@ -50,6 +50,7 @@ class Consumption:
     submaps: int
     ledger: Mapping[str, int]
     each_once: bool | None
+    gated: int = 0
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -131,6 +132,7 @@ def consumption(log: Collected, robot: str) -> Consumption:
         if consumed is None
         else sum(ledger.values()) == consumed
         and _disjoint([submaps[name] for name in sorted(submaps)]),
+        sum(submap.gated for submap in submaps.values()),
     )
 
 

@@ -316,7 +316,17 @@ def _robot_note(evaluation: Evaluation) -> str:
         if robot.consumption.not_used
     ]
     more = f"; … and {len(left_out) - NOTED} robots more" if len(left_out) > NOTED else ""
-    return words + "".join(f"; {each}" for each in left_out[:NOTED]) + more
+    return words + "".join(f"; {each}" for each in left_out[:NOTED]) + more + _gated(evaluation)
+
+
+def _gated(evaluation: Evaluation) -> str:
+    """Count of the detections that windows rejected, and the robots with the most."""
+    counts = {name: robot.consumption.gated for name, robot in evaluation.robots.items()}
+    most = sorted(filter(counts.get, counts), key=lambda name: -counts[name])
+    listed = ", ".join(f"{name} {counts[name]:,}" for name in most[:NOTED])
+    more = ", …" * (len(most) > NOTED)
+    total = sum(counts.values())
+    return f"; detections rejected as outliers: {f'{listed}{more}' if total else 'none'}"
 
 
 NOTED = 5

@@ -1,6 +1,7 @@
 """The figures of a run equal their definitions."""
 
 import json
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -516,7 +517,9 @@ def test_the_table_tells_used_from_rejected_and_open_measurements():
         published - 6, {"no pose node near it": 3}, 3
     )  # fmt: skip
     assert robot_sheet(run).rows[0][2] == f"{published - 6} of {published}"
-    assert robot_sheet(run).note.endswith("; r1: 3 rejected (no pose node near it), 3 open")
+    assert robot_sheet(run).note.endswith(
+        "; r1: 3 rejected (no pose node near it), 3 open; detections rejected as outliers: none"
+    )
     figures = to_json(run)["robots"]["r1"]
     assert figures["measurements_rejected"] == {"no pose node near it": 3}
     assert (figures["measurements_used"], figures["measurements_open"]) == (published - 6, 3)
@@ -524,7 +527,10 @@ def test_the_table_tells_used_from_rejected_and_open_measurements():
         world_log(scenario()) + samples([done(published, (("in a submap", published),))])
     )
     assert robot_sheet(every).rows[0][2] == f"{published} of {published}"
-    assert "rejected" not in robot_sheet(every).note
+    assert "r1: " not in robot_sheet(every).note
+    outliers = {name: replace(used, gated=count) for name, count in (("r1", 2), ("r2", 1300))}
+    robots = {name: replace(run.robots["r1"], consumption=of) for name, of in outliers.items()}
+    assert robot_sheet(replace(run, robots=robots)).note.endswith(": r2 1,300, r1 2")
     without = evaluate(world_log(scenario()))
     assert robot_sheet(without).rows[0][2] == f"– of {published}"
 

@@ -239,7 +239,7 @@ def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first):
 
 
 def test_too_little_motion_or_too_few_measurements_are_said(bases):
-    with pytest.raises(CalibrationError, match="stretches of 10 s of motion"):
+    with pytest.raises(CalibrationError, match="needs 30 stretches of 10 s"):
         fit_motion([bases[0].between(0, 60 * SECOND)], None)
     with pytest.raises(CalibrationError, match="measurements of landmarks"):
         fit_sensor(bases)
@@ -394,7 +394,8 @@ def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])
     assert said.exit_code == 1
     assert "set r2: no ground truth: nothing is learnt from it" in said.output
-    assert "24 stretches of 10 s of motion with a known path, 30 needed" in said.output
+    assert "these data have 24: give several data sets at once, record 1.0 minutes" in said.output
+    assert "where the path is known throughout" in said.output
 
 
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path):

@@ -278,6 +278,12 @@ def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path):
     [
         ("odometry", "", "r1/odometry.csv: empty; its first line names the columns"),
         ("odometry", "t_s,speed\n0,1\n", "line 1: unknown column 'speed'; known: t_s"),
+        ("odometry", SEEN, "line 1: its columns are those of observations.csv (t_s, landmark,"),
+        (
+            "odometry",
+            "t_s,forward_m_s,yaw_rate_rad_s\n0,1,0\n100,1,0\n200,1,0\n",
+            "r1/odometry.csv, column t_s: most rows of its odometry are 100 s apart: times",
+        ),
         ("odometry", "t_s,t_s\n", "line 1: two columns are called 't_s'"),
         ("odometry", "t_s,x_m\n0,1\n", "line 1: no odometry in its columns; give t_s with one of"),
         ("odometry", SPEEDS + "4,1\n", "line 5: 2 columns, 3 expected (t_s, forward_m_s"),
