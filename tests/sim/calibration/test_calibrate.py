@@ -50,7 +50,7 @@ def reference(name: str, **fields: Any) -> Reference:
 
 
 def driven(
-    seed: int, seconds: int = 1500, speeds: tuple[float, ...] = (0.0, 0.05, 0.08, -0.06)
+    seed: int, seconds: int = 900, speeds: tuple[float, ...] = (0.0, 0.05, 0.08, -0.06)
 ) -> Reference:
     """A base that drives 1.05 v less 0.1 m of each radian, turns 0.9 ω − 0.03 rad/m; 10 Hz.
 
@@ -80,7 +80,7 @@ def seeing(seed: int) -> Reference:
     Bearings are 0.02 rad too large, of σ 0.01, all white, and 3 % of them anywhere.
     """
     rng = np.random.default_rng(seed)
-    n, dt = 2000, 0.25
+    n, dt = 1200, 0.25
     keep = np.exp(-dt / 5.0)
     rows = []
     for i, place in SEEN.items():
@@ -339,7 +339,7 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
 def slipping():
     """A simulated team whose bases drive 10 % farther than their odometry."""
     world = SimulatedWorld(
-        steps=1000,
+        steps=840,
         step_s=0.25,
         size_m=20.0,
         landmark_count=12,
@@ -394,7 +394,7 @@ def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])
     assert said.exit_code == 1
     assert "set r2: no ground truth: nothing is learnt from it" in said.output
-    assert "these data have 24: give several data sets at once, record 1.0 minutes" in said.output
+    assert "these data have 20: give several data sets at once, record 1.7 minutes" in said.output
     assert "where the path is known throughout" in said.output
 
 
