@@ -19,7 +19,7 @@ from teamslam.team.wire.arrays import floats, ids
 from tests.trials.stress_world import StressWorld, write
 
 OFFSET_S = 0.5
-SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=215.0)
+SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
 
 
 def opened(place: Path) -> Scenario:
