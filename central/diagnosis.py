@@ -12,7 +12,7 @@ from statistics import median
 from typing import NamedTuple
 
 from teamslam.central.carried_off import CarriedOff
-from teamslam.central.monitor import finding
+from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Contribution, moment
@@ -166,8 +166,9 @@ def _shared_errors(
     Their standard deviation is the larger of two: the stated one times the root of a covariance
     scale above 1, and that from the scatter of the submaps. Errors that change slowly look like a
     shared one, but the submaps scatter about it. Of that scatter, known from few independent
-    submaps, an error must exceed as many as chance does equally rarely (Student's t). The standard
-    deviation of a large error grows by the error of its sensitivities, which vanishes with it.
+    submaps, an error must exceed more than chance does once in a thousand (Student's t). The
+    standard deviation of a large error grows by the error of its sensitivities, which vanishes with
+    it.
     """
     for found in biases:
         (robot, _), bias, value, stated = found
@@ -175,8 +176,10 @@ def _shared_errors(
         if error is None or sigma == 0.0 or abs(value) <= max(error.least, SIGMAS * sigma):
             continue
         scatter = scatter_of(fold, found)
-        least, sigma = SIGMAS * sigma, max(sigma, scatter.sigma)
-        if abs(value) > max(least, _student(SIGMAS, scatter.freedom) * scatter.sigma):
+        sigma = max(sigma, scatter.sigma)
+        if abs(value) > max(
+            SIGMAS * sigma, _student(SCALE_SIGMAS, scatter.freedom) * scatter.sigma
+        ):
             yield m.Diagnosis(
                 cause=error.cause,
                 robot=robot,
