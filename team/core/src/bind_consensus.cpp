@@ -6,19 +6,6 @@ namespace teamslam::binding {
 
 using window::Consensus;
 
-namespace {
-
-using MadeFlags = Made<bool, nb::ndim<1>>;
-
-MadeFlags made_flags(const std::vector<bool>& flags) {
-  auto* kept = new bool[flags.size()];
-  std::copy(flags.begin(), flags.end(), kept);
-  nb::capsule owner(kept, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
-  return MadeFlags(kept, {flags.size()}, owner);
-}
-
-}  // namespace
-
 void bind_consensus(nb::module_& m) {
   nb::class_<Consensus>(m, "Consensus",
                         "The measurements of a window, and which of them agree: those that no others confirm are outliers.\n\n"
@@ -35,19 +22,17 @@ void bind_consensus(nb::module_& m) {
           "Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.")
       .def(
           "add",
-          [](Consensus& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own) {
-            motion::Increment increment{{motion(0), motion(1), motion(2)}, {}};
-            std::copy(covariance.data(), covariance.data() + 9, increment.covariance[0]);
-            self.add(increment, scan_of(ids, ranges, bearings, own));
+          [](Consensus& self, const se2::Pose<double>& motion, const linalg::Matrix3& covariance, const Ids& ids,
+             const Numbers& ranges, const Numbers& bearings, const Table& own) {
+            self.add({motion, covariance}, scan_of(ids, ranges, bearings, own));
           },
           "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
           "Take a keyframe: the motion since the last one, then its measurements (there may be none).")
-      .def("agreeing", [](const Consensus& self) { return made_flags(self.agreeing()); },
+      .def("agreeing", &Consensus::agreeing,
            "Mark the measurements that agree with others of their landmark under the odometry alone.\n\n"
            "The measurement of a landmark that the others support best places it; it is accepted together with\n"
            "those that support it.")
-      .def("confirmed", [](const Consensus& self) { return made_flags(self.confirmed()); },
+      .def("confirmed", &Consensus::confirmed,
            "Mark those of `agreeing`, then by a smoother over the whole window until the classification is stable.\n\n"
            "Where the normal equations have no solution in floating point, nothing more is rejected.");
 }

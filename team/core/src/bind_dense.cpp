@@ -118,13 +118,13 @@ void bind_dense(nb::module_& m) {
       [](const Array& A) {
         std::optional<dense::Matrix> L = dense::cholesky(square(A));
         if (!L) fail("Matrix is not positive definite");
-        return made_matrix(std::move(*L));
+        return std::move(*L);
       },
       "A"_a,
       "Compute the lower L with L L^T = A from the lower triangle of A.\n\n"
       "Raises LinAlgError where A is not positive definite.");
   m.def(
-      "inverse_of_factored", [](const Array& L) { return made_matrix(dense::inverse_from_factor(square(L))); }, "L"_a,
+      "inverse_of_factored", [](const Array& L) { return dense::inverse_from_factor(square(L)); }, "L"_a,
       "Compute (L L^T)^-1 of a lower triangular L, exactly symmetric.");
   m.def(
       "forward",
@@ -149,26 +149,23 @@ void bind_dense(nb::module_& m) {
       "factor_or_fault",
       [](const Array& P) {
         gaussian::Factor found = gaussian::factor_or_fault(square(P));
-        return std::tuple(made_matrix(std::move(found.L)), int(found.fault));
+        return std::tuple(std::move(found.L), int(found.fault));
       },
       "P"_a,
       "Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in "
       "teamslam.team.estimation.gaussian.FAULTS of why there is none.");
   m.def(
       "curved_covariance",
-      [](double heading, const Matrix3& P) {
-        return made_matrix(gaussian::curved(heading, dense::Const{P.data(), 3, 3, 3}));
-      },
+      [](double heading, const linalg::Matrix3& P) { return gaussian::curved(heading, P); },
       "heading"_a, "covariance"_a,
       "Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; "
       "teamslam.team.estimation.gaussian.curved describes it.");
   m.def(
       "chi2_quantiles",
-      [](double below, double above, const Numbers& dof) {
+      [](double below, double above, std::vector<double> dof) {
         check(below > 0.0 && above > 0.0 && below < 1.0 && above < 1.0, "the probabilities must be between 0 and 1");
-        std::vector<double> found(dof.size());
-        for (std::size_t k = 0; k < found.size(); k++) found[k] = chi2::quantile(below, above, dof(k));
-        return made_numbers(std::move(found));
+        for (double& each : dof) each = chi2::quantile(below, above, each);
+        return dof;
       },
       "below"_a, "above"_a, "dof"_a,
       "Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one "

@@ -72,9 +72,8 @@ void bind_maps(nb::module_& m) {
           "end_pose",
           [](const WholeMap& self, const Ids& ids, const Numbers& mean, const Table& covariance, double gate) {
             const maps::TiedPose at = maps::end_pose(self, submap_of(ids, mean, covariance), gate);
-            return std::tuple(made_numbers({at.pose.begin(), at.pose.end()}),
-                              made<double, nb::ndim<2>>({at.covariance.begin(), at.covariance.end()}, {3, 3}), at.known,
-                              at.refused, int(at.fault));
+            return std::tuple(std::vector(at.pose.begin(), at.pose.end()),
+                              dense::Matrix(dense::Const{at.covariance.data(), 3, 3, 3}), at.known, at.refused, int(at.fault));
           },
           "ids"_a.noconvert(), "mean"_a, "covariance"_a, "gate"_a,
           "Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.\n\n"
@@ -82,17 +81,15 @@ void bind_maps(nb::module_& m) {
           "of `joined`, 2 where a single landmark's innovation is singular.");
   m.def(
       "corrected",
-      [](const Numbers& mean, const Table& covariance, double factor, const Table& sensitivity, const Table& errors) {
+      [](std::vector<double> mean, dense::Matrix covariance, double factor, const Table& sensitivity, const Table& errors) {
         const std::size_t n = mean.size(), k = errors.shape(0);
-        check(covariance.shape(0) == n && covariance.shape(1) == n, "covariance must be (n, n) of a mean of n numbers");
+        check(covariance.rows() == n && covariance.columns() == n, "covariance must be (n, n) of a mean of n numbers");
         check(errors.shape(1) == 2 && sensitivity.shape(0) == k && (k == 0 || sensitivity.shape(1) == n),
               "errors must be (k, 2), sensitivity (k, n)");
         static_assert(sizeof(maps::SharedError) == 2 * sizeof(double));
-        std::vector<double> shifted(mean.data(), mean.data() + n);
-        dense::Matrix total(matrix_of(covariance));
-        maps::correct(shifted, total.view(), factor, {reinterpret_cast<const maps::SharedError*>(errors.data()), k},
+        maps::correct(mean, covariance.view(), factor, {reinterpret_cast<const maps::SharedError*>(errors.data()), k},
                       matrix_of(sensitivity));
-        return std::tuple(made_numbers(std::move(shifted)), made_matrix(std::move(total)));
+        return std::tuple(std::move(mean), std::move(covariance));
       },
       "mean"_a, "covariance"_a, "factor"_a, "sensitivity"_a, "errors"_a,
       "Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).");
@@ -111,13 +108,10 @@ void bind_maps(nb::module_& m) {
       .def_ro("map", &ChainSolution::map, "The last end pose and all landmarks.")
       .def_ro("cost", &ChainSolution::cost, "Chi-squared of all maps, in `dof` degrees of freedom.")
       .def_ro("dof", &ChainSolution::dof)
-      .def_prop_ro("known", [](const ChainSolution& self) { return Places{self.known}; },
-                   "For each submap, the number of its landmarks that another map has, too.")
-      .def_prop_ro("landmark_chi2",
-                   [](ChainSolution& self) {
-                     return View1(self.landmark_chi2.data(), {self.landmark_chi2.size()}, nb::find(self));
-                   },
-                   "Chi-squared of each landmark of the submaps by its own covariance.")
+      .def_ro("known", &ChainSolution::known,
+              "For each submap, the number of its landmarks that another map has, too.")
+      .def_ro("landmark_chi2", &ChainSolution::landmark_chi2,
+              "Chi-squared of each landmark of the submaps by its own covariance.")
       .def_prop_ro("fault", [](const ChainSolution& self) { return int(self.fault); },
                    "0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.")
       .def_ro("at", &ChainSolution::at, "The map without covariance; 0 is the prior.");

@@ -11,7 +11,7 @@ using models::Calibration, models::Polar;
 
 namespace {
 
-using Pair = nb::ndarray<const double, nb::shape<2>, nb::c_contig, nb::device::cpu>;
+using Pose = se2::Pose<double>;
 using PythonScan = std::tuple<Ids, Numbers, Numbers, Table>;
 
 template <std::size_t N>
@@ -45,14 +45,12 @@ void bind_calibration(nb::module_& m) {
             const std::size_t n = ranges.size();
             check(bearings.size() == n, "ranges and bearings must have one length");
             std::vector<double> distances(n), turned(n);
-            auto* mask = new bool[n];
-            nb::capsule owner(mask, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+            std::vector<bool> mask(n);
             for (std::size_t k = 0; k < n; k++) {
               const auto [range, bearing, is_accepted] = self.correct(ranges(k), bearings(k));
               distances[k] = range, turned[k] = bearing, mask[k] = is_accepted;
             }
-            return std::tuple(Made<bool, nb::ndim<1>>(mask, {n}, owner), made_numbers(std::move(distances)),
-                              made_numbers(std::move(turned)));
+            return std::tuple(std::move(mask), std::move(distances), std::move(turned));
           },
           "ranges"_a, "bearings"_a,
           "Return which raw measurements are accepted, and all of them corrected: ((r - range_offset)/range_scale,\n"
@@ -68,8 +66,8 @@ void bind_models(nb::module_& m) {
   m.attr("NEAREST_M") = models::NEAREST_M;
   m.def(
       "predicted",
-      [](const Triple& pose, const Pair& landmark) {
-        const Polar z = models::polar(pose_of(pose), {landmark(0), landmark(1)});
+      [](const Pose& pose, const se2::Point<double>& landmark) {
+        const Polar z = models::polar(pose, landmark);
         return std::tuple(z.range, z.bearing);
       },
       "pose"_a, "landmark"_a,
@@ -77,9 +75,8 @@ void bind_models(nb::module_& m) {
       "range = max(|landmark - (x, y)|, NEAREST_M), bearing = atan2(dy, dx) - heading in (-pi, pi].");
   m.def(
       "predict",
-      [](const Triple& pose, const Table& landmarks) {
+      [](const Pose& from, const Table& landmarks) {
         check(landmarks.shape(1) == 2, "landmarks must be (L, 2)");
-        const se2::Pose<double> from = pose_of(pose);
         const std::size_t L = landmarks.shape(0);
         std::vector<double> measurements, by_pose, by_landmark;
         for (std::size_t k = 0; k < L; k++) {
@@ -96,15 +93,11 @@ void bind_models(nb::module_& m) {
       "Predict the measurements h (L, 2) of landmarks (L, 2), with dh/dxi (L, 2, 3) of h(pose o Exp(xi), landmark) at\n"
       "xi = 0 and dh/dlandmark (L, 2, 2).");
   m.def(
-      "located",
-      [](const Triple& pose, double range, double bearing) {
-        const auto [x, y] = models::located(pose_of(pose), {range, bearing});
-        return made_numbers({x, y});
-      },
-      "pose"_a, "range"_a, "bearing"_a, "Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.");
+      "located", [](const Pose& pose, double range, double bearing) { return models::located(pose, {range, bearing}); }, "pose"_a,
+      "range"_a, "bearing"_a, "Invert the model: the point at (range, bearing) from a pose, in the pose's map frame.");
   m.def(
       "place",
-      [](const Triple& pose, const Table& measurements, const std::array<double, 5>& noise, const Table& own) {
+      [](const Pose& pose, const Table& measurements, const std::array<double, 5>& noise, const Table& own) {
         const std::size_t n = measurements.shape(0);
         check(measurements.shape(1) == 2, "measurements must be (n, 2)");
         const models::Noise sensor = noise_of(noise);
@@ -113,7 +106,7 @@ void bind_models(nb::module_& m) {
         for (std::size_t k = 0; k < n; k++) {
           const models::Claim claim = claims.empty() ? models::OF_SENSOR : claims[k];
           const auto placed =
-              models::place(pose_of(pose), models::reading_of(measurements(k, 0), measurements(k, 1), sensor, claim));
+              models::place(pose, models::reading_of(measurements(k, 0), measurements(k, 1), sensor, claim));
           means.insert(means.end(), {placed.x, placed.y});
           covariances.insert(covariances.end(), {placed.xx, placed.xy, placed.yy});
         }
@@ -129,7 +122,7 @@ void bind_models(nb::module_& m) {
         check(poses.shape(0) == scans.size() && (poses.shape(1) == 3 || scans.empty()), "poses must be (m, 3), one of each scan");
         finite(poses, "poses");
         std::vector<window::Scan> views;
-        std::vector<se2::Pose<double>> from;
+        std::vector<Pose> from;
         for (std::size_t i = 0; i < scans.size(); i++) {
           const auto& [ids, ranges, bearings, own] = scans[i];
           views.push_back(scan_of(ids, ranges, bearings, own));
@@ -137,8 +130,8 @@ void bind_models(nb::module_& m) {
         }
         window::Reduced reduced = window::reduce(views, from);
         const std::size_t n = reduced.ids.size();
-        return std::tuple(made<std::uint32_t, nb::ndim<1>>(std::move(reduced.ids), {n}), made_numbers(std::move(reduced.ranges)),
-                          made_numbers(std::move(reduced.bearings)), made_claims(reduced.claims, n));
+        return std::tuple(made<std::uint32_t, nb::ndim<1>>(std::move(reduced.ids), {n}), std::move(reduced.ranges),
+                          std::move(reduced.bearings), made_claims(reduced.claims, n));
       },
       "scans"_a.noconvert(), "poses"_a,
       "Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.\n\n"

@@ -10,29 +10,13 @@ using motion::Densities, motion::Model, motion::Odometry;
 
 namespace {
 
-using MadeIncrement = std::tuple<MadeNumbers, MadeTable>;
+using Pose = se2::Pose<double>;
+using Mean = const Pose&;
+using Covariance = const linalg::Matrix3&;
+using MadeIncrement = std::tuple<Pose, linalg::Matrix3>;
 using Three = std::array<double, 3>;
 
-MadeIncrement made_increment(const motion::Increment& of) {
-  return {made_numbers({of.mean.x, of.mean.y, of.mean.heading}), made_matrix(dense::Matrix(of.covariance))};
-}
-
-MadeNumbers made_twist(const se2::Motion& of) { return made_numbers({of.forward, of.left, of.turn}); }
-
-linalg::Matrix3 matrix3_of(const Matrix3& from) {
-  linalg::Matrix3 made{};
-  for (std::size_t i = 0; i < 3; i++)
-    for (std::size_t j = 0; j < 3; j++) made[i][j] = from(i, j);
-  return made;
-}
-
-motion::Increment motion_of(const Triple& mean, const Matrix3& covariance) { return {pose_of(mean), matrix3_of(covariance)}; }
-
-motion::Moved moved_of(const Triple& twist, const std::optional<Matrix3>& covariance, double duration_s) {
-  motion::Moved moved{{twist(0), twist(1), twist(2)}, duration_s, std::nullopt};
-  if (covariance) moved.covariance = matrix3_of(*covariance);
-  return moved;
-}
+MadeIncrement made_increment(const motion::Increment& of) { return {of.mean, of.covariance}; }
 
 void bind_model(nb::module_& m) {
   nb::class_<Model>(m, "MotionModel", "The parameters of a motion model, as of `teamslam.team.config.MotionModel`.")
@@ -69,8 +53,10 @@ void bind_model(nb::module_& m) {
           "Returns mean and covariance.")
       .def(
           "part",
-          [](const Model& self, const Triple& twist, const std::optional<Matrix3>& covariance, double duration_s, double share,
-             double rest) { return made_increment(motion::part_of(self, moved_of(twist, covariance, duration_s), share, rest)); },
+          [](const Model& self, const se2::Motion& twist, const std::optional<linalg::Matrix3>& covariance, double duration_s,
+             double share, double rest) {
+            return made_increment(motion::part_of(self, {twist, duration_s, covariance}, share, rest));
+          },
           "twist"_a, "covariance"_a.none(), "duration_s"_a, "share"_a, "rest"_a,
           "Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.\n\n"
           "covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is\n"
@@ -79,7 +65,7 @@ void bind_model(nb::module_& m) {
           "forward_column",
           [](const Model& self, double duration_s, double forward, double yaw_rate) {
             const auto [ahead, left] = motion::forward_column(self, duration_s, forward, yaw_rate);
-            return made_numbers({ahead, left, 0.0});
+            return se2::Motion{ahead, left, 0.0};
           },
           "duration_s"_a, "forward"_a, "yaw_rate"_a,
           "Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)\n"
@@ -92,23 +78,19 @@ void bind_motion(nb::module_& m) {
   bind_model(m);
   m.def(
       "compose_motions",
-      [](const Triple& mean, const Matrix3& covariance, const Triple& then, const Matrix3& added) {
-        return made_increment(motion::compose(motion_of(mean, covariance), motion::Step(motion_of(then, added))));
+      [](Mean mean, Covariance covariance, Mean then, Covariance added) {
+        return made_increment(motion::compose({mean, covariance}, motion::Step({then, added})));
       },
       "mean"_a, "covariance"_a, "then"_a, "added"_a,
       "Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.");
   m.def(
       "motion_of_sensor",
-      [](const Triple& mean, const Matrix3& covariance, const Triple& mount) {
-        return made_increment(motion::of_sensor(motion_of(mean, covariance), pose_of(mount)));
+      [](Mean mean, Covariance covariance, const Pose& mount) {
+        return made_increment(motion::of_sensor({mean, covariance}, mount));
       },
       "mean"_a, "covariance"_a, "mount"_a, "Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).");
-  m.def(
-      "shift_after",
-      [](const Triple& shift, const Triple& motion) {
-        return made_twist(motion::shift_after({shift(0), shift(1), shift(2)}, pose_of(motion)));
-      },
-      "shift"_a, "motion"_a, "Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.");
+  m.def("shift_after", motion::shift_after, "shift"_a, "motion"_a,
+        "Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.");
 
   nb::class_<Odometry>(m, "Odometry",
                        "Odometry integrated since the places that matter to a window.\n\n"
@@ -117,7 +99,7 @@ void bind_motion(nb::module_& m) {
       .def(
           "__init__",
           [](Odometry* self, const Model& model, const std::optional<Three>& mount) {
-            std::optional<se2::Pose<double>> at;
+            std::optional<Pose> at;
             if (mount) at = {(*mount)[0], (*mount)[1], (*mount)[2]};
             new (self) Odometry(model, at);
           },
@@ -127,9 +109,9 @@ void bind_motion(nb::module_& m) {
            "Go on by a part of an interval whose speeds were measured.\n\nadded: variances per second, in addition to the noise.")
       .def(
           "move",
-          [](Odometry& self, const Triple& twist, const std::optional<Matrix3>& covariance, double interval_s, double duration_s,
-             double share, double rest, const std::optional<Odometry::Unmeasured>& added) {
-            self.drive(moved_of(twist, covariance, interval_s), duration_s, share, rest, added);
+          [](Odometry& self, const se2::Motion& twist, const std::optional<linalg::Matrix3>& covariance, double interval_s,
+             double duration_s, double share, double rest, const std::optional<Odometry::Unmeasured>& added) {
+            self.drive({twist, interval_s, covariance}, duration_s, share, rest, added);
           },
           "twist"_a, "covariance"_a.none(), "interval_s"_a, "duration_s"_a, "share"_a, "rest"_a, "added"_a.none(),
           "Go on by a part of an interval whose motion was measured, as `MotionModel.part`.")
@@ -139,7 +121,7 @@ void bind_motion(nb::module_& m) {
             const auto [motion, shift, seconds, rest] = self.end_keyframe();
             std::optional<MadeIncrement> since_unnamed;
             if (rest) since_unnamed = made_increment(*rest);
-            return std::tuple(made_increment(motion), made_numbers({shift.forward, shift.left, shift.turn, seconds}), since_unnamed);
+            return std::tuple(made_increment(motion), std::vector{shift.forward, shift.left, shift.turn, seconds}, since_unnamed);
           },
           "End the motion since the last keyframe here.\n\n"
           "Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the\n"
@@ -150,10 +132,13 @@ void bind_motion(nb::module_& m) {
       .def(
           "end_scans",
           [](Odometry& self) {
-            std::vector<double> poses;
-            for (const auto& [x, y, heading] : self.end_scans()) poses.insert(poses.end(), {x, y, heading});
-            const std::size_t count = poses.size() / 3;
-            return made<double, nb::ndim<2>>(std::move(poses), {count, 3});
+            const std::vector<Pose> scans = self.end_scans();
+            dense::Matrix poses(scans.size(), 3);
+            for (std::size_t k = 0; k < scans.size(); k++) {
+              const auto& [x, y, heading] = scans[k];
+              poses[k][0] = x, poses[k][1] = y, poses[k][2] = heading;
+            }
+            return poses;
           },
           "Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.")
       .def("since_node", [](const Odometry& self) { return made_increment(self.since_node()); }, "The motion since the last pose node.")

@@ -1,13 +1,15 @@
 // What the bindings share: arrays from Python, checked once, and arrays to Python.
 //
 // nanobind checks type, dimensions and layout; it converts numbers, and copies where only the layout
-// differs, but never converts ids, which would wrap. The functions here check lengths and finiteness.
+// differs, but never converts ids and indices, which would wrap. The functions here check lengths and
+// finiteness. Vectors, spans, matrices and poses of the core are arguments and results themselves.
 #pragma once
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
@@ -19,27 +21,10 @@
 #include <vector>
 
 #include "dense.hpp"
+#include "se2.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
-
-// Numbers as an array of numpy.int64: nanobind makes one of "long long", which is another type to
-// whatever looks at the type and not at its size.
-struct Places {
-  std::vector<std::int64_t> numbers;
-};
-
-template <>
-struct nanobind::detail::type_caster<Places> {
-  using Array = nb::ndarray<nb::numpy, std::int64_t, nb::ndim<1>, nb::c_contig>;
-  NB_TYPE_CASTER(Places, make_caster<Array>::Name)
-
-  static handle from_cpp(Places&& places, rv_policy, cleanup_list*) noexcept {
-    auto* kept = new std::vector<std::int64_t>(std::move(places.numbers));
-    capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<std::int64_t>*>(p); });
-    return nb::cast(Array(kept->data(), {kept->size()}, owner)).attr("view")("int64").release();
-  }
-};
 
 // A number of Python: a float, an integer, one of NumPy's numbers; but no array, not even of one number.
 struct Number {
@@ -124,6 +109,11 @@ using MadeNumbers = Made<double, nb::ndim<1>>;
 using MadeTable = Made<double, nb::ndim<2>>;
 using MadeStack = Made<double, nb::ndim<3>>;
 using MadeIds = Made<std::uint32_t, nb::ndim<1>>;
+
+// Numbers as an array of numpy.int64.
+struct Places {
+  std::vector<std::int64_t> numbers;
+};
 
 // A number that has to be finite and is not.
 struct NotFiniteError : std::domain_error {
@@ -226,6 +216,118 @@ inline MadeTable made_matrix(dense::Matrix&& matrix) {
   const std::size_t rows = matrix.rows(), columns = matrix.columns();
   return made<double, nb::ndim<2>>(std::move(matrix).numbers(), {rows, columns});
 }
+
+// The core's types as arrays: `set` gives a value the numbers of an array, `array_of` makes an array.
+template <class T, class Given>
+void set(std::vector<T>& to, const Given& from) {
+  to.assign(from.data(), from.data() + from.size());
+}
+template <class T, class Given>
+void set(std::span<const T>& to, const Given& from) {
+  to = {from.data(), from.size()};
+}
+template <class Given>
+void set(dense::Matrix& to, const Given& from) {
+  to = dense::Matrix(matrix_of(from));
+}
+template <class Given>
+void set(linalg::Matrix3& to, const Given& from) {
+  std::copy_n(from.data(), 9, to.entries[0]);
+}
+template <class Given>
+void set(se2::Pose<double>& to, const Given& from) {
+  to = {from(0), from(1), from(2)};
+}
+template <class Given>
+void set(se2::Motion& to, const Given& from) {
+  to = {from(0), from(1), from(2)};
+}
+template <class Given>
+void set(se2::Point<double>& to, const Given& from) {
+  to = {from(0), from(1)};
+}
+
+inline nb::object array_of(std::vector<double>&& from) { return nb::cast(made_numbers(std::move(from))); }
+// nanobind's own array of integers is of "long long", which is another type to whatever looks at the
+// type and not at its size.
+inline nb::object array_of(std::vector<std::int64_t>&& from) {
+  const std::size_t n = from.size();
+  return nb::cast(made<std::int64_t, nb::ndim<1>>(std::move(from), {n})).attr("view")("int64");
+}
+inline nb::object array_of(Places&& from) { return array_of(std::move(from.numbers)); }
+inline nb::object array_of(std::span<const std::int64_t> from) {
+  return array_of(std::vector<std::int64_t>(from.begin(), from.end()));
+}
+inline nb::object array_of(std::vector<bool>&& from) {
+  std::vector<std::uint8_t> bytes(from.begin(), from.end());
+  const std::size_t n = bytes.size();
+  return nb::cast(made<std::uint8_t, nb::ndim<1>>(std::move(bytes), {n})).attr("view")("bool");
+}
+inline nb::object array_of(dense::Matrix&& from) { return nb::cast(made_matrix(std::move(from))); }
+inline nb::object array_of(const linalg::Matrix3& from) { return array_of(dense::Matrix(from)); }
+inline nb::object array_of(const se2::Pose<double>& from) { return array_of(std::vector{from.x, from.y, from.heading}); }
+inline nb::object array_of(const se2::Motion& from) { return array_of(std::vector{from.forward, from.left, from.turn}); }
+inline nb::object array_of(const se2::Point<double>& from) { return array_of(std::vector{from.x, from.y}); }
+
+}  // namespace teamslam::binding
+
+namespace nanobind::detail {
+
+// A type of the core that is an array of T in Python.
+template <class V, class T, class Shape>
+struct ArrayCaster {
+  using Given = ndarray<const T, Shape, c_contig, device::cpu>;
+  NB_TYPE_CASTER(V, make_caster<Given>::Name)
+
+  bool from_python(handle from, std::uint32_t flags, cleanup_list* cleanup) noexcept {
+    if (!std::is_same_v<T, double>) flags &= ~std::uint32_t(cast_flags::convert);
+    make_caster<Given> caster;
+    if (!caster.from_python(from, flags, cleanup)) return false;
+    given_ = std::move(caster.value);
+    teamslam::binding::set(value, given_);
+    return true;
+  }
+
+  template <class From>
+  static handle from_cpp(From&& from, rv_policy, cleanup_list*) noexcept {
+    return teamslam::binding::array_of(V(std::forward<From>(from))).release();
+  }
+
+ private:
+  Given given_;  // what a span refers to
+};
+
+template <class T>
+using VectorCaster = ArrayCaster<std::vector<T>, T, ndim<1>>;
+template <class T>
+using SpanCaster = ArrayCaster<std::span<const T>, T, ndim<1>>;
+
+template <>
+struct type_caster<std::vector<double>> : VectorCaster<double> {};
+template <>
+struct type_caster<std::vector<std::int64_t>> : VectorCaster<std::int64_t> {};
+template <>
+struct type_caster<std::vector<bool>> : VectorCaster<bool> {};
+template <>
+struct type_caster<std::span<const double>> : SpanCaster<double> {};
+template <>
+struct type_caster<std::span<const std::int64_t>> : SpanCaster<std::int64_t> {};
+template <>
+struct type_caster<teamslam::binding::Places> : ArrayCaster<teamslam::binding::Places, std::int64_t, ndim<1>> {};
+template <>
+struct type_caster<teamslam::dense::Matrix> : ArrayCaster<teamslam::dense::Matrix, double, ndim<2>> {};
+template <>
+struct type_caster<teamslam::linalg::Matrix3> : ArrayCaster<teamslam::linalg::Matrix3, double, shape<3, 3>> {};
+template <>
+struct type_caster<teamslam::se2::Pose<double>> : ArrayCaster<teamslam::se2::Pose<double>, double, shape<3>> {};
+template <>
+struct type_caster<teamslam::se2::Motion> : ArrayCaster<teamslam::se2::Motion, double, shape<3>> {};
+template <>
+struct type_caster<teamslam::se2::Point<double>> : ArrayCaster<teamslam::se2::Point<double>, double, shape<2>> {};
+
+}  // namespace nanobind::detail
+
+namespace teamslam::binding {
 
 // One function for each file of bindings.
 void bind_checks(nb::module_& m);

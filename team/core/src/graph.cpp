@@ -12,8 +12,16 @@ void require(bool is_right, const char* what) {
   if (!is_right) throw std::invalid_argument(what);
 }
 
+std::vector<Index> checked(std::vector<Index> offset, std::size_t nodes) {
+  require(offset.size() == nodes + 1 && offset[0] == 0, "each node has an offset, and a mark whether it is fixed");
+  for (std::size_t node = 0; node < nodes; node++)
+    require(offset[node + 1] > offset[node] && offset[node + 1] <= offset[node] + 3, "a node has one to three numbers");
+  return offset;
+}
+
 std::vector<Joined> placed(std::vector<Joined> submaps, const std::vector<Index>& offset) {
   for (Joined& each : submaps) {
+    require(each.submap != nullptr, "a submap is None");
     const std::size_t members = each.submap->members(), poses = 1 + each.submap->poses(),
                       points = 1 + each.submap->points();
     require(each.nodes.size() == members, "a submap has a node for each member");
@@ -96,16 +104,13 @@ Quadratic::Terms Quadratic::terms(Values state, Indices numbers) const {
 
 Graph::Graph(std::vector<Index> offsets, std::vector<bool> constants, std::vector<Joined> joined,
              std::vector<Sighting> seen, std::vector<Prior> known, std::shared_ptr<const Quadratic> old)
-    : offset(std::move(offsets)),
+    : offset(checked(std::move(offsets), constants.size())),
       fixed(std::move(constants)),
       submaps(placed(std::move(joined), offset)),
       landmark_start(starts_of_landmarks(submaps)),
       sightings(std::move(seen)),
       priors(std::move(known)),
       condensed(std::move(old)) {
-  require(offset.size() == fixed.size() + 1 && offset[0] == 0, "each node has an offset, and a mark whether it is fixed");
-  for (std::size_t node = 0; node < nodes(); node++)
-    require(offset[node + 1] > offset[node] && offset[node + 1] <= offset[node] + 3, "a node has one to three numbers");
   const auto has = [&](Index node, std::size_t size) {
     return node >= 0 && std::size_t(node) < nodes() && size_of(node) == size;
   };

@@ -1,0 +1,306 @@
+"""Each entry of the core returns or raises an error of its caller's, whatever its arguments.
+
+Every function, constructor, method and property of the stub has an example, which it accepts. One or
+two arguments of the example, or of the constructor of its object, are replaced: by numbers that are
+not finite, huge or negative, by arrays of other shapes, types and strides, by None. In `make
+check-core` an access out of bounds, an overflow or a null pointer ends the process.
+"""
+
+import ast
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from teamslam.team import core
+
+DRAWS = 60
+NUMBERS = [0.0, -0.0, -1.0, 5e-324, 1e-200, 1e154, -1e308, np.inf, -np.inf, np.nan]
+WHOLE = [-(2**63), -1, 0, 1, 2, 7, 40, 2**31, 2**62]
+COUNTS = [-1, 0, 1, 2, 7, 40]
+"""Of particles, rows and iterations: large ones are no defect but take memory and time."""
+
+POSE, POINT, IDS = np.array([1.0, 2.0, 0.5]), np.array([3.0, -1.0]), np.array([3, 7], np.uint32)
+NOISE, NO_CLAIMS = (0.01, 0.0, 1.0, 0.001, 1.0), np.zeros((2, 0))
+MEAN = np.array([1.0, 0.2, 0.1, 3.0, 1.0, 2.0, -1.0])
+STATE = np.array([0.0, 0.0, 0.0, 1.1, 0.2, 0.1, 3.1, 1.0, 2.0, -1.1, 0.01])
+ROWS = np.array([[1.0, 0.2], [2.0, -0.3]])
+MEANS, COVARIANCES = np.tile(ROWS, (4, 1, 1)), np.tile([0.1, 0.01, 0.2], (4, 2, 1))
+
+
+def covariance(n: int) -> np.ndarray:
+    return 0.1 * np.eye(n) + 0.01
+
+
+EXAMPLES = {
+    "data": lambda: np.array([0.1, 0.2, 0.3]).tobytes(),
+    "check_pose_covariance.data": lambda: covariance(3).tobytes(),
+    "check_packed_covariance.data": lambda: np.array([2.0, 0.1, 2.0]).tobytes(),
+    "check_blocks.data": lambda: np.array([2.0, 0.1, 2.0]).tobytes(),
+    "check_named.data": IDS.tobytes,
+    "check_ascending.data": IDS.tobytes,
+    "check_blocks.count": lambda: 1,
+    **dict.fromkeys(("count", "iterations"), lambda: 3),
+    **dict.fromkeys(("n", "rows", "columns"), lambda: 2),
+    "what": lambda: "ranges",
+    "key": lambda: bytes(range(16)),
+    "noise": lambda: NOISE,
+    **dict.fromkeys(("motion", "pose", "mount", "a_from_b", "a_from_c", "twist"), POSE.copy),
+    **dict.fromkeys(("mean", "then", "shift", "xi", "observer", "teammate"), POSE.copy),
+    "b_from_c": lambda: np.array([POSE, POSE]),
+    "mean_direction.angles": POSE.copy,
+    **dict.fromkeys(("covariance", "added"), lambda: covariance(3)),
+    **dict.fromkeys(("landmark", "point", "point_in_b", "measurement"), POINT.copy),
+    **dict.fromkeys(("A", "B", "P", "a", "b", "c", "upper"), lambda: covariance(4)),
+    **dict.fromkeys(("L", "S"), lambda: np.linalg.cholesky(covariance(2))),
+    **dict.fromkeys(("forward.B", "solve_factored.B", "error"), POINT.copy),
+    **dict.fromkeys(("add_product.upper", "lower", "improved", "robust"), lambda: False),
+    **dict.fromkeys(("turns_first", "is_measured", "joined_ranges", "with_nodes"), lambda: False),
+    "spread": lambda: np.ones((4, 3)),
+    **dict.fromkeys(("x", "y", "angle", "dof"), MEAN.copy),
+    **dict.fromkeys(("below", "above", "uniform", "outlier_share", "share", "rest"), lambda: 0.5),
+    **dict.fromkeys(("heading", "max_range", "field_of_view", "gate", "factor"), lambda: 2.0),
+    **dict.fromkeys(("submap_gate", "landmark_gate", "covariance_factor"), lambda: 2.0),
+    **dict.fromkeys(("cost", "between", "range", "bearing", "tolerance"), lambda: 0.5),
+    # maps
+    "ids": IDS.copy,
+    **dict.fromkeys(("ranges", "bearings"), POINT.__abs__),
+    "own": NO_CLAIMS.copy,
+    **dict.fromkeys(("landmarks", "measurements"), ROWS.copy),
+    "poses": lambda: np.zeros((4, 3)),
+    "reduce_scans.poses": lambda: np.zeros((1, 3)),
+    "scans": lambda: [(IDS, POINT.__abs__(), POINT.copy(), NO_CLAIMS)],
+    **{f"{each}.mean": MEAN.copy for each in ("WholeMap", "WholeMap.joined", "WholeMap.end_pose")},
+    **{f"{each}.mean": MEAN.copy for each in ("Chain.append", "corrected", "SubmapFactor")},
+    **{
+        f"{each}.covariance": lambda: covariance(7)
+        for each in (
+            "WholeMap",
+            "WholeMap.joined",
+            "WholeMap.end_pose",
+            "Chain.append",
+            "corrected",
+        )
+    },
+    "sensitivity": lambda: np.ones((1, 7)),
+    "curvature": lambda: np.ones((1, 7)),
+    "errors": lambda: np.array([[0.1, 0.2]]),
+    "prior": lambda: core.WholeMap(IDS, MEAN, covariance(7)),
+    # the graph
+    "SubmapFactor.landmarks": lambda: np.array([[0.1, 0.0, 0.2]] * 2),
+    "information": lambda: covariance(7),
+    "range_power": lambda: np.array([1]),
+    **dict.fromkeys(("state", "Pattern.x"), STATE.copy),
+    "at": lambda: np.array([0, 3, 6, 8, 10]),
+    **dict.fromkeys(
+        ("discounted.weights", "SubmapFactor.discounted.weights"), lambda: np.array([0.5, 1])
+    ),
+    "nodes": lambda: np.array([1, 2]),
+    "Quadratic.at": lambda: STATE[3:8].copy(),
+    "headings": lambda: np.array([False, False, True, False, False]),
+    "Quadratic.information": lambda: covariance(5),
+    "slope": lambda: np.ones(5),
+    "offset": lambda: np.array([0, 3, 6, 8, 10, 11]),
+    "fixed": lambda: np.array([True, False, False, False, False]),
+    "submaps": lambda: [(made("SubmapFactor"), np.arange(5))],
+    "sightings": lambda: [(0, 1, np.array([1.0, 0.1]), covariance(2), POINT)],
+    "priors": lambda: [(4, np.zeros(1), np.ones((1, 1)), True)],
+    **{
+        f"Estimate.quadratic.{each}": lambda: np.array([True])
+        for each in ("submaps", "sightings", "priors")
+    },
+    "condensed": lambda: made("Quadratic"),
+    "graph": lambda: one_graph(),
+    "scale": lambda: np.ones(1),
+    "sighting_scale": lambda: np.ones(1),
+    "damping": lambda: 0.0,
+    "halvings": lambda: 4,
+    "most_damping": lambda: 1e6,
+    # sparse
+    "sizes": lambda: np.array([3, 2]),
+    "column_start": lambda: np.array([0, 2, 3]),
+    **dict.fromkeys(("Pattern.rows", "minimum_degree.rows"), lambda: np.array([0, 1, 1])),
+    "values": lambda: np.concatenate([np.eye(3).ravel(), np.zeros(6), np.eye(2).ravel()]),
+    **dict.fromkeys(("Pattern.block.row", "Pattern.block.column"), lambda: 1),
+    **dict.fromkeys(("Pattern.quadratic.x", "right"), lambda: np.ones(5)),
+    "pattern": lambda: made("Pattern"),
+    "unknowns": lambda: np.array([0, 4]),
+    # the window
+    "particles": lambda: 4,
+    "Window.mount": lambda: (0.1, 0.0, 0.2),
+    **dict.fromkeys(("log_weights", "weights"), lambda: np.full(4, -1.4)),
+    **{
+        f"{each}.weights": lambda: np.full(4, 0.25)
+        for each in ("moments", "on_group", "sample_factor")
+    },
+    "mean_direction.weights": lambda: np.ones(3),
+    "normals": lambda: np.ones((4, 3)),
+    **{
+        f"Window.{each}.shift": lambda: np.array([1.0, 0.0, 0.0, 0.5])
+        for each in ("advance", "move")
+    },
+    "means": MEANS.copy,
+    "covariances": COVARIANCES.copy,
+    "paths": lambda: np.zeros((1, 4, 3)),
+    "keyframes": lambda: np.array([0, 0]),
+    "seen": IDS.copy,
+    "Window.sensitivity.mean": MEAN.copy,
+    # odometry
+    **dict.fromkeys(("duration_s", "interval_s", "yaw_rate"), lambda: 0.1),
+    **{
+        f"{each}.forward": lambda: 1.0
+        for each in ("MotionModel.increment", "MotionModel.forward_column")
+    },
+    "Odometry.drive.forward": lambda: 1.0,
+    **dict.fromkeys(("forward", "turn", "final_turn", "lateral"), lambda: (0.01, 0.1, 0.1)),
+    **dict.fromkeys(("forward_scale", "yaw_scale", "yaw_rate_limit", "slow_scale"), lambda: 1.0),
+    **dict.fromkeys(("turn_drag", "veer", "slow_below"), lambda: 0.0),
+    **dict.fromkeys(("alpha_interval_s", "shares_interval_s"), lambda: 0.2),
+    "calibrated_speed": lambda: (0.1, 0.2),
+    "alphas": lambda: None,
+    **dict.fromkeys(("wheels", "shares"), lambda: (0.3, 0.01, 0.01)),
+    **{f"Odometry.{each}.added": lambda: (0.1, 0.1, 0.1) for each in ("drive", "move")},
+    "model": lambda: made("MotionModel"),
+    "Odometry.mount": lambda: (0.1, 0.0, 0.2),
+    # calibration
+    **dict.fromkeys(("range_offset", "bearing_offset", "optical_axis"), lambda: 0.1),
+    **dict.fromkeys(("range_scale", "half_field"), lambda: 1.0),
+    "lens": lambda: (0.1, 0.0, 0.0),
+    "Calibration.ranges": lambda: (0.1, 10.0),
+    "other": lambda: made("Estimate"),
+}
+
+
+def entries_of(stub: str) -> dict[str, list[str] | None]:
+    """List the stub's entries with the names of their arguments; None for a property."""
+    found: dict[str, list[str] | None] = {}
+    for node in ast.parse(stub).body:
+        members = node.body if isinstance(node, ast.ClassDef) and not node.bases else [node]
+        for each in members:
+            if isinstance(each, ast.FunctionDef):
+                name = each.name if each is node else f"{node.name}.{each.name}"
+                names = [one.arg for one in (*each.args.args, *each.args.kwonlyargs)]
+                is_property = "property" in [ast.unparse(one) for one in each.decorator_list]
+                names = None if is_property else [one for one in names if one != "self"]
+                found.setdefault(name.removesuffix(".__init__"), names)
+    return found
+
+
+ENTRIES = entries_of((Path(core.__file__).parent / "_core.pyi").read_text("utf-8"))
+
+
+def examples_of(name: str) -> dict[str, object]:
+    """Make the example of each argument of an entry: its own, or that of all of the name."""
+    own = {each: f"{name}.{each}" for each in ENTRIES[name] or ()}
+    return {each: EXAMPLES[at if at in EXAMPLES else each]() for each, at in own.items()}
+
+
+def made(name: str) -> object:
+    """Make an object of a class of the core by its example."""
+    return getattr(core, name)(**examples_of(name))
+
+
+@cache
+def one_graph() -> core.SubmapGraph:
+    """Make the graph of all estimates."""
+    return made("SubmapGraph")
+
+
+def advanced_window() -> tuple[core.Window, core.Step]:
+    window = made("Window")
+    return window, window.advance(**examples_of("Window.advance"))
+
+
+def longer_chain() -> core.Chain:
+    chain = made("Chain")
+    chain.append(**examples_of("Chain.append"))
+    return chain
+
+
+OBJECTS = {
+    "Window": lambda: advanced_window()[0],
+    "Step": lambda: advanced_window()[1],
+    "Chain": longer_chain,
+    "ChainSolution": lambda: longer_chain().solve(3, 1e-6),
+}
+"""Objects that are not as their constructor makes them, or that have none."""
+
+
+def call(name: str, arguments: dict[str, object], owner: object) -> object:
+    """Call an entry, of an object if it has one."""
+    of_class, _, member = name.rpartition(".")
+    if not of_class:
+        return getattr(core, name)(**arguments)
+    entry = getattr(owner, member)
+    return entry if ENTRIES[name] is None else entry(**arguments)
+
+
+def one_of(choices: Sequence[object], rng: np.random.Generator) -> object:
+    return choices[int(rng.integers(len(choices)))]
+
+
+def mutated_array(value: np.ndarray, kind: int, rng: np.random.Generator) -> object:
+    """Change the shape, the layout, the type or one number of an array."""
+    axis = int(rng.integers(value.ndim))
+    if kind == 1 and value.shape[axis]:
+        return np.delete(value, 0, axis)
+    if kind == 2:
+        return np.concatenate([value, value], axis)
+    if kind == 3:
+        views = [value[::-1], value.T, value[None], value.ravel(), value[..., None][::2]]
+        return one_of(views, rng)
+    if kind == 4:
+        return value.astype(one_of([np.float32, np.int32, np.uint32, np.bool_], rng))
+    if value.size:
+        pool = {"f": NUMBERS, "b": [False, True], "u": [0, 3, 2**32 - 1], "i": WHOLE}
+        number = np.array(one_of(pool[value.dtype.kind], rng)).astype(value.dtype)
+        value = value.copy()
+        value[tuple(int(rng.integers(n)) for n in value.shape)] = number
+    return value
+
+
+def mutated(value: object, rng: np.random.Generator) -> object:
+    """Replace a value, or one of its elements, by a hostile one."""
+    kind = int(rng.integers(8))
+    if kind == 0:
+        return one_of([None, 0.5, "x", (), MEAN, [[1.0]], core.Random(bytes(16))], rng)
+    if isinstance(value, np.ndarray):
+        return mutated_array(value, kind, rng)
+    if isinstance(value, bool | str):
+        return not value
+    if isinstance(value, int | float):
+        return one_of(COUNTS if isinstance(value, int) else NUMBERS, rng)
+    if isinstance(value, bytes):
+        return rng.bytes(int(rng.integers(40)))
+    if isinstance(value, tuple | list) and value:
+        k = int(rng.integers(len(value)))
+        changed = [] if kind == 1 else [mutated(value[k], rng)]
+        return type(value)([*value[:k], *changed, *value[k + 1 :]])
+    return value
+
+
+@pytest.mark.filterwarnings("ignore:.*encountered in")
+@pytest.mark.parametrize("name", ENTRIES)
+def test_an_entry_returns_or_refuses_its_arguments(name):
+    rng = np.random.default_rng(crc32(name.encode()))
+    of_class = name.rpartition(".")[0]
+
+    def owner() -> object:
+        return OBJECTS.get(of_class, lambda: made(of_class))() if of_class else None
+
+    call(name, examples_of(name), owner())
+    for _ in range(DRAWS):
+        arguments = examples_of(name)
+        of_owner = {} if of_class in ("", *OBJECTS) else examples_of(of_class)
+        for _ in range(int(rng.integers(1, 3))):
+            hostile = arguments if arguments and (rng.integers(3) or not of_owner) else of_owner
+            if hostile:
+                which = list(hostile)[int(rng.integers(len(hostile)))]
+                hostile[which] = mutated(hostile[which], rng)
+        with suppress(ValueError, TypeError):  # LinAlgError is one
+            at = getattr(core, of_class)(**of_owner) if of_owner else owner()
+            call(name, arguments, at)
