@@ -1,8 +1,8 @@
-"""Each entry of the core returns or raises an error of its caller's, whatever its arguments.
+"""Each entry of the core returns or raises an error of its caller, whatever its arguments.
 
-Every function, constructor, method and property of the stub has an example, which it accepts. One or
-two arguments of the example, or of the constructor of its object, are replaced: by numbers that are
-not finite, huge or negative, by arrays of other shapes, types and strides, by None. In `make
+Every function, constructor, method and property of the stub has an example, which it accepts. One
+or two arguments of the example, or of the constructor of its object, are replaced: by numbers that
+are not finite, huge or negative, by arrays of other shapes, types and strides, by None. In `make
 check-core` an access out of bounds, an overflow or a null pointer ends the process.
 """
 
