@@ -112,8 +112,10 @@ def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
     )
 
 
-def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
-    """Carry the point to a later node, which the observer reaches by node_from_here."""
+def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
+    """Carry the point back to an earlier node, from which the observer has moved by
+    node_from_here.
+    """
     T = node_from_here.mean
     turn = _turn(float(T[2]))
     J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
@@ -123,10 +125,8 @@ def carried_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
     return CarriedPoint(transformed(T, seen.point), spread)
 
 
-def carried_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
-    """Carry the point back to an earlier node, from which the observer has moved by
-    here_from_node.
-    """
+def carry_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
+    """Carry the point on to a later node, to which the observer moves by here_from_node."""
     T = inverse(here_from_node.mean)
     point = transformed(T, seen.point)
     turn = _turn(float(T[2]))

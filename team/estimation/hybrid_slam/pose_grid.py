@@ -20,8 +20,8 @@ from teamslam.team.config import GNSS, FrontEnd, Gnss, MotionModel, Sensor
 from teamslam.team.estimation.inter_robot import (
     BASE,
     CarriedPoint,
-    carried_back,
-    carried_on,
+    carry_back,
+    carry_on,
     from_station,
     of_base,
     point_seen,
@@ -164,11 +164,11 @@ class PoseGrid:
                 odometry.mark_sighting()
             else:
                 since_node = Increment(*odometry.since_node())
-                self._keep(look, carried_back(look.seen, since_node))
+                self._keep(look, carry_back(look.seen, since_node))
             self._find_next()
             return False
         for look, since in zip(self._ahead, odometry.reach_node(), strict=True):
-            self._keep(look, carried_on(look.seen, Increment(*since)))
+            self._keep(look, carry_on(look.seen, Increment(*since)))
         self._ahead = []
         self._node_ns += self._grid_ns
         self._find_next()
@@ -178,7 +178,7 @@ class PoseGrid:
         """Place the antenna, at the time of a delayed fix, in the robot's frame at its stamp."""
         lasting_ns = abs(self._delay_ns)
         moved = over.gone_on(over.end_ns, lasting_ns).part(self._motion, lasting_ns, 0)
-        carry = carried_on if self._delay_ns > 0 else carried_back
+        carry = carry_on if self._delay_ns > 0 else carry_back
         return carry(self._antenna, moved)
 
     def sightings(self) -> tuple[NodeSighting, ...]:

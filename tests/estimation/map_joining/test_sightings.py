@@ -12,8 +12,8 @@ from teamslam.team.core import linearise_sighting
 from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.inter_robot import (
     CarriedPoint,
-    carried_back,
-    carried_on,
+    carry_back,
+    carry_on,
     point_seen,
     reduced,
 )
@@ -222,7 +222,7 @@ def test_a_carried_point_has_the_mean_and_covariance_of_samples(back):
     rng = np.random.default_rng(1)
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.02, marker_sigma=0.03)
     seen = point_seen(sensor, 2.5, 0.8, 0.04)
-    carried = (carried_back if back else carried_on)(seen, MOTION)
+    carried = (carry_back if back else carry_on)(seen, MOTION)
     samples = []
     for _ in range(20_000):
         xi = np.sqrt(np.diag(MOTION.covariance)) * rng.normal(size=3)
