@@ -51,6 +51,7 @@ def samples() -> dict[str, Any]:
                 T[isaac](family="36h11", id=7, center=point, corners=[point] * 4, pose=stamped)
             ],
         ),
+        "sensor_msgs/msg/NavSatFix": ros.fix(AT, "gps", (48.745, 9.105), (1.0, 0.2, 2.0)),
         "aruco_opencv_msgs/msg/ArucoDetection": T["aruco_opencv_msgs/msg/ArucoDetection"](
             header=head,
             markers=[T["aruco_opencv_msgs/msg/MarkerPose"](marker_id=7, pose=posed)],
@@ -95,6 +96,9 @@ def test_each_type_is_decoded(kind):
             (tag,) = record.tags
             assert (tag.name, tag.position, record.frame) == ("7", (1.0, 2.0, 3.0), "camera")
             assert tag.covariance in (None, (1, 0, 0, 0, 2, 0, 0, 0, 3))
+        case d.FixRecord():
+            assert (record.degrees, record.covariance) == ((48.745, 9.105), (1.0, 0.2, 2.0))
+            assert record.frame == "gps"
     assert getattr(record, "stamp_ns", AT) == AT
 
 

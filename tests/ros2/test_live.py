@@ -38,6 +38,7 @@ class Robot:
     """Takes what a driver would, and refuses time that goes back, as it does."""
 
     sensor_mount: tuple[float, float, float] | None = None
+    antenna: tuple[float, float] | None = None
 
     def __init__(self) -> None:
         self.calls: list[tuple[Any, ...]] = []
@@ -56,6 +57,9 @@ class Robot:
 
     def sight(self, t: Decimal, teammates: Any, ranges: Any, bearings: Any) -> None:
         self.calls.append(("sight", t, list(teammates), ranges.tolist(), bearings.tolist()))
+
+    def fix(self, t: Decimal, x: float, y: float, covariance: Any) -> None:
+        self.calls.append(("fix", t, x, y, covariance))
 
 
 def odometry(k: int) -> bytes:
