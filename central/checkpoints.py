@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compacted
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compact_fold
 
 NEWEST = 4
 """Number of newest ticks whose checkpoints are all kept; of older ones as many per doubling of
@@ -79,8 +79,8 @@ class Checkpoints:
 
 
 def _compacted(checkpoint: Checkpoint) -> Checkpoint:
-    ahead = None if checkpoint.ahead is None else compacted(checkpoint.ahead)
-    return replace(checkpoint, fold=compacted(checkpoint.fold), ahead=ahead)
+    ahead = None if checkpoint.ahead is None else compact_fold(checkpoint.ahead)
+    return replace(checkpoint, fold=compact_fold(checkpoint.fold), ahead=ahead)
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:

@@ -30,7 +30,7 @@ from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.minima import RIVAL
-from teamslam.team.estimation.map_joining.refusal import refusals
+from teamslam.team.estimation.map_joining.refusal import describe_refusals
 from teamslam.team.estimation.map_joining.repetition import Repetition, find_repetitions
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
@@ -187,7 +187,7 @@ def reasons(
     """List why robots and landmarks are not in the map, and warnings about it."""
     return (
         *_apart(fold),
-        *_worded(refusals(fold)),
+        *_worded(describe_refusals(fold)),
         *(words for words in fold.warnings if not words.startswith(RIVAL)),
         *survey_warnings(fold),
         *fix_warnings(fold),

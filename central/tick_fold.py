@@ -51,7 +51,7 @@ from teamslam.team.estimation.map_joining.joining import (
     Fold,
     InitialPoseFactor,
     JoinSettings,
-    converged,
+    solve_fold,
 )
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
@@ -324,7 +324,7 @@ class TickFold:
 
     def _agreement_at_rest(self, fold: Fold) -> Agreement:
         """Return the agreement of a raw fold's full solution, or of a condensed fold as it is."""
-        at_rest = fold if fold.condensed_count else converged(fold, self.settings)
+        at_rest = fold if fold.condensed_count else solve_fold(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
@@ -420,7 +420,7 @@ class TickFold:
             fold = self._fold_raw()
             if not fold.contributions:
                 return fold
-            fold = converged(fold, self.settings)
+            fold = solve_fold(fold, self.settings)
             if not self._convict(fold, math.inf) and not self.suspended:
                 return fold
 

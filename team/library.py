@@ -214,12 +214,12 @@ def join(
     fold = joining.EMPTY_FOLD
     for robot, initial in sorted(initial_poses.items()):
         start = InitialPoseFactor(robot, _INCARNATION, initial.pose, initial.covariance)
-        fold = joining.started(fold, start)
+        fold = joining.add_start(fold, start)
     sigmas = msgspec.structs.asdict(BiasSigmas())
     chosen = settings or JoinSettings(bias_sigma={bias: sigmas[bias] for bias in BIASES})
     for tick in _ticks(submaps):
-        fold = joining.folded(fold, tick, chosen)
-    fold = joining.converged(fold, chosen)
+        fold = joining.fold_submaps(fold, tick, chosen)
+    fold = joining.solve_fold(fold, chosen)
     cost = marginals.joint_cost(fold)
     inside = {robot for robot, _ in fold.main.graph.streams}
     return JoinedMap(

@@ -30,11 +30,11 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     JoinSettings,
     ages,
     joint_marginal,
-    settled,
+    solve_island,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, extended
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, add_submaps
 from teamslam.team.shapes import Float
 
 LEAST_LANDMARKS = 3
@@ -140,7 +140,7 @@ def landmark_sigma(
         key = fold.main_key
         if key is None:
             continue
-        island, _, _ = settled(replace(fold.main, settings=settings))
+        island, _, _ = solve_island(replace(fold.main, settings=settings))
         ids = [id_ for id_ in sorted(island.graph.landmarks) if id_ in truth]
         if len(ids) >= LEAST_LANDMARKS:
             nodes = [island.graph.landmarks[id_] for id_ in ids]
@@ -183,7 +183,7 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
         key = fold.main_key
         if key is None:
             continue
-        island, _, _ = settled(replace(fold.main, settings=settings))
+        island, _, _ = solve_island(replace(fold.main, settings=settings))
         solved = replace(fold, islands={**fold.islands, key: island})
         submaps = joint_cost(solved).submaps
         chi2, dof = np.array([(each.chi2, each.dof) for each in submaps]).reshape(-1, 2).T
@@ -229,7 +229,7 @@ def _apart(
         ]
         for each in submaps
     }
-    graph, state = extended(
+    graph, state = add_submaps(
         EMPTY_GRAPH,
         np.zeros(0),
         [each.contribution for each in submaps],
@@ -244,7 +244,7 @@ def _apart(
         for node, there in zip(own.nodes[:known], of_team.nodes[:known], strict=True):
             first, last = island.graph.offset[there : there + 2]
             state[graph.offset[node] : graph.offset[node + 1]] = island.state[first:last]
-    solved, _, _ = settled(Island(graph, state, ages(len(submaps)), ages(0), settings))
+    solved, _, _ = solve_island(Island(graph, state, ages(len(submaps)), ages(0), settings))
     return graph, solved
 
 

@@ -25,9 +25,9 @@ from teamslam.team.estimation.map_joining.joining import (
     Fold,
     InitialPoseFactor,
     Tick,
-    converged,
-    folded,
-    started,
+    add_start,
+    fold_submaps,
+    solve_fold,
 )
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float, Int64
@@ -105,7 +105,7 @@ def fold_of(
     """Solved fold of these submaps, with unnamed landmarks associated."""
     fold: Fold = EMPTY_FOLD
     for start in starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     tick_ns = round(central.tick_s * 1e9)
     ticks: dict[int, list[Contribution]] = {}
     for contribution in sorted(contributions, key=lambda c: c.key):
@@ -116,8 +116,8 @@ def fold_of(
         if unnamed:
             fold = fold_tick(fold, Tick(ticks[tick]), settings)
         else:
-            fold = folded(fold, ticks[tick], settings)
-    return converged(fold, settings)
+            fold = fold_submaps(fold, ticks[tick], settings)
+    return solve_fold(fold, settings)
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:

@@ -10,7 +10,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.core import WholeMap, check_packed_covariance
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior
-from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
+from teamslam.team.estimation.map_joining.whole_map import initial_map, join_submap
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
@@ -52,8 +52,8 @@ def with_prior(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) 
     """
     whole = prior.whole
     for each in pending:
-        whole = joined(whole, each)
-    fed = joined(_express_in_its_pose(whole, local.ids), local)
+        whole = join_submap(whole, each)
+    fed = join_submap(_express_in_its_pose(whole, local.ids), local)
     return LocalMap(fed.ids, fed.mean, fed.covariance)
 
 

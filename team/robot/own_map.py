@@ -19,9 +19,9 @@ from teamslam.team.estimation.gaussian import (
     PoseGaussian,
 )
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.map_joining.conditioning import pose_now
+from teamslam.team.estimation.map_joining.conditioning import compose_pose
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.map_joining.whole_map import initial_map, joined
+from teamslam.team.estimation.map_joining.whole_map import initial_map, join_submap
 from teamslam.team.estimation.plausibility import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float
@@ -71,19 +71,19 @@ class OwnMap:
         self.origin, _ = self.whole.pose()
         named = local.named
         try:
-            after = joined(self.whole, named)
+            after = join_submap(self.whole, named)
         except NotACovarianceError:
             after = None
         if after is None or not are_landmarks(after.covariance[3:, 3:]):
-            after = joined(self.whole, named.motion)
+            after = join_submap(self.whole, named.motion)
         self.whole = after
 
     def pose(self, window: LocalMap | None) -> PoseGaussian:
         """The pose after the open window, or after its motion alone if it contradicts the map."""
         try:
-            return pose_now(self.whole, window).pose
+            return compose_pose(self.whole, window).pose
         except UNSOLVABLE:
-            return pose_now(self.whole, None if window is None else window.motion).pose
+            return compose_pose(self.whole, None if window is None else window.motion).pose
 
     @property
     def landmarks(self) -> LandmarkGaussian:

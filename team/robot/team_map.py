@@ -11,12 +11,12 @@ from teamslam.team.estimation.map_joining.conditioning import (
     Posed,
     RobotPrior,
     SubmapCorrection,
-    followed,
+    compose_pose,
     is_majority,
-    pose_now,
+    join_pending,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.map_joining.localising import localised
+from teamslam.team.estimation.map_joining.localising import locate_robot
 from teamslam.team.estimation.map_joining.whole_map import initial_map
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.own_map import OwnMap
@@ -57,7 +57,7 @@ class TeamMap:
         """
         given = self.join(prior, submaps)
         open_window = None if window is None else self._shared.taken(window.named)
-        posed = pose_now(given.whole, open_window)
+        posed = compose_pose(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._warning(given)
@@ -69,7 +69,7 @@ class TeamMap:
         """
         given, self.doubt = self.decode(prior), ""
         team = LandmarkGaussian(given.ids, given.means, given.covariance[3:, 3:])
-        posed = localised(team, own.whole, window)
+        posed = locate_robot(team, own.whole, window)
         if isinstance(posed, str):
             return None
         self.known, self.refused = posed.known, posed.refused
@@ -111,9 +111,9 @@ class TeamMap:
             self._submaps = len(submaps)
             try:
                 while len(self._pending) >= 2 * CONDENSED:
-                    self._whole = followed(self._whole, self._pending[:CONDENSED]).whole
+                    self._whole = join_pending(self._whole, self._pending[:CONDENSED]).whole
                     del self._pending[:CONDENSED]
-                self._followed = followed(self._whole, self._pending)
+                self._followed = join_pending(self._whole, self._pending)
             except UNSOLVABLE as error:
                 self._followed = error
         if isinstance(self._followed, Exception):

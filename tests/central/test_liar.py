@@ -19,7 +19,7 @@ from teamslam.sim.world.simulator import simulated
 from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.estimation.gaussian import deviation
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
 from teamslam.team.estimation.plausibility import with_least_spread
@@ -138,7 +138,7 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
     assert [each.robot for each in messages(samples, m.Withdrawal)] == [liar]
     never = of_set(samples, without=liar)
     never.fold_until(math.inf)
-    found = landmark_map(converged(never.fold, never.settings))
+    found = landmark_map(solve_fold(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
     errors = online_errors(samples, liar)
@@ -225,7 +225,7 @@ def test_one_wrong_submap_costs_no_robot(until_s: float):
     assert ticks.withdrawn == ()
     true = of_set(samples)
     true.fold_until(until_s * 1e9)
-    found, expected = (landmark_map(converged(x.fold, x.settings)) for x in (ticks, true))
+    found, expected = (landmark_map(solve_fold(x.fold, x.settings)) for x in (ticks, true))
     assert np.abs(found.means - expected.means).max() < 0.3
 
 

@@ -8,7 +8,7 @@ import pytest
 from teamslam.central.monitor import finding
 from teamslam.team.estimation.consistency import covariance_scale
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.joining import JoinSettings, converged
+from teamslam.team.estimation.map_joining.joining import JoinSettings, solve_fold
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 
@@ -21,7 +21,7 @@ def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
     world = team(seed, robots=3, submaps=30, landmarks=8)
     submaps = [claim(s) if claim else s for s in world.submaps]
     fold = joined_with(submaps, world.starts, (), settings, len(submaps))
-    solved = converged(fold, settings)
+    solved = solve_fold(fold, settings)
     agreement = marginals.joint_cost(solved)
     if final:
         agreement = marginals.with_unbounded_costs(agreement, solved)

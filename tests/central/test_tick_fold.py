@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import TickFold
 from teamslam.team import translate
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, add_start, fold_submaps
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
 from tests.teams import Submaps, stream
@@ -142,12 +142,12 @@ def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
         (translate.contribution_of(x) for x in SUBMAPS.every()), key=lambda c: c.key
     )
     for name, y in (("r1", 0.0), ("r2", 1.0)):
-        fold_by_hand = started(
+        fold_by_hand = add_start(
             fold_by_hand, translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None)
         )
     for tick in range(4):
         part = [c for c in contributions if (c.end_ns - 1) // 4_000_000_000 == tick]
-        fold_by_hand = folded(fold_by_hand, part, fresh().settings)
+        fold_by_hand = fold_submaps(fold_by_hand, part, fresh().settings)
     assert bits(fold_by_hand) == expected()
 
 

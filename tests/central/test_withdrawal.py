@@ -23,7 +23,7 @@ from teamslam.sim.world.config import OutlierKind, SimulatedWorld
 from teamslam.sim.world.simulator import simulated
 from teamslam.team import translate
 from teamslam.team.config import CALIBRATED, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import (
     Agreement,
     SubmapCost,
@@ -115,7 +115,7 @@ def of_set(
 
 def bits(ticks: TickFold) -> bytes:
     ticks.fold_until(math.inf)
-    fold = converged(ticks.fold, ticks.settings)
+    fold = solve_fold(ticks.fold, ticks.settings)
     found = landmark_map(fold)
     return b"".join(x.tobytes() for x in (fold.main.state, *found))
 
@@ -189,7 +189,7 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong):
     assert (said.robot, said.by) == ("r3", "central")
     never = of_set(samples, without="r3")
     never.fold_until(math.inf)
-    found = landmark_map(converged(never.fold, never.settings))
+    found = landmark_map(solve_fold(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
 
@@ -321,7 +321,7 @@ def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(kind
     assert final_map(list(samples)).withdrawn == ()
     ticks = of_set(samples, central=of.central)
     ticks.fold_until(math.inf)
-    found = disagreement(joint_cost(converged(ticks.fold, ticks.settings)))
+    found = disagreement(joint_cost(solve_fold(ticks.fold, ticks.settings)))
     assert set(found) == {"r1", "r2", "r3"}, "each has submaps enough to be judged"
     assert max(found.values()) < 2.0
 

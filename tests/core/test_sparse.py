@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from teamslam.team.core import Cholesky, NotPositiveDefiniteError, Pattern, minimum_degree
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, add_start, fold_submaps
 from tests.estimation.submap_world import team
 
 BIG_ROWS, BLOCK = 256, 48
@@ -354,7 +354,7 @@ def test_a_hundred_landmarks_have_no_big_panel():
     world = team(0, robots=10, submaps=30, landmarks=100, size=60.0, reach=20.0)
     fold = EMPTY_FOLD
     for start in world.starts:
-        fold = started(fold, start)
-    fold = folded(fold, world.submaps, JoinSettings(iterations_per_tick=1))
+        fold = add_start(fold, start)
+    fold = fold_submaps(fold, world.submaps, JoinSettings(iterations_per_tick=1))
     assert len(fold.main.graph.landmarks) == 100
     assert not fold.main.graph.pattern.has_big_panel

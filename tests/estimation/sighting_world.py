@@ -6,7 +6,7 @@ import numpy as np
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded, started
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, add_start, fold_submaps
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import correlated, drawn, local_truth, seen_from, wrap
 
@@ -80,12 +80,12 @@ def joined_with(submaps, starts, sightings, options, tick=4):
     """The fold over the submaps, `tick` at a time, with the sightings from the tick's submaps."""
     fold = EMPTY_FOLD
     for start in starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     for begin in range(0, len(submaps), tick):
         taken = submaps[begin : begin + tick]
         names = {(each.robot, each.sequence) for each in taken}
         seen = [each for each in sightings if (each.robot, each.sequence) in names]
-        fold = folded(fold, taken, options, seen)
+        fold = fold_submaps(fold, taken, options, seen)
     return fold
 
 

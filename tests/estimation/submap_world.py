@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
-from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.map_joining.gauss_newton import solve_island
 from teamslam.team.estimation.submap import LocalMap
 
 
@@ -58,7 +58,7 @@ def drawn(truth, covariance, rng):
 
 def solved(fold, settings):
     """The fold with the full solution of its main island; other minima are not searched for."""
-    island, _, _ = settled(replace(fold.main, settings=settings))
+    island, _, _ = solve_island(replace(fold.main, settings=settings))
     return replace(fold, islands={**fold.islands, fold.main_key: island})
 
 

@@ -7,7 +7,7 @@ import pytest
 from teamslam.team import translate
 from teamslam.team.config import Bounds
 from teamslam.team.estimation.gaussian import PoseGaussian, curved
-from teamslam.team.estimation.map_joining.conditioning import followed
+from teamslam.team.estimation.map_joining.conditioning import join_pending
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.team_map import CONDENSED, TeamMap
@@ -47,12 +47,12 @@ def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch):
         prior(0), ids=from_ids(first.ids), mean=from_floats(first.mean),
         covariance=packed(first.covariance),
     )  # fmt: skip
-    whole = followed(translate.prior_of(told).whole, submaps[1:]).whole
+    whole = join_pending(translate.prior_of(told).whole, submaps[1:]).whole
     solved_at_once: list[int] = []
 
     def counted(whole, pending):
         solved_at_once.append(len(pending))
-        return followed(whole, pending)
+        return join_pending(whole, pending)
 
     monkeypatch.setattr("teamslam.team.robot.team_map.followed", counted)
     often, seldom = TeamMap(), TeamMap()
@@ -81,7 +81,7 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already():
     alone = translate.prior_of(told).whole
     for known in (3, 4, 5):
         assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
-    expected = followed(alone, LOCALS[5:]).whole
+    expected = join_pending(alone, LOCALS[5:]).whole
     assert kept.join(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
 
 

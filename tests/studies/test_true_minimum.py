@@ -15,9 +15,9 @@ from teamslam.sim.studies.experiments.plain_cost import PlainCost
 from teamslam.sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
 from teamslam.team.config import FrontEnd
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost
-from teamslam.team.estimation.map_joining.minima import minimum, searched
+from teamslam.team.estimation.map_joining.minima import search_minima, solve_minimum
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import Team, team
 from tests.studies.test_experiment_runs import short
@@ -29,7 +29,7 @@ def world(
     seed: int, submaps: int = 8, **more: Any
 ) -> tuple[Team, Island, dict[int, np.ndarray], dict[str, Path]]:
     made = team(seed, submaps=submaps, **more)
-    island = minimum(joined_with(made.submaps, made.starts, (), OPTIONS, 1000).main).island
+    island = solve_minimum(joined_with(made.submaps, made.starts, (), OPTIONS, 1000).main).island
     stamps = 1000 * np.arange(1, submaps + 1)
     paths = {robot: Path(stamps, poses) for robot, poses in made.paths.items()}
     return made, island, dict(enumerate(made.landmarks)), paths
@@ -52,12 +52,12 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum():
     sparse = {"size": 60.0, "reach": 15.0, "sigmas": (0.3, 0.15, 1.0)}
     for seed in range(8):
         _, solved, landmarks, paths = world(seed, submaps=20, robots=1, landmarks=3, **sparse)
-        island = searched([solved]).best.island
+        island = search_minima([solved]).best.island
         free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
         anywhere = np.random.default_rng(seed).uniform(-30.0, 30.0, len(free))
-        lost = minimum(replace(island, state=np.where(free, anywhere, island.state)))
+        lost = solve_minimum(replace(island, state=np.where(free, anywhere, island.state)))
         found = judged(lost.island, landmarks, paths)
-        assert found.wrong == (lost.cost > minimum(island).cost + 1.0)
+        assert found.wrong == (lost.cost > solve_minimum(island).cost + 1.0)
         wrong += found.wrong
     assert wrong >= 2, "the state anywhere is often lost"
 
@@ -72,8 +72,8 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
         for robot, (x, y, a) in {"r0": (0.0, 0.0, 0.0), "r1": (0.0, 3.0, 0.2)}.items()
     }
     paths = {robot: Path(stamps, way) for robot, way in poses.items()}
-    assert not judged(minimum(island).island, {}, paths).wrong
-    found = judged(minimum(across).island, {}, paths)
+    assert not judged(solve_minimum(island).island, {}, paths).wrong
+    found = judged(solve_minimum(across).island, {}, paths)
     assert found.other_minimum
     assert (found.lower > 1.0) == lower
 
@@ -98,7 +98,7 @@ def test_a_run_is_asked_for_its_own_final_map(biases):
     scenario = msgspec.structs.replace(scenario, robots=robots)
     samples = list(run_team(scenario, streams_of(scenario)))
     fold, published = final_fold(samples), final_map(samples).chi2
-    robust = converged(fold, replace(fold.main.settings, robust=True))
+    robust = solve_fold(fold, replace(fold.main.settings, robust=True))
     rel = 0.05 if biases else 1e-6
     assert joint_cost(robust).chi2 == pytest.approx(published, rel=rel)
     assert fold.main.cost > (1.0 - 1e-6) * published, "plain squares bound the robust loss"

@@ -21,7 +21,7 @@ from teamslam.team.estimation.association.verification import Closure
 from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, folded
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, fold_submaps
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 
@@ -54,7 +54,7 @@ def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[
         contribution(rows, robot, sigma, classes)
         for robot, rows in zip(ROBOTS, objects, strict=True)
     ]
-    fold = folded(EMPTY_FOLD, maps, settings)
+    fold = fold_submaps(EMPTY_FOLD, maps, settings)
     views = [view_island(fold.islands[each.stream], fold.landmarks) for each in maps]
     found = {}
     for one in ROBOTS:

@@ -21,7 +21,7 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.true_minimum import final_fold
-from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.map_joining.gauss_newton import solve_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost
 
@@ -46,7 +46,7 @@ def found_at(fold: Fold, claimed: float, normal: float) -> Finding:
     settings = replace(
         fold.main.settings, covariance_factor=claimed * fold.main.settings.covariance_factor
     )
-    island, _, _ = settled(replace(fold.main, settings=settings))
+    island, _, _ = solve_island(replace(fold.main, settings=settings))
     return finding(joint_cost(replace(fold, islands={**fold.islands, key: island})), normal)
 
 

@@ -70,7 +70,7 @@ def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") 
     """No submaps; start poses are exact."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
-        fold = joining.started(fold, InitialPoseFactor(robot, 0, pose))
+        fold = joining.add_start(fold, InitialPoseFactor(robot, 0, pose))
     return SubmapJoining(fold, weighting)
 
 
@@ -79,12 +79,12 @@ def filter_step(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoin
     count = len(state.fold.contributions)
     sequence = state.fold.next_sequence((robot, 0))
     taken = Contribution(robot, 0, sequence, count, weighted(local, state.weighting))
-    return replace(state, fold=joining.folded(state.fold, [taken], SETTINGS))
+    return replace(state, fold=joining.fold_submaps(state.fold, [taken], SETTINGS))
 
 
 def solved(state: SubmapJoining) -> SubmapJoining:
     """The full least-squares solution."""
-    return replace(state, fold=joining.converged(state.fold, SETTINGS))
+    return replace(state, fold=joining.solve_fold(state.fold, SETTINGS))
 
 
 def variance_factor(state: SubmapJoining) -> float:

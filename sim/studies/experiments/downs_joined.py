@@ -204,7 +204,9 @@ def _join(robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]
         for k, s in enumerate(submaps)
     ]
     return svd_joining.solved(
-        replace(initial_state, fold=joining.folded(initial_state.fold, contributions, SETTINGS))
+        replace(
+            initial_state, fold=joining.fold_submaps(initial_state.fold, contributions, SETTINGS)
+        )
     )
 
 

@@ -23,7 +23,7 @@ from teamslam.sim.studies.experiments.plain_cost import PlainCost
 from teamslam.team import translate
 from teamslam.team.estimation.consistency import chi2_quantile
 from teamslam.team.estimation.map_joining.gauss_newton import Island
-from teamslam.team.estimation.map_joining.joining import Fold, converged
+from teamslam.team.estimation.map_joining.joining import Fold, solve_fold
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
@@ -90,7 +90,7 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
             unbiased = msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
             ticks.add_submap(unbiased, b"", sightings.get((*stream, sequence), ()))
     ticks.fold_until(float("inf"))
-    return converged(ticks.fold, replace(ticks.settings, robust=False))
+    return solve_fold(ticks.fold, replace(ticks.settings, robust=False))
 
 
 def judged(

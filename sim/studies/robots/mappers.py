@@ -22,7 +22,7 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
-from teamslam.team.estimation.map_joining.whole_map import absorbed
+from teamslam.team.estimation.map_joining.whole_map import absorb_fused_map
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import NEEDS_MAP
@@ -80,7 +80,7 @@ class ExchangingMapper(Mapper):
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the own map's landmarks by the fused ones."""
-        self.own_map.whole = absorbed(self.own_map.whole, *landmarks)
+        self.own_map.whole = absorb_fused_map(self.own_map.whole, *landmarks)
 
 
 class StreamMapper(ExchangingMapper):

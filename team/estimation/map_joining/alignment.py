@@ -55,7 +55,7 @@ def procrustes(
     return np.array([mean_a[0] - x, mean_a[1] - y, turn])
 
 
-def aligned(
+def align(
     in_a: Float[np.ndarray, "n 2"],
     covariance_a: Float[np.ndarray, "m m"],
     in_b: Float[np.ndarray, "n 2"],
@@ -78,7 +78,7 @@ def aligned(
         return _at_one_place(of_a - of_b, n)
     about = procrustes(near_a, near_b, 1.0 / variances.reshape(n, 2).sum(axis=1))
     for _ in range(ITERATIONS):
-        residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
+        residual, metric, jacobian = _linearise(about, near_a, covariance_a, near_b, covariance_b)
         spread = information(
             dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment"
         )
@@ -86,7 +86,7 @@ def aligned(
             spread, dense.product(jacobian.T, dense.product(metric, residual))
         )
         about[2] = wrapped(about[2])
-    residual, metric, jacobian = _linearised(about, near_a, covariance_a, near_b, covariance_b)
+    residual, metric, jacobian = _linearise(about, near_a, covariance_a, near_b, covariance_b)
     spread = information(dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment")
     chi2 = float(dense.product(dense.product(residual, metric), residual))
     difference = information(metric, "the metric of an alignment")
@@ -105,7 +105,7 @@ def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
     return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
 
 
-def at_heading(
+def fit_at_heading(
     in_a: Float[np.ndarray, "n 2"],
     covariance_a: Float[np.ndarray, "m m"],
     in_b: Float[np.ndarray, "n 2"],
@@ -114,7 +114,7 @@ def at_heading(
 ) -> tuple[Float[np.ndarray, "2"], float]:
     """Fit the translation [m] of a_from_b at a given heading; return it with its χ²."""
     pose = np.array([0.0, 0.0, heading])
-    residual, metric, jacobian = _linearised(pose, in_a, covariance_a, in_b, covariance_b)
+    residual, metric, jacobian = _linearise(pose, in_a, covariance_a, in_b, covariance_b)
     J = jacobian[:, :2]
     shift = dense.solve(
         dense.product(dense.product(J.T, metric), J),
@@ -138,7 +138,7 @@ def _shape_heading_sigma(
     return deviation(variance / extent)
 
 
-def _linearised(
+def _linearise(
     a_from_b: Float[np.ndarray, "3"],
     in_a: Float[np.ndarray, "n 2"],
     covariance_a: Float[np.ndarray, "m m"],

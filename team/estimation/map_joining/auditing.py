@@ -19,7 +19,7 @@ from teamslam.team.estimation.association.verification import overlap_share
 from teamslam.team.estimation.map_joining.continuity import Seam, find_seam
 from teamslam.team.estimation.map_joining.cutting import cut_tick
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
-from teamslam.team.estimation.map_joining.joining import Audit, Fold, Tick, compacted
+from teamslam.team.estimation.map_joining.joining import Audit, Fold, Tick, compact_fold
 from teamslam.team.estimation.map_joining.refusal import add_members
 
 
@@ -60,7 +60,7 @@ def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings)
         for audit in fold.audits
         if len(audit.ticks) < length
     ]
-    before = compacted(fold)
+    before = compact_fold(fold)
     open_ += [Audit(opened, before, (tick,)) for opened in after.landmarks.opened]
     for audit in open_:
         share = share_now(after, audit.opened)

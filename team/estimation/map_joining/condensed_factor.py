@@ -85,7 +85,7 @@ class Departed(NamedTuple):
     paths: Mapping[Stream, EliminatedPath]
 
 
-def newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
+def select_newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
     """Select the costs of the last HISTORY submaps of each stream, in order."""
     counts = Counter(stream for stream, *_ in submaps)
     older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
@@ -136,7 +136,7 @@ class Resting:
         return {id_: k for k, id_ in enumerate(self.ids.tolist())}
 
 
-def nobody_rests(numbers: int) -> Resting:
+def make_empty_rest(numbers: int) -> Resting:
     """Make an empty `Resting` beside a condensed factor with this many numbers."""
     none = np.zeros(0)
     return Resting(none.astype(np.int64), none, np.zeros((0, numbers)), np.zeros((0, 0)))
@@ -190,7 +190,7 @@ def places(offset: Indices, nodes: Indices) -> Indices:
     return found
 
 
-def tied_nodes(
+def tie_nodes(
     old: Condensed, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]
 ) -> Condensed:
     """Merge landmarks of the factor into one node, exactly: the same cost where they are equal.

@@ -23,8 +23,8 @@ from teamslam.team.estimation.map_joining.condensed_factor import (
     Condensed,
     Departed,
     EliminatedPath,
-    newest,
     places,
+    select_newest,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, UNSOLVABLE, Island
 from teamslam.team.estimation.map_joining.joining import Fold
@@ -32,12 +32,12 @@ from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, term
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
 from teamslam.team.estimation.map_joining.path_elimination import (
     MarkedFactors,
+    eliminate_paths,
     nodes_of,
     quadratic,
-    without_paths,
 )
-from teamslam.team.estimation.map_joining.resting import FIRST, beside, idle, split
-from teamslam.team.estimation.map_joining.submap_graph import Graph, without_nodes
+from teamslam.team.estimation.map_joining.resting import FIRST, eliminate, find_idle, put_to_rest
+from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
 from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
@@ -79,20 +79,22 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
         lag = max(lag, island.settings.association.recent)
         if fold.size <= len(island.graph.landmarks):
             return fold
-    leaving = _leaving(island, lag)
+    leaving = _mark_leaving(island, lag)
     if not leaving.any():
         return fold
     others = (each for at, each in fold.islands.items() if at != key)
     apart = {id_ for each in others for id_ in each.graph.landmarks}
     memory, given_up = NOTHING, np.zeros(0, np.int64)
     if unnamed:
-        memory, given_up = _memory(island.graph, leaving, fold)
+        memory, given_up = _extend_memory(island.graph, leaving, fold)
     try:
-        smaller = _condensed(island, leaving, apart, ALL_AWAKE if unnamed else first, given_up)
+        smaller = _condense_island(
+            island, leaving, apart, ALL_AWAKE if unnamed else first, given_up
+        )
     except UNSOLVABLE:
         return fold
     if unnamed:
-        smaller = _remembering(smaller, memory, island.graph, forgets=not fold.audits)
+        smaller = _attach_memory(smaller, memory, island.graph, forgets=not fold.audits)
     gone = smaller.graph.gone
     left = island.graph.landmarks.keys() - smaller.graph.landmarks.keys()
     return replace(
@@ -106,7 +108,9 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     )
 
 
-def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[Memory, Indices]:
+def _extend_memory(
+    graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold
+) -> tuple[Memory, Indices]:
     """Extend the graph's memory by the condensed submaps; return also the dropped landmarks: none
     during the audit of a closure, and none that an operator has judged.
     """
@@ -130,7 +134,7 @@ def _memory(graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold) -> tuple[
     return memory, memory.given_up(counts, stays, MOST)
 
 
-def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
+def _attach_memory(smaller: Island, memory: Memory, before: Graph, *, forgets: bool) -> Island:
     graph = smaller.graph
     node_of = np.full(len(before.fixed), -1, np.int64)
     for id_, node in before.landmarks.items():
@@ -141,7 +145,7 @@ def _remembering(smaller: Island, memory: Memory, before: Graph, *, forgets: boo
     return replace(smaller, graph=replace(graph, memory=memory))
 
 
-def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
+def _mark_leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
     graph = island.graph
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
@@ -157,7 +161,7 @@ def _leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
     return leaving
 
 
-def _condensed(
+def _condense_island(
     island: Island,
     leaving: Bool[np.ndarray, " F"],
     apart: Collection[int],
@@ -165,8 +169,8 @@ def _condensed(
     given_up: Indices,
 ) -> Island:
     graph, before = island.graph, island.graph.condensed
-    rests = idle(graph, ~leaving, apart, first)
-    eliminated = _eliminated(graph, leaving)
+    rests = find_idle(graph, ~leaving, apart, first)
+    eliminated = _mark_eliminated(graph, leaving)
     eliminated[rests] = eliminated[given_up] = True
     seen = np.array(
         [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
@@ -178,11 +182,11 @@ def _condensed(
     sizes = np.diff(graph.offset)
     unknowns = int(sizes[union[eliminated[union]]].sum())
     if before is None:
-        union, H, g, cost = without_paths(island, union, factors, eliminated)
+        union, H, g, cost = eliminate_paths(island, union, factors, eliminated)
     else:
         H, g, cost = quadratic(island, union, factors)
-    parts = split(H, g, np.repeat(eliminated[union], sizes[union]))
-    left, node_of = without_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
+    parts = eliminate(H, g, np.repeat(eliminated[union], sizes[union]))
+    left, node_of = remove_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
     remaining = union[~eliminated[union]]
     numbers = places(graph.offset, remaining)
     measured = int(graph.dimensions[leaving].sum()) + 2 * int(seen.sum())
@@ -196,8 +200,8 @@ def _condensed(
         cost=cost - parts.lowered,
         submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
         redundancy=measured - unknowns + (0 if before is None else before.redundancy),
-        departed=_departed(island, leaving, seen, prior, given_up),
-        resting=beside(island, union, parts, rests),
+        departed=_sum_departed(island, leaving, seen, prior, given_up),
+        resting=put_to_rest(island, union, parts, rests),
     )
     stays = np.repeat(~eliminated, np.diff(graph.offset))
     return Island(
@@ -209,7 +213,7 @@ def _condensed(
     )
 
 
-def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
+def _mark_eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
     """Mark the nodes that no later factor can contain: poses of old submaps but the last one."""
     eliminated = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(leaving):
@@ -219,7 +223,7 @@ def _eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarra
     return eliminated
 
 
-def _departed(
+def _sum_departed(
     island: Island,
     leaving: Bool[np.ndarray, " F"],
     seen: Bool[np.ndarray, " S"],
@@ -239,9 +243,9 @@ def _departed(
             believed[id_] = believed.get(id_, 0) + 1
     for node in given_up.tolist():
         believed.pop(id_of[node], None)
-    submaps = (*before.submaps, *_chosen(now.submaps, leaving))
+    submaps = (*before.submaps, *_select(now.submaps, leaving))
     robots = _sums(before, now, leaving, seen, prior)
-    return Departed(robots, newest(submaps), believed, _paths(island, before, leaving))
+    return Departed(robots, select_newest(submaps), believed, _paths(island, before, leaving))
 
 
 def _paths(
@@ -269,14 +273,14 @@ def _sums(
 ) -> dict[str, tuple[float, float]]:
     robots = dict(before.robots)
     for robot, chi2, dof in (
-        *_chosen(now.counted, leaving),
-        *_chosen(now.priors, prior),
-        *_chosen(now.sightings, seen),
+        *_select(now.counted, leaving),
+        *_select(now.priors, prior),
+        *_select(now.sightings, seen),
     ):
         sums = robots.get(robot, (0.0, 0.0))
         robots[robot] = (sums[0] + chi2, sums[1] + dof)
     return robots
 
 
-def _chosen(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
+def _select(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
     return (items[k] for k in np.flatnonzero(which).tolist())

@@ -28,10 +28,10 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     NotDeterminedError,
     ages,
     joint_marginal,
-    settled,
+    solve_island,
 )
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
-from teamslam.team.estimation.map_joining.whole_map import end_pose, without
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
+from teamslam.team.estimation.map_joining.whole_map import join_end_pose, remove_landmark
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, UInt32
 
@@ -136,7 +136,7 @@ class Posed(NamedTuple):
     refused: int = 0
 
 
-def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
+def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     """Join the submaps that follow the map's pose, in order, by least squares.
 
     If a landmark of a submap lies beyond the gate, the landmarks are discounted one by one as the
@@ -149,24 +149,26 @@ def followed(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     submaps = [each.without_nodes for each in pending]
     if not submaps:
         return Followed(whole)
-    found = _solved(whole, submaps)
+    found = _solve_chain(whole, submaps)
     known, refused = tuple(found.known.tolist()), tuple(0 for _ in submaps)
     if (found.landmark_chi2 > GATE).any():
-        doubted, _, _ = settled(_island(whole, submaps, DOUBTING))
+        doubted, _, _ = solve_island(_make_island(whole, submaps, DOUBTING))
         beyond = _beyond_gate(doubted)
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
-            found = _solved(whole, [_without(*pair) for pair in zip(submaps, beyond, strict=True)])
+            found = _solve_chain(
+                whole, [_remove_landmarks(*pair) for pair in zip(submaps, beyond, strict=True)]
+            )
     joint = found.map
-    disputed = found.cost > _most(found.dof) or any(
+    disputed = found.cost > _largest_cost(found.dof) or any(
         is_majority(*pair) for pair in zip(refused, known, strict=True)
     )
     if disputed:
-        joint = _disputed(whole, submaps)
+        joint = _join_robustly(whole, submaps)
     return Followed(joint, known, refused, found.cost, found.dof, disputed)
 
 
-def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolution:
+def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolution:
     """Solve plain least squares of the map and the submaps, with all landmarks.
 
     Raises NotACovarianceError, NotDeterminedError.
@@ -183,9 +185,9 @@ def _solved(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolution:
     return found
 
 
-def _disputed(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
+def _join_robustly(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
     """Join submaps robustly: one as a whole may be wrong, or the map itself."""
-    island, _, _ = settled(_island(whole, submaps, DISPUTED))
+    island, _, _ = solve_island(_make_island(whole, submaps, DISPUTED))
     graph = island.graph
     ids = sorted(graph.landmarks)
     nodes = [graph.streams[SELF][-1], *(graph.landmarks[id_] for id_ in ids)]
@@ -197,15 +199,15 @@ def is_majority(refused: int, known: int) -> bool:
     return refused >= FEWEST and 2 * refused > known
 
 
-def _most(dof: int) -> float:
+def _largest_cost(dof: int) -> float:
     return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
-def _island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
+def _make_island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
     """Make the island of the map, as a submap that begins at its origin, and the submaps."""
     chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
     taken = [Contribution(*SELF, k, k, each) for k, each in enumerate(chain)]
-    graph, state = extended(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
+    graph, state = add_submaps(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
     return Island(graph, state, ages(len(taken)), ages(0), settings)
 
 
@@ -214,17 +216,17 @@ def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
     return np.split(beyond, island.graph.landmark_start[1:-1])[1:]
 
 
-def _without(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
+def _remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
     for place in np.flatnonzero(beyond)[::-1]:
-        local = without(local, int(place))
+        local = remove_landmark(local, int(place))
     return local
 
 
-def pose_now(whole: WholeMap, open_window: LocalMap | None) -> Posed:
+def compose_pose(whole: WholeMap, open_window: LocalMap | None) -> Posed:
     """Compose a map's pose with the window in progress: N(pose, covariance) of the robot.
 
     Only the marginal of the window's landmarks is taken from the map, which is exact.
     """
     if open_window is None:
         return Posed(PoseGaussian(*whole.pose()))
-    return Posed(*end_pose(whole, open_window, GATE))
+    return Posed(*join_end_pose(whole, open_window, GATE))

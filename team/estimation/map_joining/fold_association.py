@@ -31,14 +31,14 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     is_solvable,
-    iterated,
+    iterate_tick,
     joint_marginal,
-    settled,
+    solve_island,
 )
-from teamslam.team.estimation.map_joining.joining import Fold, merged_islands, precedence
-from teamslam.team.estimation.map_joining.merging import Merge, placed
-from teamslam.team.estimation.map_joining.minima import minimum
-from teamslam.team.estimation.map_joining.submap_graph import tied
+from teamslam.team.estimation.map_joining.joining import Fold, merge_islands, precedence
+from teamslam.team.estimation.map_joining.merging import Merge, place_island
+from teamslam.team.estimation.map_joining.minima import solve_minimum
+from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
 
@@ -129,8 +129,8 @@ def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
     for at, island in fold.islands.items():
         if at != key and not any(id_ in becomes for id_ in island.graph.landmarks):
             continue
-        graph, state = tied(island.graph, island.state, becomes)
-        islands[at] = iterated(replace(island, graph=graph, state=state))
+        graph, state = tie_landmarks(island.graph, island.state, becomes)
+        islands[at] = iterate_tick(replace(island, graph=graph, state=state))
     return replace(fold, islands=islands, landmarks=landmarks)
 
 
@@ -150,7 +150,7 @@ def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> F
     view.record_merges(MergedPairs(found.pairs, view.joint), "closure")
     fold = _apply_merges(fold, key, view)
     fold = replace(fold, landmarks=fold.landmarks.add_decisions(decision))
-    island, iterations, change = settled(fold.islands[key])
+    island, iterations, change = solve_island(fold.islands[key])
     islands = {**fold.islands, key: island}
     fold = replace(fold, islands=islands, iterations=iterations, change=change)
     return _merge_near(fold, key)
@@ -262,15 +262,15 @@ def _merge_islands(
     renamed = {}
     for key in keys:
         island = fold.islands[key]
-        graph, state = tied(island.graph, island.state, becomes)
+        graph, state = tie_landmarks(island.graph, island.state, becomes)
         renamed[key] = replace(island, graph=graph, state=state)
     stays, goes = sorted(keys, key=lambda at: precedence(fold, at))
     if renamed[goes].graph.condensed is not None:
         return fold  # its condensed factor is linearised in its own frame
     place = second_from_first if stays == keys[1] else inverse(second_from_first)
-    both, waiting = placed(renamed[stays], renamed[goes], place, fold.waiting)
+    both, waiting = place_island(renamed[stays], renamed[goes], place, fold.waiting)
     try:
-        best = minimum(both)
+        best = solve_minimum(both)
     except UNSOLVABLE:
         return fold
     if not is_solvable(best.island):
@@ -282,7 +282,7 @@ def _merge_islands(
     )
     fold = replace(fold, landmarks=landmarks.add_decisions(decision))
     streams = sorted(renamed[goes].graph.streams)
-    fold = merged_islands(fold, stays, goes, Merge(best, waiting, words))
+    fold = merge_islands(fold, stays, goes, Merge(best, waiting, words))
     fold = _merge_near(fold, stays)
     views = _IslandViews()
     step = patch_step(fold.islands[stays].settings.association)

@@ -54,7 +54,7 @@ FULL_AGE = 1_000_000
 class JoinSettings:
     """Settings of map joining.
 
-    iterations_per_tick: Gauss-Newton iterations of `folded`. robust: whether factors beyond their
+    iterations_per_tick: iterations of `fold_submaps`. robust: whether factors beyond their
     gates are discounted; otherwise least squares. The gates of χ² are wider by robust_start² at
     first, and by robust_decay² less with each iteration, until the factor is 1. submap_gate: factor
     on the gate of a submap as a whole. landmark_gate: χ² of two numbers from which a submap's
@@ -230,7 +230,7 @@ class Island:
         return core.own_blocks(old.resting.upper, self.resting_spread)
 
 
-def aged(island: Island, iterations: int | None) -> Island:
+def age_factors(island: Island, iterations: int | None) -> Island:
     """Add iterations to the age of every factor; None: every factor begins anew."""
     if iterations is None:
         age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
@@ -241,7 +241,7 @@ def aged(island: Island, iterations: int | None) -> Island:
 
 def final_cost(island: Island) -> float:
     """Evaluate the cost with final robust scales, for comparison of islands."""
-    return aged(island, FULL_AGE).cost
+    return age_factors(island, FULL_AGE).cost
 
 
 def is_solvable(island: Island) -> bool:
@@ -258,7 +258,7 @@ def is_solvable(island: Island) -> bool:
     return bool(np.isfinite(island.state).all()) and math.isfinite(cost)
 
 
-def iterated(island: Island) -> Island:
+def iterate_tick(island: Island) -> Island:
     """Apply the iterations of one tick.
 
     With condensed submaps, iterations after the first are omitted whose step is shorter than STILL:
@@ -290,7 +290,7 @@ class Iteration(NamedTuple):
 def _iteration(island: Island, damping: float) -> tuple[Island, Iteration]:
     """Take one step; the island ages by one even where no step lowers the cost."""
     after, outcome = take_step(island, _eased(damping))
-    return aged(island, 1) if after is island else after, outcome
+    return age_factors(island, 1) if after is island else after, outcome
 
 
 def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
@@ -304,7 +304,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
         state, damping, change = island.estimate.take_step(damping, HALVINGS, MOST_DAMPING)
     if state is None:
         return island, Iteration(STUCK, change)
-    older = replace(aged(island, 1), state=state)
+    older = replace(age_factors(island, 1), state=state)
     return older, Iteration(damping, change)
 
 
@@ -312,7 +312,7 @@ def _eased(damping: float) -> float:
     return 0.0 if damping == STUCK else damping
 
 
-def settled(island: Island) -> tuple[Island, int, float]:
+def solve_island(island: Island) -> tuple[Island, int, float]:
     """Solve in full from this state; return also the number of iterations and the last change [m,
     rad].
 
@@ -322,13 +322,13 @@ def settled(island: Island) -> tuple[Island, int, float]:
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):
-            plain, count, change = _descended(
+            plain, count, change = _descend(
                 replace(island, settings=replace(island.settings, robust=False))
             )
-            found = aged(replace(plain, settings=island.settings), FULL_AGE)
+            found = age_factors(replace(plain, settings=island.settings), FULL_AGE)
             if not _has_outliers(found):
                 return found, count, change
-    return _descended(island)
+    return _descend(island)
 
 
 def _has_outliers(island: Island) -> bool:
@@ -341,9 +341,9 @@ def _has_outliers(island: Island) -> bool:
     return any((each < 1.0).any() for each in weights)
 
 
-def _descended(island: Island) -> tuple[Island, int, float]:
+def _descend(island: Island) -> tuple[Island, int, float]:
     settings = island.settings
-    island = aged(island, None)
+    island = age_factors(island, None)
     damping, change, count = 0.0, math.inf, 0
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
@@ -355,7 +355,7 @@ def _descended(island: Island) -> tuple[Island, int, float]:
     return island, count, change
 
 
-def solved_with_fixed(
+def solve_with_fixed(
     island: Island, unknown: int, by: float, iterations: int, *, shortest: float = 0.0
 ) -> Island:
     """Move one number of the state by `by` and solve for all others given that.

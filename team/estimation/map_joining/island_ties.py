@@ -97,7 +97,7 @@ def aligned_by(
         return None
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
     in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
-    return alignment.aligned(*in_main, *in_other)
+    return alignment.align(*in_main, *in_other)
 
 
 def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, bool]]) -> JointPoints:
@@ -146,7 +146,7 @@ def headings_that_fit(
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
     in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
     grid = [2.0 * math.pi * k / HEADINGS - math.pi for k in range(HEADINGS)]
-    found = [alignment.at_heading(*in_main, *in_other, heading) for heading in grid]
+    found = [alignment.fit_at_heading(*in_main, *in_other, heading) for heading in grid]
     costs = [chi2 for _, chi2 in found]
     limit = min(costs) + HOPELESS
     return [

@@ -43,20 +43,20 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     ages,
     final_cost,
     is_solvable,
-    iterated,
+    iterate_tick,
 )
 from teamslam.team.estimation.map_joining.markers import add_markers, warn_of_unmarked
-from teamslam.team.estimation.map_joining.merging import Merge, merge, sighted
+from teamslam.team.estimation.map_joining.merging import Merge, add_sightings, merge
 from teamslam.team.estimation.map_joining.minima import (
     Minimum,
     Search,
+    is_suspicious,
     rival_distance,
-    searched,
-    suspicious,
+    search_minima,
     warnings,
-    widened,
+    widen_search,
 )
-from teamslam.team.estimation.map_joining.resting import woken
+from teamslam.team.estimation.map_joining.resting import wake_landmarks
 from teamslam.team.estimation.map_joining.saved_maps import (
     FALSE_ALARM,
     SEQUENTIAL,
@@ -66,7 +66,7 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     reunite,
     separate,
 )
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 
 __all__ = [
     "EMPTY_FOLD",
@@ -80,12 +80,12 @@ __all__ = [
     "NotCanonicalError",
     "Stream",
     "Tick",
-    "compacted",
-    "converged",
-    "folded",
-    "merged_islands",
+    "add_start",
+    "compact_fold",
+    "fold_submaps",
+    "merge_islands",
     "precedence",
-    "started",
+    "solve_fold",
 ]
 
 NAMED = 10
@@ -259,14 +259,14 @@ class Fold:
 EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
-def started(fold: Fold, start: InitialPoseFactor) -> Fold:
+def add_start(fold: Fold, start: InitialPoseFactor) -> Fold:
     """Add a stream's initial pose, before the stream's first submap."""
     if start.stream in fold.home:
         raise LateStartError(start)
     return replace(fold, starts={**fold.starts, start.stream: start})
 
 
-def folded(
+def fold_submaps(
     fold: Fold,
     contributions: Sequence[Contribution],
     settings: JoinSettings,
@@ -280,7 +280,7 @@ def folded(
     sightings: the inter-robot measurements from these submaps; each is a factor from the tick on in
     which both of its pose nodes are in one island.
     """
-    _check(fold, contributions)
+    _check_order(fold, contributions)
     home = dict(fold.home)
     arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
@@ -293,11 +293,12 @@ def folded(
     landmarks, numbers = add_landmarks(fold.landmarks, contributions)
     seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
     islands = {
-        key: woken(replace(island, settings=settings), seen) for key, island in fold.islands.items()
+        key: wake_landmarks(replace(island, settings=settings), seen)
+        for key, island in fold.islands.items()
     }
     for key, taken in arrived.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
-        graph, state = extended(
+        graph, state = add_submaps(
             island.graph,
             island.state,
             taken,
@@ -307,8 +308,8 @@ def folded(
             numbers,
         )
         age = np.concatenate([island.age, ages(len(taken))])
-        island, waiting = sighted(replace(island, graph=graph, state=state, age=age), waiting)
-        islands[key] = iterated(island)
+        island, waiting = add_sightings(replace(island, graph=graph, state=state, age=age), waiting)
+        islands[key] = iterate_tick(island)
     grown = replace(
         fold,
         contributions=(*fold.contributions, *contributions),
@@ -317,10 +318,10 @@ def folded(
         waiting=waiting,
         landmarks=landmarks,
     )
-    return _separated(_with_merges(_with_searches(grown)), SEQUENTIAL, contributions)
+    return _separate_moved(_merge_all(_search_suspicious(grown)), SEQUENTIAL, contributions)
 
 
-def compacted(fold: Fold) -> Fold:
+def compact_fold(fold: Fold) -> Fold:
     """Drop the values of a fold that can be computed again from it, for a checkpoint.
 
     It shares the submaps with the folds before and after it. Of its own it has the state, the
@@ -334,7 +335,7 @@ def compacted(fold: Fold) -> Fold:
     return replace(fold, islands=islands)
 
 
-def converged(fold: Fold, settings: JoinSettings) -> Fold:
+def solve_fold(fold: Fold, settings: JoinSettings) -> Fold:
     """Solve every island in full; `iterations` and `change` describe the end of the solve.
 
     `warnings` reports other minima, and islands without a full solution, which keep the state of
@@ -343,12 +344,12 @@ def converged(fold: Fold, settings: JoinSettings) -> Fold:
     if fold.main_key is None:
         return fold
     with np.errstate(all="ignore"):  # what overflows has no finite cost, and is not taken
-        return _converged(fold, settings, fold.main_key)
+        return _solve_islands(fold, settings, fold.main_key)
 
 
-def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
+def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     searches = {
-        key: _search(add_markers(replace(island, settings=settings)))
+        key: _search_island(add_markers(replace(island, settings=settings)))
         for key, island in fold.islands.items()
     }
     main = searches[main_key]
@@ -358,11 +359,11 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
         iterations=main.best.iterations,
         change=main.best.change,
     )
-    merged = _with_changes(_with_merges(solved, at_last=True))
-    last = main if merged.main is main.best.island else _search(merged.main)
+    merged = _test_saved_places(_merge_all(solved, at_last=True))
+    last = main if merged.main is main.best.island else _search_island(merged.main)
     wider = None
     with suppress(*UNSOLVABLE):
-        wider = widened(last)
+        wider = widen_search(last)
     if wider is not None and is_solvable(wider.best.island):
         last = wider
     return replace(
@@ -375,7 +376,9 @@ def _converged(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold:
     )
 
 
-def _separated(fold: Fold, chance: float, newest: Sequence[Contribution] | None = None) -> Fold:
+def _separate_moved(
+    fold: Fold, chance: float, newest: Sequence[Contribution] | None = None
+) -> Fold:
     """Separate the landmarks that have moved since a saved map from their former places.
 
     The worst one first; its island is solved again before the next one is tested. newest: the
@@ -393,29 +396,29 @@ def _separated(fold: Fold, chance: float, newest: Sequence[Contribution] | None 
         with suppress(*UNSOLVABLE):
             while (found := next_change(islands[key], chance, nodes)) is not None:
                 apart = separate(islands[key], found[0], [found[1].landmark])
-                islands[key] = iterated(apart)
+                islands[key] = iterate_tick(apart)
     return replace(fold, islands=islands)
 
 
-def _with_changes(fold: Fold) -> Fold:
+def _test_saved_places(fold: Fold) -> Fold:
     """Test the landmarks of saved maps anew, in a full solution: those apart, then the others."""
     islands = dict(fold.islands)
     for key, island in fold.islands.items():
         with suppress(*UNSOLVABLE):
             for stream, id_ in returned(island, FALSE_ALARM):
-                islands[key] = iterated(reunite(islands[key], stream, id_))
-    return _separated(replace(fold, islands=islands), FALSE_ALARM)
+                islands[key] = iterate_tick(reunite(islands[key], stream, id_))
+    return _separate_moved(replace(fold, islands=islands), FALSE_ALARM)
 
 
-def _search(island: Island) -> Search:
+def _search_island(island: Island) -> Search:
     with suppress(*UNSOLVABLE):
-        found = searched([island])
+        found = search_minima([island])
         if is_solvable(found.best.island):
             return found
     return Search(Minimum(island, 0, math.inf, final_cost(island)), 0.0, None)
 
 
-def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
+def _check_order(fold: Fold, contributions: Sequence[Contribution]) -> None:
     for before, after in pairwise((*fold.contributions[-1:], *contributions)):
         if not before.key < after.key:
             raise NotCanonicalError(after)
@@ -428,7 +431,7 @@ def _check(fold: Fold, contributions: Sequence[Contribution]) -> None:
         expected[stream] = sequence + 1
 
 
-def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
+def _merge_all(fold: Fold, at_last: bool = False) -> Fold:
     """Merge islands while any two can be merged, into the main one or the smallest frame.
 
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
@@ -444,8 +447,8 @@ def _with_merges(fold: Fold, at_last: bool = False) -> Fold:
         if before is None or at_last or size >= PATIENCE * before[0]:
             found = merge(main, other, fold.waiting)
             if isinstance(found, Merge):
-                return _with_merges(
-                    merged_islands(replace(fold, judged=judged), key, other_key, found)
+                return _merge_all(
+                    merge_islands(replace(fold, judged=judged), key, other_key, found)
                 )
             why = found.why
             if found.after_search:
@@ -471,7 +474,7 @@ def _frame_of(streams: Collection[Stream]) -> Stream:
     return min(filter(is_map, streams), default=min(streams))
 
 
-def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
+def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
     """Merge two islands; the record of the merge is filed under the vanished frame."""
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island
@@ -492,7 +495,7 @@ def merged_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> 
     )
 
 
-def _with_searches(fold: Fold) -> Fold:
+def _search_suspicious(fold: Fold) -> Fold:
     """Search islands of suspicious cost for a lower minimum, each time they have grown by
     PATIENCE.
     """
@@ -501,8 +504,8 @@ def _with_searches(fold: Fold) -> Fold:
         size = len(island.graph.submaps)
         if size < PATIENCE * searched_at.get(key, 0) or island.graph.condensed is not None:
             continue
-        if not suspicious(island, final_cost(island)):
+        if not is_suspicious(island, final_cost(island)):
             continue
         searched_at[key] = size
-        islands[key] = _search(island).best.island
+        islands[key] = _search_island(island).best.island
     return replace(fold, islands=islands, searched_at=searched_at)

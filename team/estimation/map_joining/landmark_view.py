@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.map_joining.condensed_factor import Resting, nobody_rests, places
+from teamslam.team.estimation.map_joining.condensed_factor import Resting, make_empty_rest, places
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.upper_triangle import between
 from teamslam.team.shapes import Bool, Float, Int64
@@ -29,8 +29,8 @@ def resting_of(island: Island) -> Resting:
     """Return the landmarks at rest; none where nothing is condensed."""
     old = island.graph.condensed
     if old is None:
-        return nobody_rests(0)
-    return nobody_rests(len(old.at)) if old.resting is None else old.resting
+        return make_empty_rest(0)
+    return make_empty_rest(len(old.at)) if old.resting is None else old.resting
 
 
 def points_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2"]:

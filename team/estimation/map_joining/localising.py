@@ -16,13 +16,13 @@ from teamslam.team.estimation.map_joining.alignment import (
     NEEDED,
     Alignment,
     SharedPoints,
-    aligned,
+    align,
     disagreement,
     refusal,
 )
-from teamslam.team.estimation.map_joining.conditioning import TRUSTING, Posed, followed
+from teamslam.team.estimation.map_joining.conditioning import TRUSTING, Posed, join_pending
 from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
-from teamslam.team.estimation.map_joining.whole_map import joined
+from teamslam.team.estimation.map_joining.whole_map import join_submap
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
@@ -32,7 +32,7 @@ landmarks that give it are counted in the solution.
 """
 
 
-def localised(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) -> Posed | str:
+def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) -> Posed | str:
     """Estimate the pose of a robot in the frame of the team's landmarks, or give the reason why
     they do not determine it.
 
@@ -40,7 +40,7 @@ def localised(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) ->
     largest set that one rigid motion places is used, if it is most of them. Raises
     NotACovarianceError, NotDeterminedError.
     """
-    whole = own if window is None else joined(own, window.named)
+    whole = own if window is None else join_submap(own, window.named)
     _, in_team, in_own = np.intersect1d(team.ids, whole.ids, return_indices=True)
     shared = _Shared.of(team, whole, in_team, in_own)
     fit, why = shared.fit()
@@ -57,7 +57,7 @@ def localised(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) ->
     covariance = np.zeros_like(shared.P)
     covariance[:3, :3], covariance[3:, 3:] = FLAT * fit.covariance, shared.A
     start = WholeMap(shared.ids, np.concatenate([fit.a_from_b, shared.a.ravel()]), covariance)
-    found = followed(start, [LocalMap(shared.ids, shared.mean, shared.P)])
+    found = join_pending(start, [LocalMap(shared.ids, shared.mean, shared.P)])
     if found.disputed:
         return f"{SharedPoints(len(shared.ids))} contradict each other"
     return Posed(PoseGaussian(*found.whole.pose()), count, refused + sum(found.refused))
@@ -99,7 +99,7 @@ class _Shared(NamedTuple):
         """Align the landmarks; return the alignment, with the reason where it places nothing."""
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
-            fit = aligned(self.a, self.A, self.b, self.P[3:, 3:])
+            fit = align(self.a, self.A, self.b, self.P[3:, 3:])
         why = refusal(shared, fit, TRUSTING.alignment_heading_sigma)
         if why is None and fit is not None:
             why = disagreement(shared, fit.chi2, TRUSTING.alignment_confidence)

@@ -32,9 +32,14 @@ from teamslam.team.estimation.map_joining.island_ties import (
     sound_ties,
     ties,
 )
-from teamslam.team.estimation.map_joining.minima import Minimum, Search, minimum, searched
+from teamslam.team.estimation.map_joining.minima import (
+    Minimum,
+    Search,
+    search_minima,
+    solve_minimum,
+)
 from teamslam.team.estimation.map_joining.saved_maps import disagreeing, maps_of, separate
-from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merged
+from teamslam.team.estimation.map_joining.submap_graph import encounter_of, merge_graphs
 from teamslam.team.shapes import Float
 
 WORTH_TELLING = 1.0
@@ -56,7 +61,7 @@ class Waits(NamedTuple):
     after_search: bool
 
 
-def sighted(
+def add_sightings(
     island: Island, waiting: Sequence[InterRobotFactor]
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
     """Add the inter-robot measurements within an island; return the remaining ones."""
@@ -86,7 +91,7 @@ def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> M
 
 
 def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
-    apart = _without_moved(main, other)
+    apart = _separate_moved(main, other)
     if isinstance(apart, Waits):
         return apart
     main, other = apart
@@ -99,27 +104,29 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     why = alignment.refusal(shared, found, main.settings.alignment_heading_sigma)
     if found is None or why is not None:
         return Waits(why or str(shared), after_search=False)
-    both, left = placed(main, other, found.a_from_b, waiting)
+    both, left = place_island(main, other, found.a_from_b, waiting)
     graph = both.graph
-    others = [placed(main, other, place, ())[0] for place in _places(main, other, tied)]
-    search = searched([both, *(replace(both, state=each.state) for each in others)])
-    rise = search.best.cost - minimum(main).cost - minimum(other).cost
+    others = [place_island(main, other, place, ())[0] for place in _propose_places(main, other, tied)]
+    search = search_minima([both, *(replace(both, state=each.state) for each in others)])
+    rise = search.best.cost - solve_minimum(main).cost - solve_minimum(other).cost
     # Fixes whose errors drift agree with the alignment one by one (`sound_ties`), not together.
     are_fixes = all(tie.seen is not None and tie.seen.is_fix for tie in tied)
     if not are_fixes:
         why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
     if why is None and search.second is not None and search.ambiguous:
-        why = _ambiguous(shared, search, search.second, graph.streams[min(other.graph.streams)][0])
+        why = _describe_ambiguity(
+            shared, search, search.second, graph.streams[min(other.graph.streams)][0]
+        )
     if why is not None:
         return Waits(why, after_search=True)
     if not is_solvable(search.best.island):
         return Waits(f"{shared}, with which the map has no solution", after_search=True)
-    words = _words(other, shared, search, rise)
+    words = _describe_merge(other, shared, search, rise)
     island, left = sighted(search.best.island, sorted((*left, *aside), key=lambda each: each.key))
     return Merge(search.best._replace(island=island), left, words)
 
 
-def _without_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:
+def _separate_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:
     """Separate the landmarks that have moved since a saved map from those of the other island."""
     island = main if maps_of(main.graph) else other
     saved = maps_of(island.graph)
@@ -136,19 +143,19 @@ def _without_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits
     return (after, other) if island is main else (main, after)
 
 
-def placed(
+def place_island(
     main: Island,
     other: Island,
     main_from_other: Float[np.ndarray, "3"],
     waiting: Sequence[InterRobotFactor],
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
     """Join both islands, with every factor's robust scale at its beginning."""
-    graph, state = merged(main.graph, main.state, other.graph, other.state, main_from_other)
+    graph, state = merge_graphs(main.graph, main.state, other.graph, other.state, main_from_other)
     new = ages(len(graph.submaps)), ages(len(graph.sightings))
-    return sighted(Island(graph, state, *new, main.settings), waiting)
+    return add_sightings(Island(graph, state, *new, main.settings), waiting)
 
 
-def _places(
+def _propose_places(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
     by_landmarks = [tie for tie in tied if tie.seen is None]
@@ -167,7 +174,7 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
     return island.state[begin : begin + 3]
 
 
-def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
+def _describe_ambiguity(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
     """Word the reason to defer a merge with two likely places."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
@@ -176,7 +183,7 @@ def _ambiguous(shared: SharedPoints, search: Search, second: Minimum, node: int)
     )
 
 
-def _words(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
+def _describe_merge(other: Island, shared: SharedPoints, search: Search, rise: float) -> str:
     node = search.best.island.graph.streams[min(other.graph.streams)][0]
     _, covariance = joint_marginal(search.best.island, [node])
     sigma_m = deviation(covariance[0, 0] + covariance[1, 1])

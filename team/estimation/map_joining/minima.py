@@ -22,7 +22,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     NotDeterminedError,
     final_cost,
-    settled,
+    solve_island,
 )
 from teamslam.team.estimation.map_joining.nonlinearity import (
     ends,
@@ -30,7 +30,7 @@ from teamslam.team.estimation.map_joining.nonlinearity import (
     nonlinearity_warnings,
     profile,
 )
-from teamslam.team.estimation.map_joining.relaxation import relaxed
+from teamslam.team.estimation.map_joining.relaxation import relax_headings
 from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float
 
@@ -80,9 +80,9 @@ class Search(NamedTuple):
         return self.second is not None and self.second.cost - self.best.cost < likely_rise()
 
 
-def minimum(island: Island) -> Minimum:
+def solve_minimum(island: Island) -> Minimum:
     """Solve in full from the island's state."""
-    solved, iterations, change = settled(island)
+    solved, iterations, change = solve_island(island)
     return Minimum(solved, iterations, change, final_cost(solved))
 
 
@@ -95,7 +95,7 @@ def degrees_of_freedom(island: Island) -> int:
     return measured - graph.unknowns + (0 if old is None else old.redundancy)
 
 
-def suspicious(island: Island, cost: float) -> bool:
+def is_suspicious(island: Island, cost: float) -> bool:
     """Whether the cost is far above its degrees of freedom."""
     dof = degrees_of_freedom(island)
     return dof > 0 and cost > max(SUSPICIOUS * dof, _quantile(dof))
@@ -111,7 +111,7 @@ def likely_rise() -> float:
     return _quantile(3)
 
 
-def searched(starts: Sequence[Island]) -> Search:
+def search_minima(starts: Sequence[Island]) -> Search:
     """Find the lowest minimum from several starts of one graph, and from the relaxation of its
     headings.
 
@@ -121,26 +121,26 @@ def searched(starts: Sequence[Island]) -> Search:
     raises NotDeterminedError where none has one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
-    found = list(_minima(starts))
-    for each in _minima(_further(starts[0])):
+    found = list(_solve_each(starts))
+    for each in _solve_each(_make_starts(starts[0])):
         found.append(each)
-        if not few and not suspicious(starts[0], min(each.cost for each in found)):
+        if not few and not is_suspicious(starts[0], min(each.cost for each in found)):
             break
     if not found:
         raise NotDeterminedError("every place that was tried")
-    return _lowest(found)
+    return _select_lowest(found)
 
 
-def _minima(starts: Iterable[Island]) -> Iterator[Minimum]:
+def _solve_each(starts: Iterable[Island]) -> Iterator[Minimum]:
     for start in starts:
         found = None
         with suppress(*UNSOLVABLE), np.errstate(all="ignore"):
-            found = minimum(start)
+            found = solve_minimum(start)
         if found is not None and math.isfinite(found.cost):
             yield found
 
 
-def widened(search: Search) -> Search:
+def widen_search(search: Search) -> Search:
     """Extend the search by the minima next to the best one, where landmarks are few.
 
     Each uncertain heading of a first or last pose is moved as far as is likely, and each stream is
@@ -153,13 +153,13 @@ def widened(search: Search) -> Search:
     found = [search.best] if search.second is None else [search.best, search.second]
     for _, _, node in ends(best):
         with suppress(*UNSOLVABLE):  # of the walk itself
-            found += _minima(walked for walked, _ in profile(best, node))
-    found += _minima(_mirrored(best))
-    wider = _lowest(found)
+            found += _solve_each(walked for walked, _ in profile(best, node))
+    found += _solve_each(_mirror_streams(best))
+    wider = _select_lowest(found)
     return wider._replace(gained=search.gained + search.best.cost - wider.best.cost)
 
 
-def _mirrored(island: Island) -> Iterator[Island]:
+def _mirror_streams(island: Island) -> Iterator[Island]:
     """Mirror a stream's poses at the line through two landmarks.
 
     With the line's direction α: p' = a + R(2α) conj(p − a), θ' = 2α − θ.
@@ -169,7 +169,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
         own = [node for (of, _), node in graph.poses.items() if of == stream]
         poses = np.array([n for n in (*graph.streams[stream], *own) if not graph.fixed[n]])
         at = graph.offset[poses]
-        for pair in _passages(island, stream):
+        for pair in _list_passages(island, stream):
             a, b = (complex(*island.state[at_l : at_l + 2]) for at_l in pair)
             if a == b:
                 continue
@@ -183,7 +183,7 @@ def _mirrored(island: Island) -> Iterator[Island]:
             yield replace(island, state=state)
 
 
-def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
+def _list_passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
     """List pairs of landmarks, by index in the state, that a stream observes in succession."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
@@ -196,15 +196,15 @@ def _passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
     return [(int(graph.offset[a]), int(graph.offset[b])) for a, b in sorted(pairs)]
 
 
-def _lowest(found: Sequence[Minimum]) -> Search:
+def _select_lowest(found: Sequence[Minimum]) -> Search:
     """Select the lowest minimum of one graph; the first is from the start used without a search."""
-    best = _at_rest(min(found, key=lambda each: each.cost))
+    best = _settle_minimum(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
     return Search(best, found[0].cost - best.cost, second)
 
 
-def _further(island: Island) -> Iterator[Island]:
+def _make_starts(island: Island) -> Iterator[Island]:
     """Make starts independent of the island's state, the most promising first.
 
     There are none with condensed submaps, whose factor depends on that state.
@@ -212,28 +212,28 @@ def _further(island: Island) -> Iterator[Island]:
     graph = island.graph
     if graph.condensed is not None:
         return
-    guess = relaxed(graph, island.state)
+    guess = relax_headings(graph, island.state)
     if guess is not None:
         yield replace(island, state=guess)
     if graph.sightings:
         unseen = replace(
             island, graph=replace(graph, sightings=()), sighting_age=island.sighting_age[:0]
         )
-        alone = relaxed(unseen.graph, island.state)
+        alone = relax_headings(unseen.graph, island.state)
         if alone is not None:  # none, where only inter-robot measurements tie the robots
-            for found in _minima([replace(unseen, state=alone)]):
+            for found in _solve_each([replace(unseen, state=alone)]):
                 yield replace(island, state=found.island.state)
     if guess is not None:
         doubting = replace(island.settings, robust=True, robust_start=WIDE)
-        for found in _minima([replace(island, state=guess, settings=doubting)]):
+        for found in _solve_each([replace(island, state=guess, settings=doubting)]):
             yield replace(island, state=found.island.state)
 
 
-def _at_rest(best: Minimum) -> Minimum:
+def _settle_minimum(best: Minimum) -> Minimum:
     for _ in range(MORE_SOLUTIONS):
         if best.change <= SETTLED_M:
             break
-        further = minimum(best.island)
+        further = solve_minimum(best.island)
         best = further._replace(iterations=best.iterations + further.iterations)
     return best
 
@@ -280,7 +280,7 @@ def warnings(search: Search) -> list[str]:
     """Warn the map's user about its minimum; empty where it is the only one."""
     island, found = search.best.island, []
     dof = degrees_of_freedom(island)
-    if suspicious(island, search.best.cost):
+    if is_suspicious(island, search.best.cost):
         found.append(
             f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
             "freedom; it may be a wrong minimum, or the covariances are too small"

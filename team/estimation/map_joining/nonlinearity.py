@@ -18,9 +18,9 @@ from teamslam.team.estimation.gaussian import deviation, information
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     Island,
-    aged,
+    age_factors,
     joint_marginal,
-    solved_with_fixed,
+    solve_with_fixed,
 )
 from teamslam.team.estimation.se2 import compose, inverse, logarithm
 
@@ -73,13 +73,13 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
     sigma = deviation(covariance[2, 2])
     if sigma < STRAIGHT_RAD:
         return
-    island = aged(island, FULL_AGE)
+    island = age_factors(island, FULL_AGE)
     heading = int(island.graph.offset[node]) + 2
     for sign in (1.0, -1.0):
         walked = island
         for before, after in zip((0.0, *STEPS), STEPS, strict=False):
             by = sign * (after - before) * sigma
-            walked = solved_with_fixed(walked, heading, by, ITERATIONS, shortest=SHORTEST)
+            walked = solve_with_fixed(walked, heading, by, ITERATIONS, shortest=SHORTEST)
             rise = walked.cost - island.cost
             if not rise <= UNLIKELY:  # nor where the cost is no number
                 break

@@ -14,7 +14,7 @@ import numpy as np
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.gauss_newton import Island
-from teamslam.team.estimation.map_joining.resting import split
+from teamslam.team.estimation.map_joining.resting import eliminate
 from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
@@ -52,7 +52,7 @@ def quadratic(
     return island.estimate.quadratic(union, *factors)
 
 
-def without_paths(
+def eliminate_paths(
     island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
 ) -> tuple[Indices, Matrix, Values, float]:
     """Eliminate poses from the factors' quadratic; return its nodes, A, half the gradient and the
@@ -64,14 +64,14 @@ def without_paths(
     sizes, total = np.diff(graph.offset), 0.0
     left: list[Left] = []
     rest = MarkedFactors(*(each.copy() for each in factors))
-    for run in _runs(island, factors.submaps):
+    for run in _list_runs(island, factors.submaps):
         path = np.zeros(len(graph.fixed), np.bool_)
         for f in run:
             contribution, nodes, *_ = graph.submaps[f]
             path[nodes[0]] = True
             path[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
         path &= ~graph.fixed
-        taken = _of_run(island, run, path, rest)
+        taken = _mark_factors(island, run, path, rest)
         for each, marks in zip(rest, taken, strict=True):
             each[marks] = False
         beside = [each for each in left if path[each.nodes].any()]
@@ -79,7 +79,7 @@ def without_paths(
         nodes = nodes_of(island, taken, (each.nodes for each in beside))
         H, g, cost = quadratic(island, nodes, taken)
         _add(H, g, sizes, nodes, beside)
-        parts = split(H, g, np.repeat(path[nodes], sizes[nodes]))
+        parts = eliminate(H, g, np.repeat(path[nodes], sizes[nodes]))
         left.append(Left(nodes[~path[nodes]], parts.information, parts.slope))
         total += cost - parts.lowered
     union = union[~eliminated[union] | (sizes[union] == 2)]
@@ -88,7 +88,7 @@ def without_paths(
     return union, H, g, total + cost
 
 
-def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
+def _list_runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
     streams: dict[Stream, list[int]] = defaultdict(list)
     for f in np.flatnonzero(leaving).tolist():
         streams[island.graph.submaps[f].contribution.stream].append(f)
@@ -97,7 +97,7 @@ def _runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]
         yield from (own[k : k + RUN] for k in range(0, len(own), RUN))
 
 
-def _of_run(
+def _mark_factors(
     island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: MarkedFactors
 ) -> MarkedFactors:
     graph = island.graph

@@ -26,7 +26,7 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.fold_association import associate_tick
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
-from teamslam.team.estimation.map_joining.joining import Fold, Tick, folded, started
+from teamslam.team.estimation.map_joining.joining import Fold, Tick, add_start, fold_submaps
 
 T = TypeVar("T")
 
@@ -36,7 +36,7 @@ def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     the exceptions.
     """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
-    fold, members = _in_reach(fold, tick.contributions, tick.outside)
+    fold, members = _select_reachable(fold, tick.contributions, tick.outside)
     streams = {each.stream for each in members}
     starts = [start for start in tick.starts if start.stream in streams]
     sightings = _of_members(tick.sightings, fold)
@@ -47,7 +47,7 @@ def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
     return selection.add_solvable(members, sightings)
 
 
-def refusals(fold: Fold) -> list[str]:
+def describe_refusals(fold: Fold) -> list[str]:
     """Describe, for each chain, the submap at which it ended and how many follow, then other
     refusals.
     """
@@ -63,7 +63,7 @@ def refusals(fold: Fold) -> list[str]:
     return [*words, *fold.set_aside]
 
 
-def _in_reach(
+def _select_reachable(
     fold: Fold, contributions: Sequence[Contribution], outside: Mapping[Key, str]
 ) -> tuple[Fold, list[Contribution]]:
     """Select the submaps to try; refuse those out of bounds, or after a refused one."""
@@ -93,10 +93,10 @@ def _attempt(
     settings: JoinSettings,
 ) -> Fold | None:
     for start in starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     try:
         with np.errstate(all="ignore"):
-            after = associate_tick(folded(fold, members, settings, sightings), members)
+            after = associate_tick(fold_submaps(fold, members, settings, sightings), members)
     except UNSOLVABLE:
         return None
     changed = (
@@ -140,7 +140,7 @@ class _Selection:
         def after(some: Sequence[InterRobotFactor]) -> Fold | None:
             return _attempt(base, self._members, self._of(self._members), some, self._settings)
 
-        accepted, bad = _greatest(candidates, lambda some: after(some) is not None)
+        accepted, bad = _select_greatest(candidates, lambda some: after(some) is not None)
         self._set_aside += [
             f"an inter-robot measurement of {each.teammate} by {named(each.stream)} at "
             f"{each.stamp_ns * 1e-9:.1f} s refused: with it the map has no solution"
@@ -201,7 +201,9 @@ class _Selection:
         self._refused[whole.key] = "with it the map has no solution"
 
 
-def _greatest(items: Sequence[T], works: Callable[[Sequence[T]], bool]) -> tuple[list[T], list[T]]:
+def _select_greatest(
+    items: Sequence[T], works: Callable[[Sequence[T]], bool]
+) -> tuple[list[T], list[T]]:
     """Add items while `works`, by halves; return the accepted and the rejected ones."""
     accepted: list[T] = []
     bad: list[T] = []

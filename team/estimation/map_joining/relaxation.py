@@ -33,7 +33,7 @@ class _Rows(NamedTuple):
     weights: Float[np.ndarray, " R"]
 
 
-def relaxed(graph: Graph, state: Values) -> Values | None:
+def relax_headings(graph: Graph, state: Values) -> Values | None:
     """Relax the graph to a new state; fixed nodes and biases keep their values; None if
     undetermined.
     """
@@ -46,7 +46,7 @@ def relaxed(graph: Graph, state: Values) -> Values | None:
         value = state[graph.offset[node] : graph.offset[node + 1]]
         numbers[at[node] : at[node + 1]] = _lifted(value) if len(value) == 3 else value
         free[at[node] : at[node + 1]] = False
-    found = _least_squares(list(_rows(graph, at)), numbers, free)
+    found = _least_squares(list(_list_equations(graph, at)), numbers, free)
     if found is None:
         return None
     moved = state.copy()
@@ -91,7 +91,7 @@ def _least_squares(
     return found if np.isfinite(found).all() else None
 
 
-def _rows(graph: Graph, at: Indices) -> Iterator[_Rows]:
+def _list_equations(graph: Graph, at: Indices) -> Iterator[_Rows]:
     """List the equations of submaps, inter-robot measurements and priors; `at`: first number of
     each node.
     """

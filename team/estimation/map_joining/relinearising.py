@@ -21,13 +21,13 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     ages,
     is_solvable,
-    iterated,
+    iterate_tick,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
-from teamslam.team.estimation.map_joining.merging import sighted
+from teamslam.team.estimation.map_joining.merging import add_sightings
 from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, extended
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, add_submaps
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.shapes import Float
 
@@ -107,9 +107,9 @@ def _restore_island(
     try:
         with np.errstate(all="ignore"):
             raw = _raw(island, fold, submaps, paths, numbers)
-            raw, waiting = sighted(raw, seen)
+            raw, waiting = add_sightings(raw, seen)
             for _ in range(SOLVED):
-                raw = iterated(raw)
+                raw = iterate_tick(raw)
     except UNSOLVABLE:
         return fold
     if not is_solvable(raw):
@@ -134,7 +134,7 @@ def _raw(
 ) -> Island:
     """Build the graph of all submaps, each node at its state in the island or at condensing."""
     graph, settings = island.graph, island.settings
-    full, state = extended(
+    full, state = add_submaps(
         EMPTY_GRAPH,
         np.zeros(0),
         contributions,

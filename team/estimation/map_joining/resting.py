@@ -18,7 +18,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.map_joining.condensed_factor import Resting, places
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.landmark_view import resting_of
-from teamslam.team.estimation.map_joining.submap_graph import Graph, with_landmarks
+from teamslam.team.estimation.map_joining.submap_graph import Graph, add_landmark_nodes
 from teamslam.team.estimation.map_joining.upper_triangle import between, upper_of
 from teamslam.team.shapes import Bool, Float, Int64
 
@@ -33,7 +33,7 @@ nodes.
 """
 
 
-class Split(NamedTuple):
+class Elimination(NamedTuple):
     """A quadratic A, g whose numbers `out` are eliminated: x_out ~ N(step + gain d, (L Lᵀ)⁻¹).
 
     lowered: gᵀA⁻¹g over them. slope, information: the quadratic over the others.
@@ -48,12 +48,12 @@ class Split(NamedTuple):
     gain: Float[np.ndarray, "o n"]
 
 
-def split(H: Matrix, g: Values, out: Marks) -> Split:
+def eliminate(H: Matrix, g: Values, out: Marks) -> Elimination:
     """Eliminate some numbers from a quadratic (Schur complement)."""
     remaining = ~out
     if not out.any():
         none = np.zeros((0, 0))
-        return Split(out, 0.0, g, H, none, np.zeros(0), np.zeros((0, len(g))))
+        return Elimination(out, 0.0, g, H, none, np.zeros(0), np.zeros((0, len(g))))
     cross = H[np.ix_(out, remaining)]
     factor = dense.cholesky(H[np.ix_(out, out)])
     solved = dense.solve_factored(factor, np.column_stack([cross, g[out]]))
@@ -61,10 +61,10 @@ def split(H: Matrix, g: Values, out: Marks) -> Split:
     slope: Values = g[remaining] - dense.product(cross.T, solved[:, -1])
     lowered = float(dense.product(g[out], solved[:, -1]))
     symmetric: Matrix = 0.5 * (information + information.T)
-    return Split(out, lowered, slope, symmetric, factor, -solved[:, -1], -solved[:, :-1])
+    return Elimination(out, lowered, slope, symmetric, factor, -solved[:, -1], -solved[:, :-1])
 
 
-def idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indices:
+def find_idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indices:
     """List the nodes of landmarks that come to rest, ascending: in no submap that stays, nor in
     another island, whose landmarks are `apart`.
 
@@ -78,7 +78,9 @@ def idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indi
     return np.array(found if some_rest or len(found) >= first else [], np.int64)
 
 
-def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Resting | None:
+def put_to_rest(
+    island: Island, union: Indices, parts: Elimination, nodes: Indices
+) -> Resting | None:
     """Make the resting landmarks given the nodes of `union` that remain, with the eliminated
     landmarks `nodes`; None if there are none.
     """
@@ -117,7 +119,7 @@ def beside(island: Island, union: Indices, parts: Split, nodes: Indices) -> Rest
     )
 
 
-def woken(island: Island, ids: Collection[int]) -> Island:
+def wake_landmarks(island: Island, ids: Collection[int]) -> Island:
     """Turn those of these landmarks that are at rest into nodes again."""
     graph = island.graph
     old = graph.condensed
@@ -140,7 +142,7 @@ def woken(island: Island, ids: Collection[int]) -> Island:
     upper = upper_of(rest.upper, left, len(left))
     core.add_product(-share, np.ascontiguousarray(cross.T), upper, upper=True)
     points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.boundary))
-    grown, nodes = with_landmarks(graph, rest.ids[wakes].tolist())
+    grown, nodes = add_landmark_nodes(graph, rest.ids[wakes].tolist())
     condensed = replace(
         old,
         nodes=np.concatenate([old.nodes, nodes]),

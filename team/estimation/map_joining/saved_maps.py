@@ -23,9 +23,14 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import Stream, is_map, named
 from teamslam.team.estimation.gaussian import deviation, information
-from teamslam.team.estimation.map_joining.alignment import aligned
+from teamslam.team.estimation.map_joining.alignment import align
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from teamslam.team.estimation.map_joining.submap_graph import Graph, Joined, tied, with_former
+from teamslam.team.estimation.map_joining.submap_graph import (
+    Graph,
+    Joined,
+    add_former_place,
+    tie_landmarks,
+)
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.shapes import Bool, Float
 
@@ -183,7 +188,7 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
         node = graph.landmarks[id_]
         local = saved.contribution.local.landmarks[nodes[node]]
         value = transformed(state[start : start + 3], local)
-        graph, state = with_former(graph, state, stream, id_, value, shared=node in by_others)
+        graph, state = add_former_place(graph, state, stream, id_, value, shared=node in by_others)
     return replace(island, graph=graph, state=state)
 
 
@@ -195,7 +200,7 @@ def reunite(island: Island, stream: Stream, id_: int) -> Island:
     aside = max([*graph.landmarks, 0]) + 1
     landmarks = {**graph.landmarks, aside: node}
     graph = replace(graph, former=former, landmarks=landmarks)
-    graph, state = tied(graph, island.state, {aside: id_})
+    graph, state = tie_landmarks(graph, island.state, {aside: id_})
     return replace(island, graph=graph, state=state)
 
 
@@ -378,7 +383,7 @@ def _disagreements(
     """
     n, inside = len(a), np.repeat(agree, 2)
     of = np.ix_(inside, inside)
-    x, y, turn = aligned(a[agree], A[of], b[agree], B[of]).a_from_b
+    x, y, turn = align(a[agree], A[of], b[agree], B[of]).a_from_b
     s, c = core.sin_and_cos(turn)
     R = np.array([[c, -s], [s, c]])
     turned = dense.product(b, R.T)

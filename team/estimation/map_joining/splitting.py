@@ -14,10 +14,10 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
     Island,
-    aged,
+    age_factors,
     final_cost,
     is_solvable,
-    settled,
+    solve_island,
     take_step,
 )
 from teamslam.team.shapes import Float
@@ -32,9 +32,9 @@ def robust(island: Island) -> Island:
     """Solve an island with a robust loss, from its state."""
     settings = island.settings
     if settings.robust:
-        return aged(island, FULL_AGE)
-    solved, *_ = settled(replace(island, settings=replace(settings, robust=True)))
-    return aged(solved, FULL_AGE)
+        return age_factors(island, FULL_AGE)
+    solved, *_ = solve_island(replace(island, settings=replace(settings, robust=True)))
+    return age_factors(solved, FULL_AGE)
 
 
 def split(

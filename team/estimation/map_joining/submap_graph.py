@@ -28,7 +28,7 @@ from teamslam.team.estimation.contribution import (
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.condensed_factor import Condensed, places, tied_nodes
+from teamslam.team.estimation.map_joining.condensed_factor import Condensed, places, tie_nodes
 from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -285,7 +285,7 @@ def _starts(lengths: Sequence[int]) -> Indices:
 
 
 class _Growth:
-    """The nodes being added to a graph, with their values; used inside `extended` only."""
+    """The nodes being added to a graph, with their values; used inside `add_submaps` only."""
 
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
@@ -312,7 +312,7 @@ class _Growth:
         return self.count - 1
 
 
-def extended(
+def add_submaps(
     graph: Graph,
     state: Values,
     contributions: Sequence[Contribution],
@@ -332,7 +332,7 @@ def extended(
     growth = _Growth(graph, state)
     priors = list(graph.priors)
     submaps = list(graph.submaps)
-    for contribution in (_with_states(each, bias_sigma) for each in contributions):
+    for contribution in (_drop_unscaled_biases(each, bias_sigma) for each in contributions):
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
             start = starts.get(stream, InitialPoseFactor(*stream, np.zeros(3)))
@@ -352,7 +352,7 @@ def extended(
             if id_ not in growth.landmarks:
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
         seen = [growth.landmarks[id_] for id_ in ids]
-        common = _in_common(contribution, common_bias_sigma)
+        common = _common_errors(contribution, common_bias_sigma)
         own = local.biases  # the errors of single sensors are part of a saved map's covariance
         if is_map(stream):
             own = tuple(bias for bias in own if bias not in common)
@@ -375,7 +375,7 @@ def extended(
         landmarks=growth.landmarks,
         poses=growth.poses,
         biases=growth.biases,
-        offset=_continued(graph.offset, [len(value) for value in growth.values]),
+        offset=_continue_starts(graph.offset, [len(value) for value in growth.values]),
         fixed=np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
         submaps=tuple(submaps),
         sightings=graph.sightings,
@@ -389,14 +389,16 @@ def extended(
     return grown, np.concatenate([state, *growth.values])
 
 
-def _with_states(contribution: Contribution, bias_sigma: Mapping[Bias, float]) -> Contribution:
+def _drop_unscaled_biases(
+    contribution: Contribution, bias_sigma: Mapping[Bias, float]
+) -> Contribution:
     """Take a submap with a bias that has no scale without biases."""
     if bias_sigma.keys() >= {*contribution.local.biases}:
         return contribution
     return replace(contribution, local=contribution.local.without_biases)
 
 
-def _in_common(
+def _common_errors(
     contribution: Contribution, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
     """Return the common errors of a submap with their sigmas, in order.
@@ -415,7 +417,7 @@ def _in_common(
     return found
 
 
-def without_nodes(
+def remove_nodes(
     graph: Graph,
     eliminated: Bool[np.ndarray, " _"],
     submaps: Bool[np.ndarray, " F"],
@@ -445,10 +447,10 @@ def without_nodes(
         condensed=None,
         gone=gone,
     )
-    return _renumbered(left, node_of, ~eliminated), node_of
+    return _renumber_nodes(left, node_of, ~eliminated), node_of
 
 
-def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
+def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
     """Renumber the nodes of a graph; some are removed or become one.
 
     node_of: new number of each node. stays: origins of the new nodes, ascending. Condensed factors
@@ -474,20 +476,20 @@ def _renumbered(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -
     )
 
 
-def with_landmarks(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
+def add_landmark_nodes(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
     """Add landmarks that no factor contains yet; return their nodes."""
     first = len(graph.fixed)
     nodes = range(first, first + len(ids))
     grown = replace(
         graph,
         landmarks={**graph.landmarks, **dict(zip(ids, nodes, strict=True))},
-        offset=_continued(graph.offset, [2] * len(ids)),
+        offset=_continue_starts(graph.offset, [2] * len(ids)),
         fixed=np.concatenate([graph.fixed, np.zeros(len(ids), np.bool_)]),
     )
     return grown, np.arange(first, first + len(ids))
 
 
-def with_former(
+def add_former_place(
     graph: Graph, state: Values, stream: Stream, id_: int, value: Values, *, shared: bool
 ) -> tuple[Graph, Values]:
     """Separate a landmark's place in a saved map from its present one.
@@ -511,7 +513,7 @@ def with_former(
         graph,
         submaps=submaps,
         former={**graph.former, (stream, id_): new},
-        offset=_continued(graph.offset, [2]),
+        offset=_continue_starts(graph.offset, [2]),
         fixed=np.concatenate([graph.fixed, [False]]),
     )
     return grown, np.concatenate([state, value])
@@ -546,11 +548,11 @@ def teammate_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
     return pose_node(graph, sighting.teammate, sighting.stamp_ns)
 
 
-def _continued(starts: Indices, lengths: Sequence[int]) -> Indices:
+def _continue_starts(starts: Indices, lengths: Sequence[int]) -> Indices:
     return np.concatenate([starts, starts[-1] + _starts(lengths)[1:]])
 
 
-def merged(
+def merge_graphs(
     main: Graph,
     state: Values,
     other: Graph,
@@ -577,8 +579,8 @@ def merged(
             continue
         node_of[node] = len(main.fixed) + len(values)
         value = other_state[other.offset[node] : other.offset[node + 1]]
-        values.append(_moved(main_from_other, value))
-    moved = _renumbered(other, node_of, np.ones(len(other.fixed), np.bool_))
+        values.append(_transform_value(main_from_other, value))
+    moved = _renumber_nodes(other, node_of, np.ones(len(other.fixed), np.bool_))
     kept = [
         len(prior.mean) == 1 and prior.node not in common  # of a bias, not of an initial pose
         for prior in other.priors
@@ -588,7 +590,7 @@ def merged(
         landmarks={**moved.landmarks, **main.landmarks},
         poses={**main.poses, **moved.poses},
         biases={**main.biases, **moved.biases},
-        offset=_continued(main.offset, [len(value) for value in values]),
+        offset=_continue_starts(main.offset, [len(value) for value in values]),
         fixed=np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
         submaps=(*main.submaps, *moved.submaps),
         sightings=(*main.sightings, *moved.sightings),
@@ -602,7 +604,7 @@ def merged(
     return graph, np.concatenate([state, *values])
 
 
-def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
+def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
     """Renumber landmarks; those with the same new number become one node, at the value of the
     first.
 
@@ -620,12 +622,12 @@ def tied(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph
     renamed = replace(
         graph,
         landmarks=first,
-        condensed=None if old is None else tied_nodes(old, sizes, node_of, becomes),
+        condensed=None if old is None else tie_nodes(old, sizes, node_of, becomes),
     )
-    return _renumbered(renamed, node_of, remaining), state[np.repeat(remaining, sizes)]
+    return _renumber_nodes(renamed, node_of, remaining), state[np.repeat(remaining, sizes)]
 
 
-def _moved(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
+def _transform_value(main_from_other: Float[np.ndarray, "3"], value: Values) -> Values:
     if len(value) == 3:
         return compose(main_from_other, value)
     return transformed(main_from_other, value) if len(value) == 2 else value

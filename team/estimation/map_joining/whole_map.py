@@ -30,22 +30,21 @@ def initial_map(
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
 
-def joined(whole: WholeMap, local: LocalMap) -> WholeMap:
+def join_submap(whole: WholeMap, local: LocalMap) -> WholeMap:
     """Compose the local map onto the current pose: known landmarks fused, new ones added.
 
     Raises NotACovarianceError where the known landmarks contradict the map numerically.
     """
     local = local.without_nodes
     after, fault = whole.joined(local.ids, local.mean, local.covariance)
-    _refuse(fault)
+    _raise_fault(fault)
     return after
 
 
-def end_pose(
+def join_end_pose(
     whole: WholeMap, local: LocalMap, gate: float = math.inf
 ) -> tuple[PoseGaussian, int, int]:
-    """Compute the pose of `joined` alone; return the numbers of common landmarks and of refused
-    ones.
+    """Compute the pose of `join_submap` alone, with the numbers of common and of refused landmarks.
 
     gate: known landmarks whose constraints the others contradict by more are left out of the local
     map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the
@@ -55,26 +54,26 @@ def end_pose(
     pose, covariance, known, refused, fault = whole.end_pose(
         local.ids, local.mean, local.covariance, gate
     )
-    _refuse(fault)
+    _raise_fault(fault)
     return PoseGaussian(pose, covariance), known, refused
 
 
-def _refuse(fault: int) -> None:
+def _raise_fault(fault: int) -> None:
     if fault == INDEFINITE:
         raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
     if fault == SINGULAR:
         raise NotACovarianceError("a known landmark's innovation", "singular")
 
 
-def without(local: LocalMap, place: int) -> LocalMap:
+def remove_landmark(local: LocalMap, place: int) -> LocalMap:
     """Remove the landmark at this index from the local map."""
-    rows = np.delete(np.arange(len(local.mean)), _sights(local, np.array([place])))
+    rows = np.delete(np.arange(len(local.mean)), _coordinates(local, np.array([place])))
     ids = np.delete(local.ids, place)
     covariance = local.covariance[np.ix_(rows, rows)]
     return LocalMap(ids, local.mean[rows], covariance, local.node_stamps)
 
 
-def absorbed(
+def absorb_fused_map(
     whole: WholeMap,
     ids: UInt32[np.ndarray, " K"],
     means: Float[np.ndarray, "K 2"],
@@ -100,7 +99,7 @@ def absorbed(
     return _by_id(np.concatenate([own, ids]), mean, joint)
 
 
-def _sights(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+def _coordinates(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     """Indices of the coordinates of landmarks in a submap's mean, after its poses."""
     return len(local.mean) - 2 * len(local.ids) + _points(index)
 

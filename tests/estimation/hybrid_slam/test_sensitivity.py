@@ -18,7 +18,12 @@ from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
 from teamslam.team.estimation.map_joining import joining, marginals
-from teamslam.team.estimation.map_joining.joining import JoinSettings, converged, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    JoinSettings,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
 from teamslam.team.estimation.models import increment_of, model_of
 from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.robot.node import RobotNode
@@ -352,12 +357,12 @@ def biased_team(seed):
     return world, submaps, errors
 
 
-def fold_of(world, submaps, options, tick=4, full=converged):
+def fold_of(world, submaps, options, tick=4, full=solve_fold):
     fold = joining.EMPTY_FOLD
     for start in world.starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     for begin in range(0, len(submaps), tick):
-        fold = folded(fold, submaps[begin : begin + tick], options)
+        fold = fold_submaps(fold, submaps[begin : begin + tick], options)
     return full(fold, options)
 
 
@@ -426,8 +431,8 @@ def nees_per_dof(seed, biases, options):
     streams, submaps, starts = camera_team(seed, biases)
     fold = joining.EMPTY_FOLD
     for start in starts:
-        fold = started(fold, start)
-    fold = converged(folded(fold, submaps, options), options)
+        fold = add_start(fold, start)
+    fold = solve_fold(fold_submaps(fold, submaps, options), options)
     found = marginals.landmark_map(fold)
     truth = streams.landmarks[found.ids.astype(int) - 1]
     error = (found.means - truth).ravel()

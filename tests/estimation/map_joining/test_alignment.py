@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from teamslam.team.estimation.contribution import InitialPoseFactor, moment
 from teamslam.team.estimation.map_joining.alignment import (
     SharedPoints,
-    aligned,
+    align,
     procrustes,
     refusal,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import landmark_map, trajectory
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, team, wrap
@@ -72,8 +72,8 @@ def test_a_mirrored_map_is_rotated_and_never_mirrored():
 def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
     world = team(3, robots=2, submaps=10)
     vague = InitialPoseFactor("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
-    free = converged(joined(world.submaps, world.starts[:1], tick), OPTIONS)
-    known = converged(joined(world.submaps, [world.starts[0], vague], tick), OPTIONS)
+    free = solve_fold(joined(world.submaps, world.starts[:1], tick), OPTIONS)
+    known = solve_fold(joined(world.submaps, [world.starts[0], vague], tick), OPTIONS)
     assert not free.reasons
     assert len(free.islands) == 1
     one, other = landmark_map(free), landmark_map(known)
@@ -87,8 +87,8 @@ def test_an_aligned_stream_ends_where_one_with_a_vague_start_ends(tick):
 def test_maps_that_drifted_far_are_merged_and_find_the_same_optimum(seed):
     world = team(seed, submaps=25, landmarks=18, size=80.0, reach=20.0, sigmas=(0.3, 0.12, 1.2))
     vague = InitialPoseFactor("r1", 0, world.starts[1].pose, np.diag([1e6, 1e6, 1e3]))
-    free = converged(joined(world.submaps, world.starts[:1]), OPTIONS)
-    known = converged(joined(world.submaps, [world.starts[0], vague]), OPTIONS)
+    free = solve_fold(joined(world.submaps, world.starts[:1]), OPTIONS)
+    known = solve_fold(joined(world.submaps, [world.starts[0], vague]), OPTIONS)
     assert not free.reasons
     assert free.main.cost < known.main.cost + 0.1
 
@@ -116,11 +116,11 @@ def test_maps_that_disagree_are_not_merged():
 
 def test_landmarks_close_together_do_not_give_a_heading():
     in_a = np.array([[0.0, 0.0], [0.3, 0.0]])
-    found = aligned(in_a, np.eye(4), in_a + 5.0, np.eye(4))
+    found = align(in_a, np.eye(4), in_a + 5.0, np.eye(4))
     reason = refusal(SharedPoints(2), found, 0.3)
     assert reason is not None
     assert "too close together" in reason
-    apart = aligned(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
+    apart = align(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
     assert refusal(SharedPoints(2), apart, 0.3) is None
 
 
@@ -156,7 +156,7 @@ def test_a_free_stream_before_any_with_a_start_joins_the_frame_of_the_start():
         for each in world.submaps
     ]
     fold = joined(sorted(late, key=lambda each: each.key), world.starts[1:])
-    found = landmark_map(converged(fold, OPTIONS))
+    found = landmark_map(solve_fold(fold, OPTIONS))
     assert len(fold.islands) == 1
     assert fold.frame == ("r1", 0), "the stream whose known start fixes the frame names it"
     assert np.abs(found.means - world.landmarks[found.ids]).max() < 1.5
@@ -168,7 +168,7 @@ def test_a_free_stream_before_any_with_a_start_joins_the_frame_of_the_start():
 def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
     world = team(8, robots=3, submaps=6)
     apart = seeing_only(world.submaps, "r0", [])
-    fold = converged(joined(apart, world.starts[:1]), OPTIONS)
+    fold = solve_fold(joined(apart, world.starts[:1]), OPTIONS)
     assert fold.frame == ("r0", 0)
     assert len(fold.islands) == 2
     assert fold.home[("r1", 0)] == fold.home[("r2", 0)]
@@ -184,11 +184,11 @@ def test_two_free_islands_join_each_other_while_the_main_one_knows_neither():
 
 def test_with_no_start_known_the_whole_team_is_in_the_frame_of_the_smallest_stream():
     world = team(9, robots=3, submaps=8)
-    fold = converged(joined(world.submaps, []), OPTIONS)
+    fold = solve_fold(joined(world.submaps, []), OPTIONS)
     assert (fold.frame, len(fold.islands), len(fold.joined)) == (("r0", 0), 1, 2)
     found, known = (
         landmark_map(fold),
-        landmark_map(converged(joined(world.submaps, world.starts), OPTIONS)),
+        landmark_map(solve_fold(joined(world.submaps, world.starts), OPTIONS)),
     )
     apart = (np.linalg.norm(m[:, None] - m[None], axis=2) for m in (found.means, known.means))
     np.testing.assert_allclose(*apart, atol=0.6)

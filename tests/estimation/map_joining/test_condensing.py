@@ -15,20 +15,20 @@ from teamslam.team.estimation.map_joining import (
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import aged, final_cost, take_step
+from teamslam.team.estimation.map_joining.gauss_newton import age_factors, final_cost, take_step
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
     JoinSettings,
     Tick,
-    folded,
-    started,
+    add_start,
+    fold_submaps,
 )
 from teamslam.team.estimation.map_joining.memory import MOST, Memory, Observed
 from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
 from teamslam.team.estimation.map_joining.path_elimination import quadratic
 from teamslam.team.estimation.map_joining.relinearising import is_due, restore_submaps
-from teamslam.team.estimation.map_joining.submap_graph import tied
+from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,
@@ -52,7 +52,7 @@ def ticks_of(world):
 def empty_fold(world):
     fold = EMPTY_FOLD
     for start in world.starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     return fold
 
 
@@ -60,8 +60,8 @@ def both(world, settings):
     """The full fold and the bounded one."""
     full = bounded = empty_fold(world)
     for tick in ticks_of(world):
-        full = folded(full, tick, settings)
-        bounded = folded(condense_submaps(bounded, Limits(0, LAG)), tick, settings)
+        full = fold_submaps(full, tick, settings)
+        bounded = fold_submaps(condense_submaps(bounded, Limits(0, LAG)), tick, settings)
     return full, bounded
 
 
@@ -176,7 +176,7 @@ def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monke
     """Inter-robot measurements connect the runs of one robot with those of others."""
     world = meeting(3, robots=3, submaps=9)
     fold = joined_with(world.submaps, world.starts, world.sightings, ROBUST)
-    fold = replace(fold, islands={fold.main_key: aged(fold.main, 100)})
+    fold = replace(fold, islands={fold.main_key: age_factors(fold.main, 100)})
     monkeypatch.setattr(path_elimination, "RUN", 3)
     by_runs = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     monkeypatch.setattr(
@@ -260,7 +260,7 @@ def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
     island = bounded.main
     before = island.graph
     one, two = sorted(before.landmarks, key=before.landmarks.__getitem__)[5:7]
-    after, state = tied(before, island.state, {two: one})
+    after, state = tie_landmarks(before, island.state, {two: one})
     assert len(after.condensed.nodes) == len(before.condensed.nodes) - 1
     state = state + 0.1 * np.random.default_rng(1).normal(size=len(state))
     node_of = np.cumsum(np.arange(len(before.fixed)) != before.landmarks[two]) - 1

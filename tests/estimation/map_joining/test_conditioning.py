@@ -12,12 +12,16 @@ from teamslam.team.estimation.map_joining.conditioning import (
     TRUSTING,
     RobotPrior,
     SubmapCorrection,
-    followed,
-    pose_now,
+    compose_pose,
+    join_pending,
 )
-from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal, settled
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    JoinSettings,
+    joint_marginal,
+    solve_island,
+)
 from teamslam.team.estimation.map_joining.marginals import prior_for, trajectory
-from teamslam.team.estimation.map_joining.whole_map import without
+from teamslam.team.estimation.map_joining.whole_map import remove_landmark
 from teamslam.team.estimation.se2 import compose, exponential, tangent
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
@@ -32,7 +36,7 @@ def joined(submaps, starts, settings=OPTIONS):
 
 
 def team_pose(prior, pending, open_window):
-    return pose_now(followed(prior.whole, pending).whole, open_window).pose
+    return compose_pose(join_pending(prior.whole, pending).whole, open_window).pose
 
 
 def later(world, robot, known):
@@ -72,8 +76,8 @@ def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
         before, after = later(world, "r0", 3)
         prior = prior_for(joined(before, world.starts), "r0", 0)
         pending = [each.local for each in after]
-        found = conditioning._solved(prior.whole, pending)
-        island, _, _ = settled(conditioning._island(prior.whole, pending, TRUSTING))
+        found = conditioning._solve_chain(prior.whole, pending)
+        island, _, _ = solve_island(conditioning._make_island(prior.whole, pending, TRUSTING))
         graph = island.graph
         nodes = [graph.streams[conditioning.SELF][-1]]
         nodes += [graph.landmarks[id_] for id_ in found.map.ids.tolist()]
@@ -100,7 +104,7 @@ def test_a_prior_or_a_submap_without_a_covariance_has_no_solution():
         (prior.whole, [submap, flat]),
     ):
         with pytest.raises(NotACovarianceError):
-            followed(whole, pending)
+            join_pending(whole, pending)
 
 
 def test_an_open_window_is_one_more_submap():
@@ -120,7 +124,7 @@ def one_after_the_other(prior, pending):
     """The mutant, which was the program: each submap is linearised on the guess before it."""
     whole = prior.whole
     for each in pending:
-        whole = whole_map.joined(whole, each)
+        whole = whole_map.join_submap(whole, each)
     return whole.mean[:3]
 
 
@@ -134,7 +138,7 @@ def test_a_poor_prior_and_later_submaps_give_the_pose_of_the_full_join():
         pending = [each.local for each in after]
         path = trajectory(joined(before + after, world.starts), "r0", 0)
         poses = {
-            "ours": followed(prior.whole, pending).whole.mean[:3],
+            "ours": join_pending(prior.whole, pending).whole.mean[:3],
             "one after the other": one_after_the_other(prior, pending),
         }
         for name, pose in poses.items():
@@ -163,12 +167,14 @@ def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(s
     before, after = later(world, "r0", 5)
     prior = prior_for(joined(before, world.starts), "r0", 0)
     bad = overconfident(after[0].local, (1.0, -0.8, 0.1))
-    told = followed(prior.whole, [bad, *(each.local for each in after[1:3])])
+    told = join_pending(prior.whole, [bad, *(each.local for each in after[1:3])])
     off = told.whole.mean[:3] - world.paths["r0"][7]
     off[2] = wrap(off[2])
     assert told.disputed
     assert nees(off, told.whole.covariance[:3, :3]) < 16.3
-    assert not any(followed(prior.whole, [e.local for e in after[:n]]).disputed for n in range(4))
+    assert not any(
+        join_pending(prior.whole, [e.local for e in after[:n]]).disputed for n in range(4)
+    )
 
 
 def test_without_later_submaps_the_prior_itself_is_the_pose():
@@ -196,7 +202,7 @@ def test_of_each_submap_the_landmarks_are_counted_that_the_map_or_another_submap
     first = LocalMap(np.array([2, 3, 8], np.uint32), means, spread)
     second = LocalMap(np.array([3, 4, 9], np.uint32), means, spread)
     prior = RobotPrior(np.zeros(3), np.array([2], np.uint32), np.array([[3.0, 1.0]]), np.eye(5))
-    assert followed(prior.whole, [first, second]).known == (2, 1)
+    assert join_pending(prior.whole, [first, second]).known == (2, 1)
 
 
 def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them():
@@ -225,7 +231,7 @@ def test_a_misread_landmark_leaves_the_pose_as_it_is_without_it(seed, monkeypatc
     first, second = (each.local for each in after)
     known = [k for k, id_ in enumerate(second.ids.tolist()) if id_ in prior.ids]
     place = known[0]
-    expected, covariance = team_pose(prior, [first], without(second, place))
+    expected, covariance = team_pose(prior, [first], remove_landmark(second, place))
     wrong = misread(second, place, np.array([4.0, -3.0]))
     pose, spread = team_pose(prior, [first], wrong)
     np.testing.assert_array_equal(pose, expected)
@@ -243,7 +249,7 @@ def test_two_misread_landmarks_in_two_submaps_are_both_left_out():
     good = [each.local for each in after]
     places = [int(np.flatnonzero(np.isin(each.ids, prior.ids))[-1]) for each in good]
     bad = [misread(e, k, np.array([2.0, 5.0])) for e, k in zip(good, places, strict=True)]
-    kept = [without(e, k) for e, k in zip(good, places, strict=True)]
+    kept = [remove_landmark(e, k) for e, k in zip(good, places, strict=True)]
     expected, _ = team_pose(prior, kept[:1], kept[1])
     pose, _ = team_pose(prior, bad[:1], bad[1])
     np.testing.assert_array_equal(pose, expected)

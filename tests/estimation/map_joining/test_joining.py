@@ -15,10 +15,10 @@ from teamslam.team.estimation.map_joining.joining import (
     GapError,
     LateStartError,
     NotCanonicalError,
-    compacted,
-    converged,
-    folded,
-    started,
+    add_start,
+    compact_fold,
+    fold_submaps,
+    solve_fold,
 )
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
@@ -97,7 +97,7 @@ def windows(steps, sights, length):
 @pytest.mark.parametrize("length", [1, 2, 3, 4, 6, 12])
 def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
     steps, sights = raw_measurements()
-    fold = converged(
+    fold = solve_fold(
         joined(windows(steps, sights, length), [InitialPoseFactor("r0", 0, np.zeros(3))]), EXACTLY
     )
     mean, covariance = batch(steps, sights)
@@ -128,8 +128,8 @@ def test_taking_submaps_leaves_the_fold_before_as_it_was():
     world = team(2)
     before = joined(world.submaps[:8], world.starts)
     state, blocks = before.main.state.copy(), landmark_blocks(before).covariances.copy()
-    on = folded(before, world.submaps[8:], EXACTLY)
-    again = folded(before, world.submaps[8:], EXACTLY)
+    on = fold_submaps(before, world.submaps[8:], EXACTLY)
+    again = fold_submaps(before, world.submaps[8:], EXACTLY)
     assert before.main.state.tobytes() == state.tobytes()
     assert landmark_blocks(before).covariances.tobytes() == blocks.tobytes()
     assert on.main.state.tobytes() == again.main.state.tobytes()
@@ -139,17 +139,19 @@ def test_a_lean_fold_goes_on_to_the_same_bytes():
     world = team(2)
     before = joined(world.submaps[:8], world.starts)
     landmark_map(before)
-    on, lean_on = (folded(each, world.submaps[8:], EXACTLY) for each in (before, compacted(before)))
+    on, lean_on = (
+        fold_submaps(each, world.submaps[8:], EXACTLY) for each in (before, compact_fold(before))
+    )
     assert on.main.state.tobytes() == lean_on.main.state.tobytes()
     assert landmark_map(on).covariance.tobytes() == landmark_map(lean_on).covariance.tobytes()
-    assert "posterior" not in vars(compacted(before).main)
+    assert "posterior" not in vars(compact_fold(before).main)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     world = team(seed, robots=3, submaps=10)
-    one_by_one = converged(joined(world.submaps, world.starts, tick=1), EXACTLY)
-    at_once = converged(joined(world.submaps, world.starts, tick=1000), EXACTLY)
+    one_by_one = solve_fold(joined(world.submaps, world.starts, tick=1), EXACTLY)
+    at_once = solve_fold(joined(world.submaps, world.starts, tick=1000), EXACTLY)
     assert one_by_one.change < 1e-11
     np.testing.assert_allclose(
         landmark_map(one_by_one).means, landmark_map(at_once).means, atol=1e-8
@@ -168,13 +170,13 @@ def test_a_submap_out_of_the_canonical_order_is_an_error():
         joined([world.submaps[1], world.submaps[0]], world.starts)
     fold = joined(world.submaps[:4], world.starts)
     with pytest.raises(NotCanonicalError):
-        folded(fold, world.submaps[3:4], EXACTLY)
+        fold_submaps(fold, world.submaps[3:4], EXACTLY)
 
 
 def test_a_start_after_the_first_submap_is_an_error():
     world = team(4)
     with pytest.raises(LateStartError, match=r"r1 \(incarnation 0\)"):
-        started(joined(world.submaps[:2], world.starts), world.starts[1])
+        add_start(joined(world.submaps[:2], world.starts), world.starts[1])
 
 
 # --- the mathematics of one factor ---
@@ -227,7 +229,7 @@ def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():
 def test_the_redundancies_of_submaps_and_priors_add_up_to_the_joint_degrees_of_freedom():
     world = team(8, robots=3)
     starts = [world.starts[0], *(replace(s, covariance=np.eye(3)) for s in world.starts[1:])]
-    fold = converged(joined(world.submaps, starts), EXACTLY)
+    fold = solve_fold(joined(world.submaps, starts), EXACTLY)
     agreement, graph = joint_cost(fold), fold.main.graph
     assert agreement.dof == pytest.approx(graph.dimensions.sum() + 6 - graph.unknowns)
     assert sum(dof for _, dof in agreement.robots.values()) == pytest.approx(agreement.dof)
@@ -240,7 +242,7 @@ def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_i
     """Σ (dim − w tr(JᵀP⁻¹J Σ)) = Σ dim − unknowns: Σ is the inverse of Σ w JᵀP⁻¹J."""
     world = team(11, robots=2, submaps=10)
     options = JoinSettings(landmark_gate=gate, step_tolerance=1e-9)
-    fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
+    fold = solve_fold(joined(with_outlier(world, 15), world.starts, options), options)
     costs, graph = joint_cost(fold).submaps, fold.main.graph
     assert (
         min(
@@ -313,7 +315,7 @@ def test_of_many_landmarks_a_prior_has_the_nearest():
 
 def test_a_known_start_stays_exactly_where_it_is():
     world = team(9, robots=2)
-    island = converged(joined(world.submaps, world.starts), EXACTLY).main
+    island = solve_fold(joined(world.submaps, world.starts), EXACTLY).main
     for start in world.starts:
         begin = island.graph.offset[island.graph.streams[start.stream][0]]
         assert island.state[begin : begin + 3].tobytes() == start.pose.tobytes()
@@ -363,7 +365,7 @@ def test_one_wrong_submap_in_forty_moves_the_map_much_unless_the_loss_is_robust(
 
     def moved(options):
         clean, wrong = (
-            landmark_map(converged(joined(each, world.starts, options, tick), options))
+            landmark_map(solve_fold(joined(each, world.starts, options, tick), options))
             for each in (world.submaps, submaps)
         )
         sigma = np.sqrt(np.diag(clean.covariance)).reshape(-1, 2)
@@ -376,7 +378,7 @@ def test_one_wrong_submap_in_forty_moves_the_map_much_unless_the_loss_is_robust(
 def test_the_wrong_submap_is_the_one_with_discounted_landmarks_and_the_large_cost():
     world = team(11, robots=2, submaps=20)
     options = JoinSettings()
-    fold = converged(joined(with_outlier(world, 15), world.starts, options), options)
+    fold = solve_fold(joined(with_outlier(world, 15), world.starts, options), options)
     costs = joint_cost(fold).submaps
     weights = np.split(fold.main.estimate.landmark_weights, fold.main.graph.landmark_start[1:-1])
     assert min(range(40), key=lambda k: weights[k].min(initial=1.0)) == 15
@@ -386,7 +388,7 @@ def test_the_wrong_submap_is_the_one_with_discounted_landmarks_and_the_large_cos
 def test_a_true_loop_closure_is_not_taken_for_an_outlier():
     world = team(12, robots=1, submaps=30, landmarks=8, reach=6.0, sigmas=(0.1, 0.1, 0.05))
     options = JoinSettings()
-    plain = landmark_map(converged(joined(world.submaps, world.starts, tick=1), EXACTLY))
-    robust = landmark_map(converged(joined(world.submaps, world.starts, options, 1), options))
+    plain = landmark_map(solve_fold(joined(world.submaps, world.starts, tick=1), EXACTLY))
+    robust = landmark_map(solve_fold(joined(world.submaps, world.starts, options, 1), options))
     sigma = np.sqrt(np.diag(plain.covariance)).reshape(-1, 2)
     assert (np.abs(robust.means - plain.means) < 1.5 * sigma).all()

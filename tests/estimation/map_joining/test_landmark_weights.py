@@ -11,22 +11,22 @@ from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
-    aged,
+    age_factors,
     ages,
     final_cost,
-    iterated,
-    settled,
+    iterate_tick,
+    solve_island,
     take_step,
 )
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_blocks,
     landmark_map,
     prior_for,
 )
-from teamslam.team.estimation.map_joining.merging import sighted
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, extended
+from teamslam.team.estimation.map_joining.merging import add_sightings
+from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, solved, team
@@ -51,7 +51,7 @@ def mistaken(world, seed, share=0.3):
     return submaps
 
 
-def fold_of(world, submaps, options, full=converged):
+def fold_of(world, submaps, options, full=solve_fold):
     return full(joined_with(submaps, world.starts, (), options), options)
 
 
@@ -222,16 +222,16 @@ def closed_loop(options):
     starts = {(robot, 0): InitialPoseFactor(robot, 0, np.zeros(3)) for robot in ("r0", "r1")}
     submaps = [standing("r0", (0.0, 0.0), 0.01), standing("r1", (10.0, 3.5), 1.0)]
     seen = InterRobotFactor("r0", 0, 0, 500, "r1", np.array([10.0, 0.0]), np.diag([1e-4, 1e-6]))
-    graph, state = extended(EMPTY_GRAPH, np.zeros(0), submaps, starts, {})
+    graph, state = add_submaps(EMPTY_GRAPH, np.zeros(0), submaps, starts, {})
     island = Island(graph, state, ages(len(submaps)), ages(0), options)
-    island, waiting = sighted(island, [seen])
+    island, waiting = add_sightings(island, [seen])
     assert waiting == ()
     return island
 
 
 def after(ticks, island):
     for _ in range(ticks):
-        island = iterated(island)
+        island = iterate_tick(island)
     return island
 
 
@@ -250,10 +250,10 @@ def test_a_true_sighting_bends_the_chain_tick_by_tick_and_one_that_is_judged_at_
 
 
 def test_a_full_solution_anneals_what_has_been_judged_anew():
-    judged = aged(replace(after(10, closed_loop(AT_ONCE)), settings=ANNEALED), 100)
+    judged = age_factors(replace(after(10, closed_loop(AT_ONCE)), settings=ANNEALED), 100)
     assert (judged.sighting_scale == 1.0).all()
     assert off_m(judged) > 2.0
-    solved, _, change = settled(judged)
+    solved, _, change = solve_island(judged)
     assert off_m(solved) < 0.3
     assert change < ANNEALED.step_tolerance
     assert (solved.scale == 1.0).all(), "it ends at the final scale"
@@ -311,7 +311,7 @@ def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(
 def test_the_map_has_the_landmarks_own_sigma_and_the_robots_priors_have_not():
     world = team(3)
     settings = JoinSettings()
-    fold = converged(joined_with(world.submaps, world.starts, (), settings, 1000), settings)
+    fold = solve_fold(joined_with(world.submaps, world.starts, (), settings, 1000), settings)
     island = replace(fold.main, settings=replace(settings, landmark_sigma=0.03))
     wider = replace(fold, islands={**fold.islands, fold.main_key: island})
     before, after = landmark_map(fold), landmark_map(wider)

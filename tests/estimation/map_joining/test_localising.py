@@ -5,7 +5,7 @@ import pytest
 
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.estimation.map_joining.conditioning import Posed
-from teamslam.team.estimation.map_joining.localising import localised
+from teamslam.team.estimation.map_joining.localising import locate_robot
 from teamslam.team.estimation.map_joining.whole_map import initial_map
 from teamslam.team.estimation.se2 import compose, inverse, transformed, wrapped
 from teamslam.team.estimation.submap import LocalMap
@@ -39,7 +39,7 @@ def drawn(seed, seen, moved=()):
 
 
 def placed(team, window) -> Posed | str:
-    return localised(team, initial_map(np.zeros(3), None), window)
+    return locate_robot(team, initial_map(np.zeros(3), None), window)
 
 
 def nees(found: Posed) -> float:

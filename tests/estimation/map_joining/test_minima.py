@@ -10,16 +10,21 @@ from hypothesis import strategies as st
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.map_joining import gauss_newton, minima
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
 from teamslam.team.estimation.map_joining.minima import (
     Search,
-    minimum,
-    searched,
-    suspicious,
+    is_suspicious,
+    search_minima,
+    solve_minimum,
     warnings,
-    widened,
+    widen_search,
 )
-from teamslam.team.estimation.map_joining.relaxation import relaxed
+from teamslam.team.estimation.map_joining.relaxation import relax_headings
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting, mirrored
 from tests.estimation.submap_world import team, wrap
@@ -45,7 +50,7 @@ def thrown(island, seed):
 def test_the_relaxation_of_exact_submaps_is_the_truth_whatever_the_guess(seed):
     world = team(seed % 50, robots=2, submaps=5, sigmas=(1e-7, 1e-7, 1e-7))
     island = island_of(world)
-    found = relaxed(island.graph, thrown(island, seed).state)
+    found = relax_headings(island.graph, thrown(island, seed).state)
     for robot, path in world.paths.items():
         for node, pose in zip(island.graph.streams[robot, 0][1:], path, strict=True):
             begin = island.graph.offset[node]
@@ -57,8 +62,8 @@ def test_the_relaxation_takes_sightings_and_priors():
     world = meeting(2, robots=2, submaps=3, sigmas=(1e-4, 1e-4))
     exact = [replace(s, covariance=1e-8 * np.eye(3)) for s in world.starts]
     island = joined_with(world.submaps, exact, world.sightings, OPTIONS, 1000).main
-    solved = minimum(island).island.state
-    found = relaxed(island.graph, thrown(island, 3).state)
+    solved = solve_minimum(island).island.state
+    found = relax_headings(island.graph, thrown(island, 3).state)
     points = island.graph.offset[:-1]
     away = np.hypot(*(found - solved)[np.array([points, points + 1])])
     assert away.max() < 1.0
@@ -69,11 +74,11 @@ def test_a_search_leaves_the_wrong_minimum_that_gauss_newton_stays_in():
     for seed in range(8):
         sparse = {"size": 60.0, "reach": 15.0, "sigmas": (0.3, 0.15, 1.0)}
         island = island_of(team(seed, robots=1, submaps=20, landmarks=3, **sparse))
-        right = searched([island]).best.cost
+        right = search_minima([island]).best.cost
         lost = thrown(island, seed)
-        alone = minimum(lost).cost
+        alone = solve_minimum(lost).cost
         wrong += alone > right + 1.0
-        search = searched([lost])
+        search = search_minima([lost])
         assert search.best.cost < right + 0.1
         assert search.gained == pytest.approx(alone - search.best.cost)
         assert warnings(search) == []
@@ -90,25 +95,25 @@ def test_a_cost_that_the_degrees_of_freedom_do_not_allow_is_said():
         for each in world.submaps
     ]
     clean, told = (
-        converged(joined_with(submaps, world.starts, (), OPTIONS, len(submaps)), OPTIONS)
+        solve_fold(joined_with(submaps, world.starts, (), OPTIONS, len(submaps)), OPTIONS)
         for submaps in (world.submaps, spoilt)
     )
     assert clean.warnings == ()
     (text,) = told.warnings
     assert "the map does not fit its submaps: chi²" in text
-    assert suspicious(told.main, told.main.cost)
+    assert is_suspicious(told.main, told.main.cost)
 
 
 @pytest.mark.parametrize("seed", [1, 12])
 def test_a_long_curved_valley_is_gone_along_to_its_end(seed, monkeypatch):
     far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
     island = island_of(team(seed, robots=1, submaps=30, landmarks=3, **far))
-    island = replace(island, state=relaxed(island.graph, island.state))
-    found = minimum(island)
+    island = replace(island, state=relax_headings(island.graph, island.state))
+    found = solve_minimum(island)
     assert found.iterations < 25
     assert found.change < OPTIONS.step_tolerance
     monkeypatch.setattr(gauss_newton, "HALVINGS", 0)
-    creeping = minimum(island)
+    creeping = solve_minimum(island)
     assert creeping.iterations == OPTIONS.max_iterations, "the mutant damps at once"
     assert creeping.cost > found.cost + 10.0
 
@@ -117,14 +122,16 @@ def test_a_map_that_is_not_settled_is_said(monkeypatch):
     monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
     island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
     hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
-    assert any("is not settled: after 1 iterations" in text for text in warnings(searched([hasty])))
+    assert any(
+        "is not settled: after 1 iterations" in text for text in warnings(search_minima([hasty]))
+    )
 
 
 def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatch):
     lost = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
     monkeypatch.setattr(gauss_newton, "HALVINGS", 0)
     monkeypatch.setattr(gauss_newton, "MOST_DAMPING", 1e-4)
-    stuck = minimum(lost)
+    stuck = solve_minimum(lost)
     assert stuck.iterations < OPTIONS.max_iterations
     assert stuck.change > 1.0, "the mutant says 0"
     assert any("is not settled" in text for text in warnings(Search(stuck, 0.0, None)))
@@ -133,12 +140,12 @@ def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatc
 def test_what_has_not_settled_is_solved_on(monkeypatch):
     far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
     island = island_of(team(1, robots=1, submaps=30, landmarks=3, **far))
-    state = relaxed(island.graph, island.state)
+    state = relax_headings(island.graph, island.state)
     hasty = replace(island, state=state, settings=replace(OPTIONS, max_iterations=6))
-    assert minimum(hasty).change > minima.SETTLED_M
-    assert searched([hasty]).best.change <= minima.SETTLED_M
+    assert solve_minimum(hasty).change > minima.SETTLED_M
+    assert search_minima([hasty]).best.change <= minima.SETTLED_M
     monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
-    assert searched([hasty]).best.change > minima.SETTLED_M, "the mutant leaves it"
+    assert search_minima([hasty]).best.change > minima.SETTLED_M, "the mutant leaves it"
 
 
 @pytest.mark.parametrize(("landmark_sigma", "said"), [(6.0, True), (0.2, False)])
@@ -147,12 +154,12 @@ def test_a_robot_whose_heading_no_landmark_gives_is_said(landmark_sigma, said):
     wide = np.diag([100.0, 100.0, 9.0])
     starts = [world.starts[0], replace(world.starts[1], covariance=wide)]
     island = joined_with(world.submaps, starts, (), OPTIONS).main
-    found = [text for text in warnings(searched([island])) if "is placed weakly" in text]
+    found = [text for text in warnings(search_minima([island])) if "is placed weakly" in text]
     assert [text.split(" is ")[0] for text in found] == ["r1 (incarnation 0)"] * said
 
 
 def test_a_second_place_that_fits_as_well_is_found_and_said():
-    search = searched(mirrored(30.0, OPTIONS))
+    search = search_minima(mirrored(30.0, OPTIONS))
     assert search.second is not None
     assert search.ambiguous
     (text,) = warnings(search)
@@ -160,7 +167,7 @@ def test_a_second_place_that_fits_as_well_is_found_and_said():
 
 
 def test_a_place_that_the_measurements_exclude_is_no_second_place():
-    search = searched(mirrored(0.02, OPTIONS))
+    search = search_minima(mirrored(0.02, OPTIONS))
     assert not search.ambiguous
     assert warnings(search) == []
 
@@ -184,15 +191,15 @@ def hinged(apart, turn=0.1, sigma=0.8):
             for robot, k, mean, sigmas, ids in said
         )
     ]
-    fold = started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
-    return folded(fold, sorted(submaps, key=lambda each: each.key), OPTIONS)
+    fold = add_start(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
+    return fold_submaps(fold, sorted(submaps, key=lambda each: each.key), OPTIONS)
 
 
 @pytest.mark.parametrize("apart", [9.0, 13.0])
 def test_a_chain_that_may_be_folded_to_the_other_side_is_said(apart):
     fold = hinged(apart)
-    assert not searched([fold.main]).ambiguous, "the mutant that does not mirror sees one map"
-    wider = widened(searched([fold.main]))
+    assert not search_minima([fold.main]).ambiguous, "the mutant that does not mirror sees one map"
+    wider = widen_search(search_minima([fold.main]))
     assert wider.ambiguous
     turns = [
         each.state[each.graph.offset[each.graph.streams["r1", 0][2]] + 2]
@@ -202,18 +209,18 @@ def test_a_chain_that_may_be_folded_to_the_other_side_is_said(apart):
     cosine = (apart**2 - 5.0**2 - 10.0**2) / (2.0 * 5.0 * 10.0)
     np.testing.assert_allclose(np.cos(turns), cosine, atol=0.1)
     assert turns[0] * turns[1] < 0.0
-    (text,) = converged(fold, OPTIONS).warnings
+    (text,) = solve_fold(fold, OPTIONS).warnings
     assert "another map fits about as well" in text
 
 
 def test_a_chain_that_is_known_to_turn_left_is_not_said():
-    assert converged(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).warnings == ()
+    assert solve_fold(hinged(13.0, turn=1.1, sigma=0.2), OPTIONS).warnings == ()
 
 
 def test_the_lower_one_of_two_sides_is_the_map():
     fold = hinged(13.0, turn=0.8, sigma=0.8)
-    lower = widened(searched([fold.main]))
+    lower = widen_search(search_minima([fold.main]))
     other = Search(lower.second, 0.0, None)
-    found = widened(other)
+    found = widen_search(other)
     assert found.best.cost == pytest.approx(lower.best.cost)
     assert found.gained == pytest.approx(lower.second.cost - lower.best.cost)

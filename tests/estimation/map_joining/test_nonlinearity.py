@@ -9,10 +9,15 @@ from teamslam.team.estimation.map_joining import nonlinearity
 from teamslam.team.estimation.map_joining.gauss_newton import (
     JoinSettings,
     joint_marginal,
-    solved_with_fixed,
+    solve_with_fixed,
 )
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
-from teamslam.team.estimation.map_joining.minima import minimum, searched, warnings
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
+from teamslam.team.estimation.map_joining.minima import search_minima, solve_minimum, warnings
 from teamslam.team.estimation.map_joining.nonlinearity import understated_uncertainty
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import drawn, local_truth
@@ -27,7 +32,7 @@ def latecomer(blind, seed=0, turn=0.09):
     turn: of each submap's end [rad].
     """
     rng = np.random.default_rng(seed)
-    fold = started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
+    fold = add_start(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3)))
     submaps = [seeing("r0", 0, np.zeros(3), rng)]
     for k in range(blind):
         truth = np.array([10.0, 0.0, 0.0])
@@ -36,7 +41,7 @@ def latecomer(blind, seed=0, turn=0.09):
         submaps.append(Contribution("r1", 0, k, 1000 * (k + 1), local))
     submaps.append(seeing("r1", blind, np.array([-3.0, 2.0, 0.3]), rng))
     ordered = sorted(submaps, key=lambda each: each.key)
-    return converged(folded(fold, ordered, OPTIONS), OPTIONS)
+    return solve_fold(fold_submaps(fold, ordered, OPTIONS), OPTIONS)
 
 
 def seeing(robot, sequence, pose, rng):
@@ -52,9 +57,9 @@ def start_node(fold):
 
 def test_a_number_is_held_where_the_rest_has_the_least_cost():
     fold = latecomer(blind=10)
-    island = minimum(fold.main).island
+    island = solve_minimum(fold.main).island
     at = int(island.graph.offset[start_node(fold)]) + 2
-    found = solved_with_fixed(island, at, 0.3, 12)
+    found = solve_with_fixed(island, at, 0.3, 12)
     assert found.state[at] - island.state[at] == pytest.approx(0.3)
     gradient = found.estimate.gradient
     assert abs(gradient[at]) > 0.1
@@ -96,14 +101,14 @@ def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
 
 def test_a_straight_valley_is_no_bend_however_wide():
     wide = InitialPoseFactor("r1", 0, np.zeros(3), np.diag([4.0, 4.0, 0.25]))
-    fold = started(started(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3))), wide)
+    fold = add_start(add_start(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3))), wide)
     rng = np.random.default_rng(1)
     submaps = [seeing("r0", 0, np.zeros(3), rng)]
-    fold = folded(fold, submaps, OPTIONS)
+    fold = fold_submaps(fold, submaps, OPTIONS)
     local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), 1e-4 * np.eye(3))
-    fold = folded(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
+    fold = fold_submaps(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
     assert understated_uncertainty(fold.main, start_node(fold)) is None
-    assert not [text for text in warnings(searched([fold.main])) if "farther off" in text]
+    assert not [text for text in warnings(search_minima([fold.main])) if "farther off" in text]
 
 
 def test_a_robot_whose_initial_pose_is_given_costs_no_profile(monkeypatch):

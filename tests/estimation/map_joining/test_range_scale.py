@@ -12,16 +12,16 @@ from teamslam.team.estimation.contribution import Contribution, InitialPoseFacto
 from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import settled
+from teamslam.team.estimation.map_joining.gauss_newton import solve_island
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     JoinSettings,
-    converged,
-    folded,
-    started,
+    add_start,
+    fold_submaps,
+    solve_fold,
 )
 from teamslam.team.estimation.map_joining.markers import add_markers
-from teamslam.team.estimation.map_joining.submap_graph import tied
+from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from teamslam.team.estimation.se2 import compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.sighting_world import joined_with
@@ -83,7 +83,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0)
 
 
 def fold_of(submaps, starts, options):
-    return converged(joined_with(submaps, starts, (), options, len(submaps)), options)
+    return solve_fold(joined_with(submaps, starts, (), options, len(submaps)), options)
 
 
 # --- noise at the joined map's ranges ---
@@ -171,12 +171,12 @@ def hidden(submaps, starts, options):
         replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids, unnamed=together))
         for x in submaps
     ]
-    fold = folded(started(started(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
+    fold = fold_submaps(add_start(add_start(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
     assert len(fold.main.graph.landmarks) == 5 * len(unnamed)
     number = {members[0]: own for own, members in fold.landmarks.sets.items()}
     first = {each.local: own for each, own in sorted(number.items(), reverse=True)}
     becomes = {own: first[each.local] for each, own in number.items()}
-    graph, state = tied(fold.main.graph, fold.main.state, becomes)
+    graph, state = tie_landmarks(fold.main.graph, fold.main.state, becomes)
     united = replace(fold.main, graph=graph, state=state)
     return replace(fold, islands={fold.main_key: united}), first
 
@@ -186,7 +186,7 @@ def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
     options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
     named = fold_of(submaps, starts, options).main
     fold, first = hidden(submaps, starts, options)
-    joined, *_ = settled(add_markers(fold.main))
+    joined, *_ = solve_island(add_markers(fold.main))
     graph = joined.graph
     assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
     assert len(graph.priors) == len(named.graph.priors)
@@ -207,12 +207,12 @@ def test_a_map_says_that_landmarks_without_a_name_lack_the_error_of_their_marker
         association=AssociationProfile(recent=1),
     )
     fold, _ = hidden(submaps, starts, options)
-    island, *_ = settled(fold.main)
+    island, *_ = solve_island(fold.main)
     old = condense_submaps(replace(fold, islands={fold.main_key: island}), Limits(2, lag=2))
     assert old.condensed_count
     said = "5 landmarks without a name lack the error of their marker"
-    assert [each for each in converged(old, options).warnings if said in each]
-    assert not [each for each in converged(fold, options).warnings if "marker" in each]
+    assert [each for each in solve_fold(old, options).warnings if said in each]
+    assert not [each for each in solve_fold(fold, options).warnings if "marker" in each]
 
 
 def _only_own_biases_are_discounted(graph):

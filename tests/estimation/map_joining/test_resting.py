@@ -9,7 +9,12 @@ import pytest
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
 from teamslam.team.estimation.map_joining.gauss_newton import final_cost
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, JoinSettings, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    JoinSettings,
+    add_start,
+    fold_submaps,
+)
 from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
@@ -33,9 +38,9 @@ def folds(found, settings, first, starts=None):
     """The fold after each tick."""
     fold = EMPTY_FOLD
     for start in found.starts if starts is None else starts:
-        fold = started(fold, start)
+        fold = add_start(fold, start)
     for tick in ticks_of(found):
-        fold = folded(condense_submaps(fold, Limits(0, lag=2, first=first)), tick, settings)
+        fold = fold_submaps(condense_submaps(fold, Limits(0, lag=2, first=first)), tick, settings)
         yield fold
 
 

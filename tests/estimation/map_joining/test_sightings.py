@@ -18,7 +18,7 @@ from teamslam.team.estimation.inter_robot import (
     reduced,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import converged
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential, inverse, transformed
@@ -79,7 +79,7 @@ def test_pose_nodes_without_sightings_change_nothing_in_the_map():
     world = meeting(4, robots=3)
     bare = [replace(each, local=each.local.without_nodes) for each in world.submaps]
     with_nodes, without = (
-        landmark_map(converged(joined_with(each, world.starts, [], EXACTLY), EXACTLY))
+        landmark_map(solve_fold(joined_with(each, world.starts, [], EXACTLY), EXACTLY))
         for each in (world.submaps, bare)
     )
     np.testing.assert_allclose(with_nodes.means, without.means, atol=1e-7)
@@ -105,7 +105,7 @@ def test_a_submap_without_its_nodes_is_the_marginal():
 def test_sightings_shrink_the_trajectories_covariance_and_their_redundancy_counts():
     world = meeting(5, robots=3)
     plain, seen = (
-        converged(joined_with(world.submaps, world.starts, s, EXACTLY), EXACTLY)
+        solve_fold(joined_with(world.submaps, world.starts, s, EXACTLY), EXACTLY)
         for s in ([], world.sightings)
     )
     for robot in ("r0", "r1", "r2"):
@@ -137,7 +137,7 @@ def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
     by_others = [s for s in world.sightings if s.robot != "r2"]
     options = JoinSettings()
     without, withdrawn = (
-        converged(joined_with(submaps, starts, each, options), options)
+        solve_fold(joined_with(submaps, starts, each, options), options)
         for each in (of_others, by_others)
     )
     assert without.main.state.tobytes() == withdrawn.main.state.tobytes()
@@ -150,7 +150,7 @@ def test_one_outlier_among_sightings_does_not_bend_the_robust_map():
     options = JoinSettings()
     wrong = replace(world.sightings[4], measurement=np.array([25.0, 2.0]))
     clean, spoilt = (
-        landmark_map(converged(joined_with(world.submaps, world.starts, s, options), options))
+        landmark_map(solve_fold(joined_with(world.submaps, world.starts, s, options), options))
         for s in (world.sightings, [*world.sightings[:4], wrong, *world.sightings[5:]])
     )
     sigma = np.sqrt(np.diag(clean.covariance)).reshape(-1, 2)
@@ -176,7 +176,7 @@ def test_two_islands_without_a_common_landmark_are_joined_by_a_sighting_and_its_
     for seed in range(4):
         submaps, starts, sightings, world = strangers(seed, 2)
         assert {s.robot for s in sightings} == {"r0", "r1"}
-        fold = converged(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
+        fold = solve_fold(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
         assert fold.reasons == {}
         assert fold.waiting == ()
         found = landmark_map(fold)
@@ -187,7 +187,7 @@ def test_two_islands_without_a_common_landmark_are_joined_by_a_sighting_and_its_
 
 def test_one_sighting_does_not_join_two_islands_and_the_fold_says_why():
     submaps, starts, sightings, _ = strangers(0, 1)
-    fold = converged(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
+    fold = solve_fold(joined_with(submaps, starts, sightings, EXACTLY), EXACTLY)
     assert fold.reasons == {
         ("r1", 0): "r1 (incarnation 0) not joined: 0 shared landmarks and 1 sighting, 2 needed"
     }
@@ -199,16 +199,16 @@ def test_sightings_that_contradict_each_other_join_nothing():
         replace(s, measurement=np.array([s.measurement[0], wrap(s.measurement[1] + 0.9 * k)]))
         for k, s in enumerate(sightings)
     ]
-    fold = converged(joined_with(submaps, starts, turned, EXACTLY), EXACTLY)
+    fold = solve_fold(joined_with(submaps, starts, turned, EXACTLY), EXACTLY)
     (reason,) = fold.reasons.values()
     assert "0 shared landmarks and 6 sightings disagree" in reason
 
 
 def test_islands_with_sightings_become_the_same_map_as_with_known_starts():
     submaps, _, sightings, world = strangers(2, 12)
-    free = converged(joined_with(submaps, world.starts[:1], sightings, EXACTLY), EXACTLY)
+    free = solve_fold(joined_with(submaps, world.starts[:1], sightings, EXACTLY), EXACTLY)
     vague = [world.starts[0], replace(world.starts[1], covariance=1e6 * np.eye(3))]
-    known = converged(joined_with(submaps, vague, sightings, EXACTLY), EXACTLY)
+    known = solve_fold(joined_with(submaps, vague, sightings, EXACTLY), EXACTLY)
     np.testing.assert_allclose(landmark_map(free).means, landmark_map(known).means, atol=1e-3)
 
 

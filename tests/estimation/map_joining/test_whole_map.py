@@ -8,14 +8,19 @@ import pytest
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
 from teamslam.team.estimation.map_joining.marginals import prior_for
 from teamslam.team.estimation.map_joining.whole_map import (
-    absorbed,
-    end_pose,
+    absorb_fused_map,
     initial_map,
-    joined,
-    without,
+    join_end_pose,
+    join_submap,
+    remove_landmark,
 )
 from tests.estimation.submap_world import correlated, team
 
@@ -25,7 +30,7 @@ LINEAR = (0.1, 1e-5, 0.2)
 def whole_of(world, count=None):
     whole = initial_map(world.starts[0].pose, world.starts[0].covariance)
     for each in world.submaps[:count]:
-        whole = joined(whole, each.local)
+        whole = join_submap(whole, each.local)
     return whole
 
 
@@ -35,8 +40,8 @@ def test_joining_one_after_the_other_equals_the_joint_solution_in_the_linear_cas
     world = team(seed, robots=1, submaps=6, sigmas=LINEAR)
     world.starts[0] = replace(world.starts[0], covariance=covariance)
     settings = JoinSettings(step_tolerance=1e-11)
-    fold = converged(
-        folded(started(EMPTY_FOLD, world.starts[0]), world.submaps, settings), settings
+    fold = solve_fold(
+        fold_submaps(add_start(EMPTY_FOLD, world.starts[0]), world.submaps, settings), settings
     )
     expected = prior_for(fold, "r0", 0)
     found = whole_of(world)
@@ -69,7 +74,9 @@ def test_ids_stay_ascending_when_new_landmarks_lie_between_known_ones():
 
 def test_absorbing_its_own_marginal_changes_nothing():
     whole = whole_of(team(6, robots=1, submaps=5))
-    again = absorbed(whole, whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
+    again = absorb_fused_map(
+        whole, whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:]
+    )
     np.testing.assert_array_equal(again.ids, whole.ids)
     np.testing.assert_allclose(again.mean, whole.mean, rtol=1e-12)
     np.testing.assert_allclose(again.covariance, whole.covariance, rtol=1e-9, atol=1e-14)
@@ -81,7 +88,7 @@ def test_the_pose_follows_the_absorbed_landmarks_by_regression():
     P_ll = whole.covariance[5:9, 5:9]
     P_pl = whole.covariance[:3, 5:9]
     told, spread = whole.mean[5:9] + 0.1, 0.25 * P_ll
-    after = absorbed(whole, ids, told.reshape(-1, 2), spread)
+    after = absorb_fused_map(whole, ids, told.reshape(-1, 2), spread)
     gain = P_pl @ np.linalg.inv(P_ll)
     np.testing.assert_allclose(after.mean[:3], whole.mean[:3] + gain @ np.full(4, 0.1))
     expected = whole.covariance[:3, :3] - gain @ (P_ll - spread) @ gain.T
@@ -97,7 +104,7 @@ def test_absorbing_adds_unknown_landmarks_and_keeps_their_ties():
     ids = np.array([known, 900], np.uint32)
     told = np.array([whole.mean[3:5], [7.0, 8.0]])
     spread = correlated(np.full(4, 0.3), rng)
-    after = absorbed(whole, ids, told, spread)
+    after = absorb_fused_map(whole, ids, told, spread)
     assert after.ids[-1] == 900
     np.testing.assert_array_equal(after.mean[-2:], [7.0, 8.0])
     np.testing.assert_allclose(after.covariance[-2:, 3:5], spread[2:, :2])
@@ -115,21 +122,21 @@ def test_the_end_pose_is_that_of_joining_without_the_landmark_that_the_gate_leav
     entry = len(local.mean) - 2 * len(local.ids) + 2 * bad
     moved = local.mean.copy()
     moved[entry] += 40.0 * np.sqrt(local.covariance[entry, entry] + whole.covariance.max())
-    pose, seen, refused = end_pose(whole, replace(local, mean=moved), gate=30.0)
-    expected = joined(whole, without(local, bad))
+    pose, seen, refused = join_end_pose(whole, replace(local, mean=moved), gate=30.0)
+    expected = join_submap(whole, remove_landmark(local, bad))
     assert (seen, refused) == (len(known), 1)
     np.testing.assert_allclose(pose.mean, expected.mean[:3], rtol=1e-12)
     np.testing.assert_allclose(pose.covariance, expected.covariance[:3, :3], rtol=1e-9)
-    all_of_it, seen, refused = end_pose(whole, local, gate=30.0)
+    all_of_it, seen, refused = join_end_pose(whole, local, gate=30.0)
     assert (seen, refused) == (len(known), 0)
-    np.testing.assert_allclose(all_of_it.mean, joined(whole, local).mean[:3], rtol=1e-12)
+    np.testing.assert_allclose(all_of_it.mean, join_submap(whole, local).mean[:3], rtol=1e-12)
 
 
 def test_a_map_whose_shared_landmarks_have_no_covariance_has_no_end_pose():
     world = team(6, robots=1, submaps=4, landmarks=12, reach=30.0)
     whole, local = whole_of(world, 3), world.submaps[3].local
     with pytest.raises(NotACovarianceError, match="not positive definite"):
-        end_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), local)
+        join_end_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), local)
 
 
 def test_a_map_keeps_its_numbers_and_refuses_others():

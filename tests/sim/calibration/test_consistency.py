@@ -13,8 +13,8 @@ from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
     JoinSettings,
-    converged,
-    folded,
+    fold_submaps,
+    solve_fold,
 )
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
@@ -30,7 +30,7 @@ def folds_of(seeds, claimed=1.0):
         world = team(seed, robots=4, submaps=8, landmarks=8, reach=30.0, sigmas=SIGMAS)
         submaps = [told(each, claimed) for each in world.submaps]
         fold = joined_with(submaps, world.starts, (), JoinSettings(), len(submaps))
-        folds.append(converged(fold, JoinSettings()))
+        folds.append(solve_fold(fold, JoinSettings()))
     return folds
 
 
@@ -61,7 +61,7 @@ def test_the_factor_is_never_below_one_and_one_robot_says_nothing_of_it():
     factor = covariance_factor(folds_of(range(5), 4.0), CentralConfig())
     assert factor.value == 1.0
     world = team(1, robots=1, sigmas=SIGMAS)
-    alone = converged(folded(EMPTY_FOLD, world.submaps, JoinSettings()), JoinSettings())
+    alone = solve_fold(fold_submaps(EMPTY_FOLD, world.submaps, JoinSettings()), JoinSettings())
     assert covariance_factor([alone], CentralConfig()) is None
 
 

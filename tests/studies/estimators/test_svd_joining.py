@@ -84,10 +84,10 @@ def test_the_full_covariance_is_the_joining_of_the_team():
     made = team(4)
     fold = EMPTY_FOLD
     for start in made.starts:
-        fold = joining.started(fold, start)
+        fold = joining.add_start(fold, start)
     for each in made.submaps:
-        fold = joining.folded(fold, [each], svd_joining.SETTINGS)
-    fold = joining.converged(fold, svd_joining.SETTINGS)
+        fold = joining.fold_submaps(fold, [each], svd_joining.SETTINGS)
+    fold = joining.solve_fold(fold, svd_joining.SETTINGS)
     state = joined(made, "full")
     np.testing.assert_allclose(state.fold.main.state, fold.main.state, atol=1e-9)
     assert svd_joining.variance_factor(state) == 1.0
