@@ -8,7 +8,12 @@ from teamslam.team.config import GNSS
 from teamslam.team.estimation.contribution import STATION, Contribution, InitialPoseFactor
 from teamslam.team.estimation.inter_robot import STATION_POSE, InterRobotFactor, from_station
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
 from teamslam.team.estimation.se2 import compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
 
@@ -49,10 +54,10 @@ def warnings(*, late_s=0.0, off=(0.0, 0.0), wrong=0, stated_m=STATED_M, seed=1):
         at += rng.normal(0.0, 20.0, 2) * (k < wrong)
         measured = from_station(at, stated_m**2 * np.eye(2))
         fixes.append(InterRobotFactor("r1", 0, k // EACH, stamp, GNSS, *measured, np.zeros(2)))
-    fold = started(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE))
-    fold = folded(fold, [Contribution(*STATION, 0, 0, station)], JoinSettings())
-    fold = folded(fold, submaps, JoinSettings(), fixes)
-    return [*fix_warnings(converged(fold, JoinSettings()))]
+    fold = add_start(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE))
+    fold = fold_submaps(fold, [Contribution(*STATION, 0, 0, station)], JoinSettings())
+    fold = fold_submaps(fold, submaps, JoinSettings(), fixes)
+    return [*fix_warnings(solve_fold(fold, JoinSettings()))]
 
 
 def number_after(text, word):

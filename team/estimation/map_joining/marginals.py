@@ -22,7 +22,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     joint_marginal,
-    settled,
+    solve_island,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import (
@@ -398,7 +398,9 @@ def unbounded_costs(island: Island) -> list[SubmapCost]:
         return found
     factor = scale.value * settings.covariance_factor
     try:
-        solved, *_ = settled(replace(island, settings=replace(settings, covariance_factor=factor)))
+        solved, *_ = solve_island(
+            replace(island, settings=replace(settings, covariance_factor=factor))
+        )
         again = terms(solved).submaps
     except UNSOLVABLE:
         return found

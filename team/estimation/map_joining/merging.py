@@ -106,7 +106,9 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
         return Waits(why or str(shared), after_search=False)
     both, left = place_island(main, other, found.a_from_b, waiting)
     graph = both.graph
-    others = [place_island(main, other, place, ())[0] for place in _propose_places(main, other, tied)]
+    others = [
+        place_island(main, other, place, ())[0] for place in _propose_places(main, other, tied)
+    ]
     search = search_minima([both, *(replace(both, state=each.state) for each in others)])
     rise = search.best.cost - solve_minimum(main).cost - solve_minimum(other).cost
     # Fixes whose errors drift agree with the alignment one by one (`sound_ties`), not together.
@@ -122,7 +124,9 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     if not is_solvable(search.best.island):
         return Waits(f"{shared}, with which the map has no solution", after_search=True)
     words = _describe_merge(other, shared, search, rise)
-    island, left = sighted(search.best.island, sorted((*left, *aside), key=lambda each: each.key))
+    island, left = add_sightings(
+        search.best.island, sorted((*left, *aside), key=lambda each: each.key)
+    )
     return Merge(search.best._replace(island=island), left, words)
 
 

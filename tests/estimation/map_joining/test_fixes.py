@@ -8,7 +8,12 @@ from teamslam.team.estimation.contribution import STATION, Contribution, Initial
 from teamslam.team.estimation.inter_robot import STATION_POSE, InterRobotFactor, from_station
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.island_ties import MOST_FIXES, sound_ties, ties
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, converged, folded, started
+from teamslam.team.estimation.map_joining.joining import (
+    EMPTY_FOLD,
+    add_start,
+    fold_submaps,
+    solve_fold,
+)
 from teamslam.team.estimation.map_joining.submap_graph import observer_of
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -32,9 +37,9 @@ def placed_by_fixes(count, jumping=()):
         )
         measured = from_station(at, 0.09 * np.eye(2))
         fixes.append(InterRobotFactor("r1", 0, 0, k + 1, GNSS, *measured, np.zeros(2)))
-    fold = started(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE))
-    fold = folded(fold, [Contribution(*STATION, 0, 0, station)], JoinSettings())
-    return folded(fold, [Contribution("r1", 0, 0, 1000, local)], JoinSettings(), fixes), fixes
+    fold = add_start(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE))
+    fold = fold_submaps(fold, [Contribution(*STATION, 0, 0, station)], JoinSettings())
+    return fold_submaps(fold, [Contribution("r1", 0, 0, 1000, local)], JoinSettings(), fixes), fixes
 
 
 @pytest.mark.parametrize("count", [10, 3 * MOST_FIXES + 7])
@@ -44,7 +49,7 @@ def test_an_island_is_placed_by_few_fixes_and_has_all_of_them_at_once(count):
     assert list(fold.islands) == [fold.main_key]
     assert fold.waiting == ()
     assert len(fold.main.graph.sightings) == len(fixes)
-    solved = converged(fold, JoinSettings()).main
+    solved = solve_fold(fold, JoinSettings()).main
     node = solved.graph.streams["r1", 0][0]
     at = solved.state[solved.graph.offset[node] :][:3]
     np.testing.assert_allclose(at, PLACE, atol=0.3)
@@ -55,12 +60,12 @@ def test_an_island_is_placed_by_few_fixes_and_has_all_of_them_at_once(count):
 
 def test_the_number_of_fixes_that_align_is_bounded_and_they_span_the_path():
     fold, fixes = placed_by_fixes(4 * MOST_FIXES)
-    station = folded(
-        started(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE)),
+    station = fold_submaps(
+        add_start(EMPTY_FOLD, InitialPoseFactor(*STATION, STATION_POSE)),
         [fold.contributions[0]],
         JoinSettings(),
     ).main
-    robot = folded(EMPTY_FOLD, [fold.contributions[1]], JoinSettings()).main
+    robot = fold_submaps(EMPTY_FOLD, [fold.contributions[1]], JoinSettings()).main
     assert observer_of(station.graph, fixes[0]) is not None
     used, aside = sound_ties(station, robot, ties(station.graph, robot.graph, fixes))
     assert 0.9 * MOST_FIXES < len(used) <= MOST_FIXES
