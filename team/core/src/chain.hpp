@@ -32,7 +32,7 @@ class Chain {
   explicit Chain(const LocalMap& prior) { append(prior); }
   void append(const LocalMap& submap);
 
-  // Minimises over all poses and landmarks, by the steps of `gauss_newton.solve_island` without robust
+  // Minimises over all poses and landmarks, by the steps of `gauss_newton.settled` without robust
   // losses: undamped steps are shortened to a sixteenth before they are damped. Stops where no number
   // of an undamped step reaches the tolerance.
   ChainSolution solve(int iterations, double tolerance) const;

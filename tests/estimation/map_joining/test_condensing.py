@@ -181,7 +181,7 @@ def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monke
     by_runs = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     monkeypatch.setattr(
         condensing,
-        "without_paths",
+        "eliminate_paths",
         lambda island, union, factors, _: (union, *quadratic(island, union, factors)),
     )
     at_once = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
