@@ -400,7 +400,7 @@ def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_
 
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path):
     team = scenario()
-    with pytest.raises(CalibrationError, match="30 needed"):
+    with pytest.raises(CalibrationError, match="needs 30 stretches of 10 s"):
         calibrate_models([("a log", streams(team))], team, lambda text: None)
     result = CliRunner().invoke(app, ["calibrate", "a.zip", "-o", str(tmp_path / "a.json")])
     assert result.exit_code == 2
