@@ -10,7 +10,7 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"  # before NumPy is imported, here and in every child process
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
@@ -19,7 +19,12 @@ from xdist.workermanage import WorkerController
 import tests.shapes
 
 # The same examples in every run: what fails once fails again. HYPOTHESIS_SEARCH=1 finds new ones.
-settings.register_profile("repeatable", derandomize="HYPOTHESIS_SEARCH" not in os.environ)
+settings.register_profile(
+    "repeatable",
+    derandomize="HYPOTHESIS_SEARCH" not in os.environ,
+    deadline=None,  # a test is right or wrong, however loaded the machine is
+    suppress_health_check=[HealthCheck.too_slow],
+)
 settings.load_profile("repeatable")
 
 DEFECTS = Path(__file__).with_name("open_defects.txt")
