@@ -34,7 +34,7 @@ from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldS
 from teamslam.team.config import UNNAMED, Sensor
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import unpacked
-from teamslam.team.estimation.map_joining.alignment import aligned, procrustes
+from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Sample, opened
@@ -80,7 +80,7 @@ def figures(fused: m.FusedMap, world: WorldStreams) -> Figures:
     truth, means, count = world.landmarks[rows[known]], means[known], int(known.sum())
     chosen = np.flatnonzero(np.repeat(known, 2))
     P = unpacked(floats(fused.covariance, "covariance"), 2 * len(numbers))[np.ix_(chosen, chosen)]
-    fit = aligned(truth, 1e-12 * np.eye(len(P)), means, P)
+    fit = align(truth, 1e-12 * np.eye(len(P)), means, P)
     off = truth - transform_points(np.array(procrustes(truth, means, np.ones(count))), means)
     limit = chi2_limit(fit.dof, 0.025) / fit.dof
     of = dict(zip(numbers[known].tolist(), world.landmark_ids[rows[known]].tolist(), strict=True))
