@@ -9,6 +9,7 @@ maps. So an error is located in one message; its successors are judged by its re
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
@@ -19,6 +20,7 @@ from teamslam.central.desk.verification.recorded import (
     Identity,
     Recorded,
     RecordedOutput,
+    RerunError,
     identity,
     recorded,
 )
@@ -147,7 +149,7 @@ def verify(log: Log, processes: int = 1) -> Verification:
 
 
 def _computed(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Identity, m.Message]]:
-    """Messages of the parts, in their order."""
+    """Messages of the parts, in their order; raises RerunError."""
     if processes == 1:
         yield from (part() for part in parts)
         return
@@ -156,6 +158,11 @@ def _computed(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Identit
         # The last begins first: the centre takes longest.
         begun = [pool.submit(_compute_part, number) for number in reversed(range(len(parts)))]
         yield from (each.result() for each in reversed(begun))
+    except BrokenProcessPool:
+        raise RerunError(
+            "a process that recomputed a node was killed, perhaps for its memory: on one "
+            "processor, as by `taskset -c 0`, one process recomputes all nodes"
+        ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -1,6 +1,8 @@
 """A log is recomputed to the last bit, and a change in it is named."""
 
+import os
 import random
+import signal
 import struct
 from typing import get_type_hints
 
@@ -10,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.verification import verification
 from teamslam.central.desk.verification.differences import ARRAYS
 from teamslam.central.desk.verification.recorded import RerunError
 from teamslam.central.desk.verification.verification import Verification, verify
@@ -241,6 +244,15 @@ def test_a_log_without_a_configuration_can_not_be_computed(processes, samples, t
     ]
     with pytest.raises(RerunError, match="no configuration of robot/r1"):
         verify(written(tmp_path / "log.mcap", bare), processes)
+
+
+def test_a_killed_process_of_a_verification_is_an_error_with_its_remedy(log, monkeypatch):
+    def die(*_):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    monkeypatch.setattr(verification, "recomputed_centre", die)
+    with pytest.raises(RerunError, match=r"was killed, .*: on one processor"):
+        verify(log, processes=2)
 
 
 def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(log, samples, tmp_path):
