@@ -2,15 +2,18 @@
 
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
 import tomli_w
 
 from teamslam.sim.datasets.folder_files import SCENARIO, robots_of
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.source import Report, Request, import_data
+from teamslam.sim.importing.source import Report, Request, import_data, robot_entry
+from teamslam.team.geodesy import Datum
 
 LANDMARKS = "landmarks.csv"
 
@@ -27,16 +30,25 @@ def takes_robot(folder: Path, robot: str) -> bool:
 def add_robot(request: Request, folder: Path) -> Report:
     """Import one robot into a data set, whose other files stay as they are.
 
-    An existing landmarks.csv is kept. Raises DatasetError.
+    An existing landmarks.csv is kept, and the robot's fixes are in the plane of the data set's
+    datum. Raises DatasetError.
     """
     assert request.robot is not None
     with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as place:
         added = Path(place)
-        report = import_data(request, added)
+        datum = _datum_in(folder / SCENARIO)
+        report = import_data(replace(request, datum=datum), added)
         if report.robots != [request.robot]:
             raise DatasetError(
                 f"--robot {request.robot}: {request.sources[0]} has the robots "
                 f"{', '.join(report.robots)}; one robot at a time is added to {folder}"
+            )
+        own = _datum_in(added / SCENARIO)
+        if own not in (None, datum) and (folder / SCENARIO).exists():
+            raise DatasetError(
+                f"{folder / SCENARIO}: its [central.datum] is not that of {request.robot}'s fixes, "
+                f"{own.latitude_deg}, {own.longitude_deg}: state one datum for both, here and as "
+                "[datum] in the file of topics"
             )
         scenario = _with_robot(folder, added, request.robot)
         if (added / LANDMARKS).exists():
@@ -65,7 +77,7 @@ def _with_robot(folder: Path, added: Path, robot: str) -> str:
             return ""
         entries = [*({"id": each} for each in robots_of(str(folder))), *entries]
     changed = text or tomli_w.dumps({key: own[key] for key in own if key != "robots"})
-    changed += "".join(map(_entry, entries))
+    changed += "".join(map(robot_entry, entries))
     try:
         tomllib.loads(changed)
     except tomllib.TOMLDecodeError:
@@ -76,9 +88,9 @@ def _with_robot(folder: Path, added: Path, robot: str) -> str:
     return changed
 
 
-def _entry(robot: Mapping[str, Any]) -> str:
-    mount = f"sensor.mount = {robot['sensor']['mount']}\n" if "sensor" in robot else ""
-    return f'\n[[robots]]\nid = "{robot["id"]}"\n{mount}'
+def _datum_in(path: Path) -> Datum | None:
+    found = _document(path).get("central", {}).get("datum")
+    return None if found is None else msgspec.convert(found, Datum)
 
 
 def _document(path: Path) -> Mapping[str, Any]:

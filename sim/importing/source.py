@@ -4,6 +4,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -43,7 +44,8 @@ class Request:
     """Import request.
 
     sources: files or folders. starts: initial poses by robot (pose, then two or no standard
-    deviations); "" is the only robot. truth: trajectory of the only robot.
+    deviations); "" is the only robot. truth: trajectory of the only robot. datum: origin of the
+    plane of fixes, where the topics state none; None: the first fix.
     """
 
     sources: Sequence[Path]
@@ -52,6 +54,7 @@ class Request:
     columns: Path | None = None
     ros2: Path | None = None
     truth: Path | None = None
+    datum: Datum | None = None
 
 
 @dataclass
@@ -284,10 +287,10 @@ def _bags(request: Request, folder: Path) -> Report:
             proposed = "\n".join(map(propose_assignment, request.sources))
             raise DatasetError(write_proposal(proposed, request.ros2))
         topics = load_topics(request.ros2) if request.ros2 else None
-        found, datum = [], None
+        found, datum = [], request.datum
         for path in request.sources:
             found.append(import_bag(path, topics, request.robot, datum))
-            datum = datum or found[-1].datum
+            datum = found[-1].datum or datum
     except (BagError, TopicsError) as error:
         raise DatasetError(str(error)) from None
     tables = [each for one in found for each in one.robots]
@@ -346,16 +349,26 @@ def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Pa
         if any(each.antenna):
             own["gnss"] = {"antenna": list(each.antenna)}
         robots.append(own)
-    central = {} if datum is None else {"datum": msgspec.to_builtins(datum)}
-    places = f"datum {datum.latitude_deg}, {datum.longitude_deg}" if datum is not None else ""
-    if not central and all(len(own) == 1 for own in robots):
+    if datum is None and all(len(own) == 1 for own in robots):
         return []
+    origin = "" if datum is None else f"datum {datum.latitude_deg}, {datum.longitude_deg}"
     if path.exists():
-        return [f"{path.name} exists and is kept: it needs [central.datum], {places}"] * bool(
-            places
-        )
-    document = {"base": "recorded", "world": {"path": "."}, "robots": robots}
-    document |= {"central": central} if central else {}
-    path.write_text(tomli_w.dumps(document), "utf-8")
+        kept = f"{path.name} exists and is kept: it needs [central.datum], {origin}"
+        return [kept] if origin else []
+    document: dict[str, object] = {"base": "recorded", "world": {"path": "."}}
     notes = [f"{path.name}: the models of `recorded`, with the sensors' places on the robots"]
-    return notes + [f"fixes are east and north of the {places}"] * bool(places)
+    if datum is not None:
+        document["central"] = {"datum": msgspec.to_builtins(datum)}
+        notes.append(f"fixes are east and north of the {origin}")
+    path.write_text(tomli_w.dumps(document) + "".join(map(robot_entry, robots)), "utf-8")
+    return notes
+
+
+def robot_entry(robot: Mapping[str, Any]) -> str:
+    """Text of a robot's entry in a scenario: its name, and the places of sensor and antenna."""
+    places = [
+        f"{part}.{name} = {place}\n"
+        for part in ("sensor", "gnss")
+        for name, place in robot.get(part, {}).items()
+    ]
+    return f'\n[[robots]]\nid = "{robot["id"]}"\n{"".join(places)}'

@@ -17,9 +17,12 @@ FIX = "sensor_msgs/msg/NavSatFix"
 DATUM = Datum(48.745, 9.105)
 
 
-def fixes(topic: str = "/gps/fix", frame: str = "base_link") -> list[ros.Message]:
+def fixes(
+    topic: str = "/gps/fix", frame: str = "base_link", east_m: float = 10.0
+) -> list[ros.Message]:
     """(10, 20) m from the datum without covariance, then none, then (12, 21) m with one."""
-    first, last = geodetic_from_local(DATUM, np.array([[10.0, 20.0], [12.0, 21.0]])).tolist()
+    places = np.array([[east_m, 20.0], [east_m + 2.0, 21.0]])
+    first, last = geodetic_from_local(DATUM, places).tolist()
     made = [
         ros.fix(S, frame, tuple(first)),
         ros.fix(S + S // 2, frame, (float("nan"), float("nan")), status=-1),
@@ -91,3 +94,26 @@ def test_of_two_receivers_the_user_decides_and_a_filtered_one_is_left_out(tmp_pa
     both = ros.write_bag(tmp_path / "b", [*drive(), *fixes(), *fixes("/gps/filtered")])
     assert run(both, "-o", tmp_path / "set").exit_code == 0
     assert len(read(tmp_path / "set").streams[0].fixes) == 2
+
+
+def test_fixes_of_an_added_robot_are_in_the_plane_of_the_data_set(tmp_path):
+    antenna = static("/tf_static", ("base_link", "gps", ros.vector(0.8, -0.5, 1.0), LEVEL))
+    for robot, east_m in (("ann", 10.0), ("bob", 40.0)):
+        made = [*antenna, *drive(), *fixes(frame="gps", east_m=east_m)]
+        bag = ros.write_bag(tmp_path / robot, made)
+        result = run(bag, "-o", tmp_path / "set", "--robot", robot)
+        assert result.exit_code == 0, result.output
+    one, other = (stream.fixes[:, :2] for stream in read(tmp_path / "set").streams)
+    np.testing.assert_allclose(other - one, [[30.0, 0.0], [30.0, 0.0]], atol=1e-3)
+    robots = load(scenario_beside(tmp_path / "set")).robots
+    assert [each.gnss.antenna for each in robots] == [(0.8, -0.5), (0.8, -0.5)]
+
+
+def test_a_robot_with_fixes_of_another_datum_is_not_added(tmp_path):
+    bag = ros.write_bag(tmp_path / "bag", [*drive(), *fixes()])
+    assert run(bag, "-o", tmp_path / "set", "--robot", "ann").exit_code == 0
+    topics = topics_with_datum(tmp_path / "topics.toml")
+    topics.write_text(topics.read_text().replace("robots.r1", "robots.bob"))
+    refused = run(bag, "-o", tmp_path / "set", "--robot", "bob", "--ros2", topics)
+    assert "its [central.datum] is not that of bob's fixes" in str(refused.exception)
+    assert not (tmp_path / "set" / "bob").exists()
