@@ -47,6 +47,10 @@ LEAST_MIRRORED = 4
 """Least number of such submaps."""
 MIRRORED = 0.8
 """Least share of them that fit reflected, and not as they are."""
+MIRRORED_REMEDY = (
+    "negate the robot's bearings, or its odometry's turns if these are wrong "
+    "(counter-clockwise is positive)"
+)
 
 
 class _SharedError(NamedTuple):
@@ -245,7 +249,7 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
                 value=(-1.0,),
                 sigma=(0.0,),
                 evidence=evidence,
-                remedy="negate the robot's bearings (counter-clockwise is positive)",
+                remedy=MIRRORED_REMEDY,
             )
 
 

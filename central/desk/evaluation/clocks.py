@@ -175,7 +175,7 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
     if not timed.ends_ns or not timed.ids:
         return None
     with np.errstate(all="ignore"):
-        pairs = _pairs(timed, config)
+        pairs = pairs_of(timed, config)
         if pairs is None:
             return None
         late_ns = 0
@@ -210,7 +210,7 @@ class _DeadReckoning:
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class Pairs:
     """Pairs of measurements of one landmark, at base points b_i and b_j; stretch: time stretch of
     each pair.
     """
@@ -244,6 +244,15 @@ class _Pairs:
         J = np.stack(columns, axis=2) / scale[:, :, np.newaxis]
         return _first_of_fit((self.b_j - q) / scale, J, self.stretch)
 
+    @property
+    def gaps(self) -> Float[np.ndarray, " k"]:
+        """Distance of b_j from its place by the odometry, relative to NEAR_M or the range."""
+        gaps = self.b_j - self._again(0)
+        found: Float[np.ndarray, " k"] = np.hypot(*gaps.T) / np.maximum(
+            np.hypot(*self.b_j.T), NEAR_M
+        )
+        return found
+
     def _motion(self, late_ns: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
         """Translation and turn of D(τ)."""
         one, two = self.path.at(self.t_i - late_ns), self.path.at(self.t_j - late_ns)
@@ -254,7 +263,7 @@ class _Pairs:
         return _turned(self.b_i - d, -turn)
 
 
-def _pairs(timed: Timed, config: RobotConfig) -> _Pairs | None:
+def pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
     """Pairs of subsequent measurements of a landmark; None if too few."""
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
@@ -269,7 +278,7 @@ def _pairs(timed: Timed, config: RobotConfig) -> _Pairs | None:
     stretches, which = np.unique(stamps[i] // STRETCH_NS, return_inverse=True)
     if len(stretches) < LEAST_STRETCHES:
         return None
-    return _Pairs(path, stamps[i], stamps[i + 1], points[i], points[i + 1], which)
+    return Pairs(path, stamps[i], stamps[i + 1], points[i], points[i + 1], which)
 
 
 def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:

@@ -22,6 +22,7 @@ from teamslam.central.desk.evaluation.errors import (
 from teamslam.central.desk.evaluation.gps import gps_median
 from teamslam.central.desk.evaluation.log import Collected, collect_log
 from teamslam.central.desk.evaluation.map_result import map_result, own_map
+from teamslam.central.desk.evaluation.mirrored import mirrored_cause
 from teamslam.central.desk.evaluation.peers import peer_results
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
 from teamslam.central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
@@ -88,7 +89,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     }
     end = log.newest(ch.END, m.End)
     faults = log.of_all(ch.FAULT, m.Fault)
-    late, separate_times = _clocks(log)
+    mirrored, late, separate_times = _streams(log)
     return Evaluation(
         scenario=scenario,
         map=fused,
@@ -117,14 +118,18 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         data_set=_data_set(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
         separate_times=separate_times,
+        mirrored=mirrored,
         late=late,
         recorded_ns=log.first_ns,
     )
 
 
-def _clocks(log: Collected) -> tuple[tuple[m.Diagnosis, ...], tuple[str, ...]]:
-    """Return the late clocks, by each robot's incarnation with most measurements, and the warning
-    of times that do not overlap.
+Causes = tuple[m.Diagnosis, ...]
+
+
+def _streams(log: Collected) -> tuple[Causes, Causes, tuple[str, ...]]:
+    """Return the mirrored robots and the late clocks, by each robot's incarnation with most
+    measurements, and the warning of times that do not overlap.
     """
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
@@ -136,8 +141,17 @@ def _clocks(log: Collected) -> tuple[tuple[m.Diagnosis, ...], tuple[str, ...]]:
         if span is not None:
             first, last = spans.get(robot, span)
             spans[robot] = min(first, span[0]), max(last, span[1])
-    found = (clock_cause(robot, longest[robot], configs[robot]) for robot in in_order(longest))
-    return tuple(filter(None, found)), tuple(filter(None, (separate_times_warning(spans),)))
+    names = in_order(longest)
+    mirrored = tuple(
+        found for robot in names if (found := mirrored_cause(robot, longest[robot], configs[robot]))
+    )
+    out = {each.robot for each in mirrored}
+    late = tuple(
+        found
+        for robot in names
+        if robot not in out and (found := clock_cause(robot, longest[robot], configs[robot]))
+    )
+    return mirrored, late, tuple(filter(None, (separate_times_warning(spans),)))
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:

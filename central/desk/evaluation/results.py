@@ -113,8 +113,9 @@ class Evaluation:
     mapped robot has a known initial pose, so only aligned errors are meaningful. decisions:
     closures and merges by unnamed landmarks. verdicts: an operator's, as text. states: of every
     robot in the final map. data_set: folder or file name; empty for a simulated world.
-    separate_times: of measurements that do not overlap, as text. late: clock offsets by the
-    measurements alone. recorded_ns: wall time of the first message.
+    separate_times: of measurements that do not overlap, as text. mirrored, late: bearings of the
+    wrong sign, and clock offsets, by the measurements alone. recorded_ns: wall time of the first
+    message.
     """
 
     scenario: TeamConfig | None
@@ -137,17 +138,25 @@ class Evaluation:
     data_set: str = ""
     states: Mapping[str, RobotState] = field(default_factory=dict)
     separate_times: tuple[str, ...] = ()
+    mirrored: tuple[m.Diagnosis, ...] = ()
     late: tuple[m.Diagnosis, ...] = ()
     recorded_ns: int | None = None
 
     @property
     def diagnosis(self) -> tuple[m.Diagnosis, ...]:
-        """Causes of misfit: those of the map, and late clocks by the measurements alone of robots
-        whose clocks the map does not determine.
+        """Causes of misfit: those of the map; mirrored robots, and late clocks that the map does
+        not determine, by the measurements alone.
+
+        Of a mirrored robot nothing else is a cause; nor of the team where all robots are mirrored.
         """
         of_map = () if self.map is None else self.map.diagnosis
-        named = {each.robot for each in of_map if each.cause == "clock_offset"}
-        return (*of_map, *(each for each in self.late if each.robot not in named))
+        found = {each.robot for each in self.mirrored}
+        of_all = found | {""} if found >= {*self.robots} else found
+        own = [each for each in of_map if each.cause == "mirrored" or each.robot not in of_all]
+        named = {(each.cause, each.robot) for each in own}
+        more = [each for each in self.mirrored if (each.cause, each.robot) not in named]
+        late = [each for each in self.late if (each.cause, each.robot) not in named]
+        return (*more, *own, *late)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -74,8 +74,12 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
     return judged(fold.main, landmarks, {name: each.truth for name, each in run.robots.items()})
 
 
-def final_fold(samples: Iterable[Sample]) -> Fold:
-    """The centre's final fold, recomputed from a log with plain squares and without biases."""
+def final_fold(
+    samples: Iterable[Sample], *, is_robust: bool = False, has_biases: bool = False
+) -> Fold:
+    """Recompute the centre's final fold from a log, by default with plain squares and without
+    biases.
+    """
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -87,10 +91,14 @@ def final_fold(samples: Iterable[Sample]) -> Fold:
         if value is not None:
             ticks.add_start(value)
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
-            unbiased = msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
-            ticks.add_submap(unbiased, b"", sightings.get((*stream, sequence), ()))
+            taken = submap if has_biases else _without_biases(submap)
+            ticks.add_submap(taken, b"", sightings.get((*stream, sequence), ()))
     ticks.fold_until(float("inf"))
-    return solve_fold(ticks.fold, replace(ticks.settings, robust=False))
+    return solve_fold(ticks.fold, replace(ticks.settings, robust=is_robust))
+
+
+def _without_biases(submap: m.Submap) -> m.Submap:
+    return msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
 
 
 def judged(
