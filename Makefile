@@ -23,7 +23,7 @@ LISTED := install --require-hashes --no-deps --requirement
 # The core is built without build isolation, by these.
 BUILDING := cmake nanobind ninja scikit-build-core
 CORE := $(wildcard team/core/src/* team/core/building/* team/core/CMakeLists.txt)
-NEEDS_ZIG = @$(BIN)/python team/core/building/backend.py --find > /dev/null || { \
+NEEDS_ZIG = @$(BIN)/python team/core/building/backend.py --find compiler > /dev/null || { \
   echo "No C++20 compiler here: installing that of the ziglang wheel (100 MB)"; $(PIP) $(LISTED) hashes-zig.txt; }
 CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 
@@ -43,7 +43,7 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .DELETE_ON_ERROR:
 .PHONY: run test check core check-core bench docs setup constraints clean
 
-run: $(VENV)/.runtime $(VENV)/.core
+run: $(VENV)/.runtime $(VENV)/.own
 	$(BIN)/teamslam launch waypoints --speed 20
 
 # tests/conftest.py says which worker gets what.
@@ -133,19 +133,29 @@ $(VENV)/.python:
 
 $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes-run.txt) packages at pinned versions into $(VENV): a minute or two, once"
-	$(PIP) $(LISTED) hashes-run.txt
+	@cp hashes-run.txt $(VENV)/run.txt  # without CMake (86 MB) where the machine has one
+	@! $(BIN)/python team/core/building/backend.py --find cmake > /dev/null || \
+	  sed '/^cmake==/,/[^\]$$/d' hashes-run.txt > $(VENV)/run.txt
+	$(PIP) $(LISTED) $(VENV)/run.txt
 	$(NEEDS_ZIG)
-	$(OWN) install --constraint constraints.txt --no-build-isolation --editable .
+	@echo "Compiling the core for this processor: about a minute on two cores, once"
+	$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings levels=own --editable .
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	$(PIP) $(LISTED) hashes.txt
 	$(NEEDS_ZIG)
+	@echo "Compiling the core for all processors: two minutes on two cores, once"
 	$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $(VENV)/.runtime $@
 
-# An install has built the core; it is built again once one of its sources is newer.
+# An install has built the core; it is built again once one of its sources is newer: for a run at
+# the level of this processor, for everything else at all levels.
+$(VENV)/.own: $(CORE) | $(VENV)/.runtime
+	@$(BIN)/python team/core/building/backend.py --own
+	@touch $@
+
 $(VENV)/.core: $(CORE) | $(VENV)/.runtime
-	$(BIN)/python team/core/building/backend.py
-	touch $@
+	@$(BIN)/python team/core/building/backend.py
+	@touch $(VENV)/.own $@

@@ -4,6 +4,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from datetime import datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,6 +49,7 @@ from teamslam.sim.cli.results import print_evaluation, print_nis, print_written,
 from teamslam.sim.cli.steps import Steps
 from teamslam.sim.cli.view import FoxglovePort, Open, Port, shown_on_page
 from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
+from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,7 +125,7 @@ def launch(
         ),
     ] = None,
     port: Port = 0,
-    foxglove_port: FoxglovePort = 8765,
+    foxglove_port: FoxglovePort = None,
     listen: Annotated[
         str, network(help="Where the router listens; port 0: any free one.", metavar="ENDPOINT")
     ] = ANY_PORT,
@@ -281,7 +283,9 @@ def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
     found = moving_stretches(streams.streams)
     if found >= LEAST_SPANS:
         command = f"`teamslam calibrate {dataset} -o {dataset / 'scenario.toml'}`"
-        if any(each.truth is not None for each in streams.streams):
+        if find_spec("scipy") is None:
+            command = f"`{install_command('calibrate')}`, then {command}"
+        if streams.landmarks is not None and any(s.truth is not None for s in streams.streams):
             return f"{command} learns your robots' own from the data"
         return (
             f"{command} learns the odometry's scales; without ground truth not the noise: write "

@@ -128,8 +128,8 @@ def rerun(
     Otherwise the recorded measurements pass through the same nodes again, with
     the given changes; without a change, as if every message arrived at once. For
     a data set, the reference run is computed, too. No process is started. Exit
-    status 0 only if every robot that is not left out is in the final map, with
-    --verify only if all is equal; else 1. 2: wrong use.
+    status 0 only if the log is complete and every robot that is not left out is in
+    the final map, with --verify only if all is equal; else 1. 2: wrong use.
     """
     saved_maps(map_)
     if localise:
@@ -272,6 +272,12 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
         fail("the changed run ended without a final map", FAILED)
     if missing := not_in_the_map(changed.states):
         fail("; ".join(missing), FAILED)
+    if isinstance(log, Log) and not log.complete:
+        fail(
+            f"{log.path} is cut, so the result is of the part before the cut: `teamslam repair "
+            f"{log.path} -o FIXED.mcap` completes the log",
+            FAILED,
+        )
 
 
 def _print_warnings(

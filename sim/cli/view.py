@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,17 +26,25 @@ from teamslam.sim.cli.options import (
     scenario_of,
     warn_of_holes,
 )
+from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
     from teamslam.central.desk.view.server import Shown
     from teamslam.team.recording.reader import Log
 
 _LOG = logging.getLogger("teamslam")
+FOXGLOVE_PORT = 8765
 Port = Annotated[
     int, rare(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
 ]
 FoxglovePort = Annotated[
-    int, rare(help="Where Foxglove can connect; 0: any free port.", min=0, metavar="PORT")
+    int | None,
+    rare(
+        help="Where Foxglove can connect; 0: any free port; default: 8765, if foxglove-sdk is "
+        "installed.",
+        min=0,
+        metavar="PORT",
+    ),
 ]
 Open = Annotated[
     bool | None,
@@ -67,7 +76,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 def view(
     log: LogArgument,
     port: Port = 0,
-    foxglove_port: FoxglovePort = 8765,
+    foxglove_port: FoxglovePort = None,
     host: Annotated[
         str,
         rare(
@@ -100,7 +109,8 @@ def view(
     """Show a log, or a running team by its log, on a page in a browser.
 
     Map with uncertainty, robots, paths, errors with bounds, consistency, traffic
-    and events, without remote content. Foxglove and Lichtblick can connect, too.
+    and events, without remote content. With foxglove-sdk installed, Foxglove and
+    Lichtblick can connect, too; the log opens there in any case.
     Ends with Ctrl-C.
     """
     from teamslam.team.recording.reader import log_file, open_log
@@ -130,14 +140,26 @@ def view(
 
 @contextmanager
 def shown_on_page(
-    log: Path, host: str, port: int, foxglove_port: int, browser: bool | None, *, growing: bool
+    log: Path,
+    host: str,
+    port: int,
+    foxglove_port: int | None,
+    browser: bool | None,
+    *,
+    growing: bool,
 ) -> Iterator["Shown"]:
-    """Serve a log, print the address, and open the page on request or on a display."""
+    """Serve a log, print the addresses, and open the page on request or on a display."""
     from teamslam.central.desk.view.server import session
 
+    has_sdk = find_spec("foxglove") is not None
+    if foxglove_port is not None and not has_sdk:
+        fail(f"--foxglove-port needs Foxglove's SDK: {install_command('foxglove')}", WRONG_USE)
+    if foxglove_port is None and has_sdk:
+        foxglove_port = FOXGLOVE_PORT
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")
-        typer.echo(f"foxglove  {shown.foxglove}")
+        if shown.foxglove:
+            typer.echo(f"foxglove  {shown.foxglove}")
         if _has_display() if browser is None else browser:
             import webbrowser
 

@@ -1,5 +1,6 @@
 """Determine the kind of data set at a path."""
 
+import zipfile
 from pathlib import Path
 from typing import Literal
 
@@ -8,14 +9,23 @@ from teamslam.sim.datasets.tables import DatasetError
 
 Kind = Literal["utias", "folder", "unlabelled", "graph"]
 UTIAS_MARKER = "Barcodes.dat"
+FORMATS = (
+    "expected a folder with a sub-folder for each robot, with odometry.csv and observations.csv, "
+    "or a zip of it (docs/your_data.md); a folder with odometry.csv and detections.csv; a ROS 2 "
+    "bag; a landmark graph of isam, g2o or pyfg; or the folder or zip of a UTIAS set"
+)
 
 
 def kind_of(path: str | Path) -> Kind:
     """UTIAS files, CSV tables by robot, detections, or a graph; raises DatasetError for others."""
+    if not Path(path).exists():
+        raise DatasetError(f"{path}: no such file or folder; {FORMATS}")
     if graph.is_graph(path):
         return "graph"
     if unlabelled.is_unlabelled(path):
         return "unlabelled"
+    if Path(path).is_file() and not zipfile.is_zipfile(path):
+        raise DatasetError(f"{path}: not a zip, or a damaged one, and no landmark graph; {FORMATS}")
     if folder_files.has_tables(path):
         return "folder"
     if (Path(path) / unlabelled.FILES[1]).is_file():
@@ -36,10 +46,7 @@ def kind_of(path: str | Path) -> Kind:
                 f"{path}: its CSV tables have names of their own ({shown}): `teamslam import "
                 f"{path} -o FOLDER` proposes which are what, and makes a data set of them"
             ) from None
-        raise DatasetError(
-            f"{path}: no data set in it; {folder_files.EXPECTED}; or "
-            f"{tables.EXPECTED.removeprefix('expected ')}"
-        ) from None
+        raise DatasetError(f"{path}: no data set in it; {FORMATS}") from None
 
 
 def _other_tables(place: Path) -> list[str]:

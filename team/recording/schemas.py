@@ -5,6 +5,7 @@ MessagePack `bin` of little-endian numbers, see docs/wire.md.
 """
 
 import json
+from importlib import import_module
 from typing import NamedTuple
 
 import msgspec
@@ -41,11 +42,12 @@ def declaration_of(key: str, tag: str = "") -> Declaration | None:
     if view is None:
         return None
     if isinstance(view.schema, str):
-        import foxglove.messages  # 50 ms, needed for views only
+        from mcap_protobuf.schema import build_file_descriptor_set  # needed for views only
 
-        kind_there = getattr(foxglove.messages, view.schema.removeprefix("foxglove."))
-        schema = kind_there.get_schema()
-        return Declaration(schema.encoding, schema.name, schema.encoding, schema.data)
+        name = view.schema.removeprefix("foxglove.")
+        kind_there = getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+        files = build_file_descriptor_set(kind_there).SerializeToString()
+        return Declaration("protobuf", view.schema, "protobuf", files)
     name = f"teamslam.{view.schema.__name__}"
     text = json.dumps(json_schema(view.schema), sort_keys=True).encode()
     return Declaration("json", name, "jsonschema", text)

@@ -66,8 +66,10 @@ def load_topics(path: Path) -> Topics:
     """Read a file; raises TopicsError."""
     try:
         found = msgspec.convert(tomllib.loads(path.read_text("utf-8")), Topics)
-    except (OSError, UnicodeDecodeError) as error:
-        raise TopicsError(f"{path}: can not be read: {error}") from None
+    except OSError as error:
+        raise TopicsError(f"{path}: can not be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise TopicsError(f"{path}: can not be read as UTF-8 text: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise TopicsError(f"{path}: not valid TOML: {error}") from None
     except msgspec.ValidationError as error:

@@ -254,6 +254,13 @@ def test_a_mistake_in_a_file_of_topics_is_named(tmp_path, text, words):
     assert "topics.toml" in str(error.value)
 
 
+def test_a_missing_file_of_topics_is_named_once(tmp_path):
+    path = tmp_path / "none.toml"
+    with pytest.raises(TopicsError) as error:
+        load_topics(path)
+    assert str(error.value) == f"{path}: can not be read: No such file or directory"
+
+
 def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_goes_on():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)

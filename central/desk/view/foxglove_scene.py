@@ -1,4 +1,4 @@
-"""Encode drawable objects as Foxglove messages; the only module that imports its encoders.
+"""Encode drawable objects as Foxglove messages; the only module that imports their classes.
 
 The map plane is z = 0. Rotations are about z, (0, 0, sin θ/2, cos θ/2).
 """
@@ -8,7 +8,26 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
-from foxglove import messages as fox
+from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
+from foxglove_schemas_protobuf.Color_pb2 import Color
+from foxglove_schemas_protobuf.CubePrimitive_pb2 import CubePrimitive
+from foxglove_schemas_protobuf.CylinderPrimitive_pb2 import CylinderPrimitive
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.TextPrimitive_pb2 import TextPrimitive
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from teamslam.central.desk.drawing import ellipses
 from teamslam.central.desk.view.drawn import Landmarks
@@ -26,18 +45,18 @@ _LEAST_M = 0.01
 _LAST_NS = 2**32 * 1_000_000_000 - 1
 
 
-def stamp(stamp_ns: int) -> fox.Timestamp:
+def stamp(stamp_ns: int) -> Timestamp:
     """Team time as a Foxglove time, clamped to 32 bits of seconds."""
     at = min(max(stamp_ns, 0), _LAST_NS)
-    return fox.Timestamp(at // 1_000_000_000, at % 1_000_000_000)
+    return Timestamp(seconds=at // 1_000_000_000, nanos=at % 1_000_000_000)
 
 
-def scene(entities: Iterable[fox.SceneEntity]) -> bytes:
+def scene(entities: Iterable[SceneEntity]) -> bytes:
     """Scene update; an entity replaces an earlier one of its name."""
-    return bytes(fox.SceneUpdate(entities=list(entities)).encode())
+    return SceneUpdate(entities=list(entities)).SerializeToString()
 
 
-def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.SceneEntity:
+def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> SceneEntity:
     """Team landmarks: dot, 95 % ellipse, number."""
     major, minor, direction = ellipses(landmarks.blocks)
     dots, names = [], []
@@ -54,11 +73,11 @@ def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> fox.
 
 def true_landmarks_entity(
     stamp_ns: int, truth: Float[np.ndarray, "T 2"], size_m: float
-) -> fox.SceneEntity:
+) -> SceneEntity:
     """True landmarks, as small squares."""
-    edge = fox.Vector3(x=0.25 * size_m, y=0.25 * size_m, z=_FLAT_M)
+    edge = Vector3(x=0.25 * size_m, y=0.25 * size_m, z=_FLAT_M)
     cubes = [
-        fox.CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH))
+        CubePrimitive(pose=_pose(x, y, 0.0), size=edge, color=_colour(TRUTH))
         for x, y in truth.tolist()
     ]
     return _entity(stamp_ns, "true landmarks", cubes=cubes)
@@ -74,7 +93,7 @@ def robot_entity(
     size_m: float,
     *,
     lost: bool,
-) -> fox.SceneEntity:
+) -> SceneEntity:
     """Robot: arrow, 95 % position ellipse, name, recent path."""
     x, y, theta = (float(v) for v in pose)
     P = np.array([[covariance[0, 0], covariance[0, 1], covariance[1, 1]]])
@@ -93,13 +112,13 @@ def robot_entity(
         cylinders=[disc],
         lines=[_line([*trail, (x, y)], (colour, 0.9), 3.0)],
         texts=[_label(x, y - 0.8 * size_m, f"{name} (lost)" if lost else name, shade)],
-        metadata=[fox.KeyValuePair(key="robot", value=name)],
+        metadata=[KeyValuePair(key="robot", value=name)],
     )
 
 
 def true_robot_entity(
     stamp_ns: int, name: str, pose: Float[np.ndarray, "3"], size_m: float
-) -> fox.SceneEntity:
+) -> SceneEntity:
     """True pose of a robot."""
     x, y, theta = (float(v) for v in pose)
     arrow = _arrow(_pose(x, y, theta), 0.8 * size_m, (TRUTH[0], 0.6))
@@ -108,7 +127,7 @@ def true_robot_entity(
 
 def path_entity(
     stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, pixels: float
-) -> fox.SceneEntity:
+) -> SceneEntity:
     """Path as a line of this width in pixels."""
     return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
 
@@ -119,22 +138,22 @@ def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]
     for name, pose in poses:
         x, y, theta = (float(v) for v in pose)
         found.append(
-            fox.FrameTransform(
+            FrameTransform(
                 timestamp=stamp(stamp_ns),
                 parent_frame_id=MAP_FRAME,
                 child_frame_id=f"robot/{name}",
-                translation=fox.Vector3(x=x, y=y, z=0.0),
+                translation=Vector3(x=x, y=y, z=0.0),
                 rotation=_turn(theta),
             )
         )
-    return bytes(fox.FrameTransforms(transforms=found).encode())
+    return FrameTransforms(transforms=found).SerializeToString()
 
 
 def pose_in_map(stamp_ns: int, pose: Float[np.ndarray, "3"]) -> bytes:
     """A pose in the frame of the map."""
     x, y, theta = (float(v) for v in pose)
-    found = fox.PoseInFrame(timestamp=stamp(stamp_ns), frame_id=MAP_FRAME, pose=_pose(x, y, theta))
-    return bytes(found.encode())
+    found = PoseInFrame(timestamp=stamp(stamp_ns), frame_id=MAP_FRAME, pose=_pose(x, y, theta))
+    return found.SerializeToString()
 
 
 def cloud(
@@ -148,12 +167,12 @@ def cloud(
     with np.errstate(over="ignore"):  # infinite beyond 3e38
         packed[:, :2] = points
         packed[:, 3] = values
-    kind = fox.PackedElementFieldNumericType.Float32
+    kind = PackedElementField.FLOAT32
     fields = [
-        fox.PackedElementField(name=each, offset=4 * i, type=kind)
+        PackedElementField(name=each, offset=4 * i, type=kind)
         for i, each in enumerate(("x", "y", "z", name))
     ]
-    found = fox.PointCloud(
+    found = PointCloud(
         timestamp=stamp(stamp_ns),
         frame_id=MAP_FRAME,
         pose=_pose(0.0, 0.0, 0.0),
@@ -161,24 +180,24 @@ def cloud(
         fields=fields,
         data=packed.tobytes(),
     )
-    return bytes(found.encode())
+    return found.SerializeToString()
 
 
 def log_line(stamp_ns: int, name: str, text: str, *, warns: bool) -> bytes:
     """A line of a log."""
-    level = fox.LogLevel.Warning if warns else fox.LogLevel.Info
-    found = fox.Log(timestamp=stamp(stamp_ns), level=level, message=text, name=name)
-    return bytes(found.encode())
+    level = Log.WARNING if warns else Log.INFO
+    found = Log(timestamp=stamp(stamp_ns), level=level, message=text, name=name)
+    return found.SerializeToString()
 
 
-def _entity(stamp_ns: int, name: str, **primitives: Any) -> fox.SceneEntity:
-    """Entity in the frame of the map; primitives: lists, as `fox.SceneEntity` names them."""
+def _entity(stamp_ns: int, name: str, **primitives: Any) -> SceneEntity:
+    """Entity in the frame of the map; primitives: lists, as `SceneEntity` names them."""
     at = stamp(stamp_ns)
-    return fox.SceneEntity(timestamp=at, frame_id=MAP_FRAME, id=name, **primitives)
+    return SceneEntity(timestamp=at, frame_id=MAP_FRAME, id=name, **primitives)
 
 
-def _arrow(pose: fox.Pose, size_m: float, shade: Shade) -> fox.ArrowPrimitive:
-    return fox.ArrowPrimitive(
+def _arrow(pose: Pose, size_m: float, shade: Shade) -> ArrowPrimitive:
+    return ArrowPrimitive(
         pose=pose,
         shaft_length=0.6 * size_m,
         shaft_diameter=0.25 * size_m,
@@ -188,29 +207,29 @@ def _arrow(pose: fox.Pose, size_m: float, shade: Shade) -> fox.ArrowPrimitive:
     )
 
 
-def _disc(pose: fox.Pose, width: float, depth: float, shade: Shade) -> fox.CylinderPrimitive:
-    return fox.CylinderPrimitive(
+def _disc(pose: Pose, width: float, depth: float, shade: Shade) -> CylinderPrimitive:
+    return CylinderPrimitive(
         pose=pose,
-        size=fox.Vector3(x=width, y=depth, z=_FLAT_M),
+        size=Vector3(x=width, y=depth, z=_FLAT_M),
         bottom_scale=1.0,
         top_scale=1.0,
         color=_colour(shade),
     )
 
 
-def _line(points: Iterable[tuple[float, float]], shade: Shade, pixels: float) -> fox.LinePrimitive:
-    return fox.LinePrimitive(
-        type=fox.LinePrimitiveLineType.LineStrip,
+def _line(points: Iterable[tuple[float, float]], shade: Shade, pixels: float) -> LinePrimitive:
+    return LinePrimitive(
+        type=LinePrimitive.LINE_STRIP,
         pose=_pose(0.0, 0.0, 0.0),
         thickness=pixels,
         scale_invariant=True,
-        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in points],
+        points=[Point3(x=x, y=y, z=0.0) for x, y in points],
         color=_colour(shade),
     )
 
 
-def _label(x: float, y: float, text: str, shade: Shade) -> fox.TextPrimitive:
-    return fox.TextPrimitive(
+def _label(x: float, y: float, text: str, shade: Shade) -> TextPrimitive:
+    return TextPrimitive(
         pose=_pose(x, y, 0.0),
         billboard=True,
         font_size=12.0,
@@ -220,15 +239,15 @@ def _label(x: float, y: float, text: str, shade: Shade) -> fox.TextPrimitive:
     )
 
 
-def _pose(x: float, y: float, theta: float, z: float = 0.0) -> fox.Pose:
-    return fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=_turn(theta))
+def _pose(x: float, y: float, theta: float, z: float = 0.0) -> Pose:
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=_turn(theta))
 
 
-def _turn(theta: float) -> fox.Quaternion:
-    return fox.Quaternion(x=0.0, y=0.0, z=float(np.sin(0.5 * theta)), w=float(np.cos(0.5 * theta)))
+def _turn(theta: float) -> Quaternion:
+    return Quaternion(x=0.0, y=0.0, z=float(np.sin(0.5 * theta)), w=float(np.cos(0.5 * theta)))
 
 
 @lru_cache(maxsize=256)
-def _colour(shade: Shade) -> fox.Color:
+def _colour(shade: Shade) -> Color:
     r, g, b = (int(shade[0][i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return fox.Color(r=r, g=g, b=b, a=shade[1])
+    return Color(r=r, g=g, b=b, a=shade[1])

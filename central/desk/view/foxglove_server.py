@@ -1,9 +1,12 @@
 """Foxglove WebSocket: views of a log or run in Foxglove or Lichtblick, by the SDK's server.
 
+The only module that needs the SDK, the extra `foxglove`.
+
 A new subscriber receives the newest view of its topic at once. To play a finished log, open its
 file there.
 """
 
+import logging
 import threading
 from typing import Self
 
@@ -26,6 +29,7 @@ class FoxgloveServer(ServerListener):
         self._channels: dict[str, Channel] = {}
         self._newest: dict[str, Sample] = {}
         self._lock = threading.Lock()
+        foxglove.set_log_level(logging.WARNING)  # it prints its hidden address otherwise
         hidden = hidden_host()
         self._server = foxglove.start_server(
             name="teamslam",

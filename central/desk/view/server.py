@@ -8,11 +8,12 @@ import asyncio
 import logging
 import threading
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import AsyncExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -23,11 +24,13 @@ from websockets.http11 import Request, Response
 from teamslam.central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
 from teamslam.central.desk.view.export import VIEWED, Viewing, for_viewer
 from teamslam.central.desk.view.foxglove_proxy import proxy, refuse
-from teamslam.central.desk.view.foxglove_server import FoxgloveServer
 from teamslam.central.desk.view.page_frames import CHANNELS, PageFrames
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.tail import Tail
 from teamslam.team.wire.bus import BusError, Sample
+
+if TYPE_CHECKING:
+    from teamslam.central.desk.view.foxglove_server import FoxgloveServer
 
 STREAM = "/stream"
 LOOK_S = 0.2
@@ -65,7 +68,7 @@ class Feed:
     """
 
     tail: Tail
-    foxglove: FoxgloveServer | None = None
+    foxglove: "FoxgloveServer | None" = None
     frames: list[str] = field(default_factory=list)
     error: str | None = None
     ended: bool = False
@@ -204,18 +207,25 @@ class Shown:
 
 @contextmanager
 def session(
-    log: Path, host: str, port: int, foxglove_port: int, *, growing: bool
+    log: Path, host: str, port: int, foxglove_port: int | None, *, growing: bool
 ) -> Iterator[Shown]:
     """Show a log until the context ends; raises ServerError for a taken port.
 
-    growing: its recorder may still run, or not have begun.
+    foxglove_port: None: only the page. growing: the recorder may still run, or not have begun.
     """
     # The library logs every connection otherwise.
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    with FoxgloveServer() as foxglove:
+    with nullcontext() if foxglove_port is None else _foxglove_server() as foxglove:
         feed = Feed(Tail(log), foxglove)
-        with serving(feed, host, port, foxglove_port, growing=growing) as shown:
+        with serving(feed, host, port, foxglove_port or 0, growing=growing) as shown:
             yield shown
+
+
+def _foxglove_server() -> "FoxgloveServer":
+    """Server of Foxglove's SDK, which is an extra."""
+    from teamslam.central.desk.view.foxglove_server import FoxgloveServer
+
+    return FoxgloveServer()
 
 
 @contextmanager

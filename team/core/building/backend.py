@@ -1,8 +1,10 @@
 """Build the native core: the backend that pyproject.toml names, and the build of a source tree.
 
-    python team/core/building/backend.py             build into team/core
+    python team/core/building/backend.py             build into team/core, for every processor
+    python team/core/building/backend.py --own       for this machine's processor, in half the time
     python team/core/building/backend.py --checked   with sanitizers (TEAMSLAM_CORE=checked)
-    python team/core/building/backend.py --find      name the C++ compiler; status 1: there is none
+    python team/core/building/backend.py --find compiler    name it; status 1: there is none
+    python team/core/building/backend.py --find cmake
 
 Wheels are scikit-build-core's. An editable install builds into the source tree and adds one
 folder to the path, which holds a link to the package `teamslam` and nothing else: no import hook
@@ -16,6 +18,7 @@ import base64
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -28,6 +31,8 @@ ROOT = Path(__file__).resolve().parents[3]
 SOURCES = ROOT / "team" / "core"
 MODULES = "_core_*"
 ZIG = "ziglang>=0.13"
+CMAKE = (3, 20)
+"""Least version, that of CMakeLists.txt."""
 COMPILERS = ("c++", "g++", "clang++")
 C20 = "#include <bit>\n#include <concepts>\n#include <span>\nstd::span<const double> numbers;\n"
 NO_COMPILER = """\
@@ -90,8 +95,20 @@ def compiler_options() -> list[str]:
     ]
 
 
-def build_in_place(*, checked: bool = False) -> None:
-    """Build the core of this source tree into team/core, or a checked one beside it."""
+def own_level() -> str:
+    """Name the level that this machine's processor imports, as `teamslam.team.core` chooses it."""
+    try:
+        flags = Path("/proc/cpuinfo").read_text("utf-8").partition("flags")[2].partition("\n")[0]
+    except OSError:
+        flags = ""
+    return "avx2" if "avx2" in flags.split() else "base"
+
+
+def build_in_place(*, checked: bool = False, own: bool = False) -> None:
+    """Build the core of this source tree into team/core.
+
+    checked: a build with sanitizers, beside it. own: for this machine's processor alone.
+    """
     kind = "checked" if checked else "own" if find_compiler() else "zig"
     folder = ROOT / "build" / f"core-{sys.version_info[1]}-{kind}"
     _cmake(
@@ -100,7 +117,7 @@ def build_in_place(*, checked: bool = False) -> None:
         f"-DTEAMSLAM_CHECKED={'ON' if checked else 'OFF'}",
         *compiler_options(),
     )
-    _cmake("--build", str(folder))
+    _cmake("--build", str(folder), *(["--target", f"_core_{own_level()}"] if own else []))
     for built in sorted(folder.glob(f"{MODULES}.so")):
         # Replaced, not rewritten: a process may have the old one in memory.
         new = SOURCES / f"{built.name}.new"
@@ -108,10 +125,22 @@ def build_in_place(*, checked: bool = False) -> None:
         new.replace(SOURCES / built.name)
 
 
+def find_cmake() -> str | None:
+    """Find a CMake that is new enough: of this environment, or of the machine."""
+    for place in (str(Path(sys.executable).parent), os.environ["PATH"]):
+        if command := shutil.which("cmake", path=place):
+            asked = [command, "--version"]
+            said = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603
+            version = re.search(r"(\d+)\.(\d+)", said.stdout)
+            if version and (int(version[1]), int(version[2])) >= CMAKE:
+                return command
+    return None
+
+
 def _cmake(*arguments: str) -> None:
-    command = shutil.which("cmake", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    command = find_cmake()
     if command is None:
-        sys.exit("Building the core needs cmake and ninja: pip install cmake ninja")
+        sys.exit("Building the core needs CMake 3.20 and ninja: pip install cmake ninja")
     # Ninja of the same environment comes before the machine's.
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run([command, *arguments], env={**os.environ, "PATH": path}, check=False)  # noqa: S603
@@ -166,7 +195,7 @@ def build_editable(
     """Build the core in place; the wheel holds the path of the source tree and the metadata."""
     from scikit_build_core import build
 
-    build_in_place()
+    build_in_place(own=(config_settings or {}).get("levels") == "own")
     link = ROOT / "build" / "editable" / "teamslam"
     if not link.is_symlink():
         link.parent.mkdir(parents=True, exist_ok=True)
@@ -198,10 +227,11 @@ def _digest(data: bytes) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Build the native core of this source tree.")
     parser.add_argument("--checked", action="store_true", help="with sanitizers and bounds checks")
-    parser.add_argument("--find", action="store_true", help="name the C++ compiler")
+    parser.add_argument("--own", action="store_true", help="for this machine's processor alone")
+    parser.add_argument("--find", choices=("compiler", "cmake"), help="name the program")
     options = parser.parse_args()
     if options.find:
-        compiler = find_compiler()
-        print(compiler or "no C++20 compiler")
-        sys.exit(compiler is None)
-    build_in_place(checked=options.checked)
+        found = find_compiler() if options.find == "compiler" else find_cmake()
+        print(found or f"no {options.find} that is new enough")
+        sys.exit(found is None)
+    build_in_place(checked=options.checked, own=options.own)

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -21,6 +22,7 @@ from teamslam.central.desk.view.foxglove_proxy import VIEWERS, refusal
 from teamslam.central.desk.view.layout import layout
 from teamslam.central.desk.view.page_frames import PageFrames
 from teamslam.central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
+from teamslam.sim.cli import view
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.tail import Tail
@@ -375,6 +377,17 @@ def test_foxglove_is_for_viewers_of_this_machine(shown):
             connect(shown.foxglove, origin=origin, subprotocols=["foxglove.sdk.v1"])
     at = shown.foxglove.replace("ws:", "http:") + "/"
     assert asked(shown, "/", at=at, Host="elsewhere.example")[0] == 403
+
+
+def test_without_foxgloves_sdk_the_page_is_served_and_its_port_names_the_extra(log, monkeypatch):
+    with session(log, "127.0.0.1", 0, None, growing=False) as shown:
+        assert asked(shown, "/")[0] == 200
+        assert shown.foxglove == ""
+    monkeypatch.setattr(view, "find_spec", lambda _: None)
+    result = CliRunner().invoke(view.app, ["view", str(log), "--foxglove-port", "0"])
+    assert result.exit_code == 2
+    assert "--foxglove-port needs Foxglove's SDK" in result.output
+    assert "pip install" in result.output
 
 
 @pytest.mark.parametrize(

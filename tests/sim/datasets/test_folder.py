@@ -427,6 +427,17 @@ def test_a_folder_around_the_data_set_is_named(tmp_path):
         kind_of(tmp_path / "none")
 
 
+@pytest.mark.parametrize("content", [None, b"x,y\n1,2\n", b"PK\3\4 and no more"])
+def test_a_file_that_is_no_data_set_is_refused_with_all_formats(tmp_path, content):
+    path = tmp_path / "set.zip"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DatasetError) as refused:
+        kind_of(path)
+    expected = ("odometry.csv", "detections.csv", "ROS 2 bag", "g2o", "UTIAS", "docs/your_data.md")
+    assert [each for each in expected if each not in str(refused.value)] == []
+
+
 def test_import_of_a_folder_without_measurements_makes_none(tmp_path):
     data_set(tmp_path / "a", landmarks="landmark,x_m,y_m\n1,2,3\n")
     done = CliRunner().invoke(app, ["import", str(tmp_path / "a"), "-o", str(tmp_path / "b")])

@@ -46,6 +46,13 @@ def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
     assert "`teamslam calibrate my_set -o my_set/scenario.toml` learns" in (
         launch._how_to_learn(Path("my_set"), world)
     )
+    assert "without ground truth" in launch._how_to_learn(
+        Path("my_set"), replace(world, landmarks=None)
+    )
+    with monkeypatch.context() as without_scipy:
+        without_scipy.setattr(launch, "find_spec", lambda _: None)
+        advice = launch._how_to_learn(Path("my_set"), world)
+    assert " install 'scipy" in advice.partition("`, then `teamslam calibrate my_set")[0]
     unknown = [replace(each, truth=None, truth_ns=None) for each in world.streams]
     advice = launch._how_to_learn(Path("my_set"), replace(world, streams=tuple(unknown)))
     assert "learns the odometry's scales; without ground truth not the noise" in advice

@@ -271,6 +271,12 @@ def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(log, samples
     )
     assert empty.exit_code == 1
     assert "nothing is verified" in empty.output
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.path.read_bytes()[:-40])
+    result = runner.invoke(app, ["rerun", str(cut)])
+    assert result.exit_code == 1
+    assert "final map: the same bytes" in result.output
+    assert "is cut, so the result is of the part before the cut" in " ".join(result.output.split())
     for wrong in (
         ["--verify", "--delay", "3"],
         ["--loss", "1"],
