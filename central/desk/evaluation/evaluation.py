@@ -1,15 +1,21 @@
 """Evaluate a run from its log, against the recorded truth."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from teamslam.central.desk.evaluation.association import association_result
-from teamslam.central.desk.evaluation.clocks import Timed, clock_cause, separate_times_warning
+from teamslam.central.desk.evaluation.clocks import (
+    Late,
+    Timed,
+    lateness,
+    separate_times_warning,
+)
 from teamslam.central.desk.evaluation.errors import (
     MapErrors,
     Path,
@@ -89,7 +95,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     }
     end = log.newest(ch.END, m.End)
     faults = log.of_all(ch.FAULT, m.Fault)
-    mirrored, late, separate_times = _streams(log)
+    streams = _streams(log)
     return Evaluation(
         scenario=scenario,
         map=fused,
@@ -117,20 +123,25 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         verdicts=verdicts_given(log),
         data_set=_data_set(log),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
-        separate_times=separate_times,
-        mirrored=mirrored,
-        late=late,
+        separate_times=streams.separate_times,
+        mirrored=streams.mirrored,
+        lateness=streams.lateness,
         recorded_ns=log.first_ns,
     )
 
 
-Causes = tuple[m.Diagnosis, ...]
-
-
-def _streams(log: Collected) -> tuple[Causes, Causes, tuple[str, ...]]:
-    """Return the mirrored robots and the late clocks, by each robot's incarnation with most
-    measurements, and the warning of times that do not overlap.
+class _Streams(NamedTuple):
+    """Findings in the measurements alone: mirrored robots, clock offsets where they are determined,
+    and the warning of times that do not overlap.
     """
+
+    mirrored: tuple[m.Diagnosis, ...]
+    lateness: Mapping[str, Late]
+    separate_times: tuple[str, ...]
+
+
+def _streams(log: Collected) -> _Streams:
+    """Judge each robot's incarnation with most measurements."""
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -141,17 +152,13 @@ def _streams(log: Collected) -> tuple[Causes, Causes, tuple[str, ...]]:
         if span is not None:
             first, last = spans.get(robot, span)
             spans[robot] = min(first, span[0]), max(last, span[1])
-    names = in_order(longest)
-    mirrored = tuple(
-        found for robot in names if (found := mirrored_cause(robot, longest[robot], configs[robot]))
+    of = [(robot, longest[robot], configs[robot]) for robot in in_order(longest)]
+    offsets = ((robot, lateness(timed, config)) for robot, timed, config in of)
+    return _Streams(
+        tuple(filter(None, (mirrored_cause(*each) for each in of))),
+        {robot: found for robot, found in offsets if found is not None},
+        tuple(filter(None, (separate_times_warning(spans),))),
     )
-    out = {each.robot for each in mirrored}
-    late = tuple(
-        found
-        for robot in names
-        if robot not in out and (found := clock_cause(robot, longest[robot], configs[robot]))
-    )
-    return mirrored, late, tuple(filter(None, (separate_times_warning(spans),)))
 
 
 def _config(log: Collected, robot: str) -> RobotConfig:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from teamslam.central.desk.evaluation.association import AssociationResult
+from teamslam.central.desk.evaluation.clocks import Late, clock_cause, is_refuted
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
 from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
@@ -113,9 +114,9 @@ class Evaluation:
     mapped robot has a known initial pose, so only aligned errors are meaningful. decisions:
     closures and merges by unnamed landmarks. verdicts: an operator's, as text. states: of every
     robot in the final map. data_set: folder or file name; empty for a simulated world.
-    separate_times: of measurements that do not overlap, as text. mirrored, late: bearings of the
-    wrong sign, and clock offsets, by the measurements alone. recorded_ns: wall time of the first
-    message.
+    separate_times: of measurements that do not overlap, as text. mirrored, lateness: bearings of
+    the wrong sign, and each robot's clock offset where it is determined, by the measurements alone.
+    recorded_ns: wall time of the first message.
     """
 
     scenario: TeamConfig | None
@@ -139,20 +140,32 @@ class Evaluation:
     states: Mapping[str, RobotState] = field(default_factory=dict)
     separate_times: tuple[str, ...] = ()
     mirrored: tuple[m.Diagnosis, ...] = ()
-    late: tuple[m.Diagnosis, ...] = ()
+    lateness: Mapping[str, Late] = field(default_factory=dict)
     recorded_ns: int | None = None
 
     @property
+    def late(self) -> tuple[m.Diagnosis, ...]:
+        """Clock offsets by the measurements alone, beyond doubt, of robots not mirrored."""
+        out = {each.robot for each in self.mirrored}
+        found = (clock_cause(robot, of) for robot, of in self.lateness.items() if robot not in out)
+        return tuple(filter(None, found))
+
+    @property
     def diagnosis(self) -> tuple[m.Diagnosis, ...]:
-        """Causes of misfit: those of the map; mirrored robots, and late clocks that the map does
-        not determine, by the measurements alone.
+        """Causes of misfit: those of the map that the measurements alone do not exclude; mirrored
+        robots, and late clocks that the map does not determine, by the measurements alone.
 
         Of a mirrored robot nothing else is a cause; nor of the team where all robots are mirrored.
         """
         of_map = () if self.map is None else self.map.diagnosis
         found = {each.robot for each in self.mirrored}
         of_all = found | {""} if found >= {*self.robots} else found
-        own = [each for each in of_map if each.cause == "mirrored" or each.robot not in of_all]
+        own = [
+            each
+            for each in of_map
+            if each.cause == "mirrored"
+            or not (each.robot in of_all or is_refuted(each, self.lateness.get(each.robot)))
+        ]
         named = {(each.cause, each.robot) for each in own}
         more = [each for each in self.mirrored if (each.cause, each.robot) not in named]
         late = [each for each in self.late if (each.cause, each.robot) not in named]
