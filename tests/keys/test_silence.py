@@ -4,7 +4,7 @@ import logging
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -82,13 +82,16 @@ def answering(answer: bytes | None) -> Iterator[str]:
                     return
                 kept.append(link)
                 if answer is not None:
-                    link.recv(65_536)
-                    link.sendall(answer)
-                    link.shutdown(socket.SHUT_WR)
+                    with suppress(OSError):  # the client is gone
+                        link.recv(65_536)
+                        link.sendall(answer)
+                        link.shutdown(socket.SHUT_WR)
 
-        threading.Thread(target=serve, daemon=True).start()
+        thread = threading.Thread(target=serve)
+        thread.start()
         yield f"tls/127.0.0.1:{server.getsockname()[1]}"
         server.shutdown(socket.SHUT_RDWR)
+        thread.join()
     for link in kept:
         link.close()
 
