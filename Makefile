@@ -44,7 +44,8 @@ HASHED := $(VENV)/uv/bin/uv pip compile --quiet --universal --python-version 3.1
 .PHONY: run test check core check-core bench docs setup constraints clean
 
 run: $(VENV)/.runtime $(VENV)/.own
-	$(BIN)/teamslam launch waypoints --speed 20
+	@echo "Running three robots for five minutes, at twenty times real time: half a minute with the report"
+	@$(BIN)/teamslam launch waypoints --speed 20
 
 # tests/conftest.py says which worker gets what.
 test: $(VENV)/.dev $(VENV)/.core

@@ -244,7 +244,10 @@ def _calibrate_by_map(
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
         of_central = _fit_factor_by_cost(teams[0], scenario.central, progress)
-    note = "no ground truth: the sensor's figures and the densities of noise stay as they are"
+    note = (
+        "no true paths and landmarks: the sensor's figures and the densities of noise stay as they "
+        "are"
+    )
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
     findings = (note, *notes, *clocks.clock_notes(of_clocks), *_alarms(figures, scenario))

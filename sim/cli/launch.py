@@ -288,9 +288,9 @@ def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
         if streams.landmarks is not None and any(s.truth is not None for s in streams.streams):
             return f"{command} learns your robots' own from the data"
         return (
-            f"{command} learns the odometry's scales; without ground truth not the noise: write "
-            "what you know of it into that file, and change it as the report's covariance scale "
-            "advises (docs/faq.md)"
+            f"{command} learns the odometry's scales; without true paths and landmarks not the "
+            "noise: write what you know of it into that file, and change it as the report's "
+            "covariance scale advises (docs/faq.md)"
         )
     return (
         f"the data have {found} stretch{'es' * (found != 1)} of {SPAN_S:.0f} s with "

@@ -85,7 +85,8 @@ def info(
     messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
     state = "complete" if not lacks else "not whole" if opened.complete else NOT_FINISHED
     typer.echo(
-        f"{log}\nteam {one_line(opened.team)}, {state}: {messages} messages, {size} payload bytes"
+        f"{log}\nteam {one_line(opened.team)}, {state}: {messages:,} messages, "
+        f"{size:,} payload bytes"
     )
     if span is not None:
         first, last = (ns * 1e-9 for ns in span)
@@ -269,8 +270,8 @@ def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> 
         table.add_row(
             Text(one_line(name)),
             str(len(of)),
-            str(sum(each.messages for each in of)),
-            str(sum(each.bytes for each in of)),
+            f"{sum(each.messages for each in of):,}",
+            f"{sum(each.bytes for each in of):,}",
             f"{sum(rates) / len(rates):.3g}" if rates else "",
             _after(min(each.first_ns for each in of), start_ns),
             _after(max(each.last_ns for each in of), start_ns),

@@ -59,6 +59,11 @@ def print_nis(run: "Run", console: "Console") -> None:
 
 
 def print_written(paths: Iterable[Path], console: "Console") -> None:
-    """Print the names of written files."""
-    for path in paths:
-        console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+    """Print the path of the first written file and the names of the others, which are beside it."""
+    written = list(paths)
+    others = written[1:]
+    for first in written[:1]:
+        console.print(f"wrote {first}", highlight=False, soft_wrap=True)
+    if others:
+        names = ", ".join(f"{each.name}/" if each.is_dir() else each.name for each in others)
+        console.print(f"      beside it: {names}", highlight=False)

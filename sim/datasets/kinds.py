@@ -44,7 +44,8 @@ def kind_of(path: str | Path) -> Kind:
             shown = f"{', '.join(strays[:4])}{', …' if len(strays) > 4 else ''}"
             raise DatasetError(
                 f"{path}: its CSV tables have names of their own ({shown}): `teamslam import "
-                f"{path} -o FOLDER` proposes which are what, and makes a data set of them"
+                f"{path} -o my_set --columns columns.toml` writes a proposal of which are what; "
+                "the same command again makes a data set of them"
             ) from None
         raise DatasetError(f"{path}: no data set in it; {FORMATS}") from None
 

@@ -1,6 +1,7 @@
 """`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,9 +80,11 @@ def test_the_log_of_a_launch_is_complete_and_says_what_ran(launched):
 def test_a_launch_tells_its_result_and_where_log_report_and_pictures_are(launched):
     assert f"log   {launched.log}" in launched.said
     assert "landmark RMSE" in launched.said
-    written = [line[6:] for line in launched.said.splitlines() if line.startswith("wrote ")]
-    assert {Path(path).suffix for path in written} >= {".png"}
-    assert all(Path(path).stat().st_size > 0 for path in written)
+    (page,) = re.findall(r"^wrote (.*/report\.html)$", launched.said, re.M)
+    beside = re.search(r"^      beside it: ([^:]*?)\nlog ", launched.said, re.M)[1]
+    written = [Path(page), *(Path(page).parent / name for name in re.split(r",\s+", beside))]
+    assert {path.suffix for path in written} >= {".html", ".png"}
+    assert all(path.stat().st_size > 0 for path in written)
 
 
 def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(launched):

@@ -196,11 +196,11 @@ class Evaluation:
 
     @property
     def method(self) -> str:
-        """Estimator and rule; empty for a data set with the defaults."""
+        """Estimator and rule; empty for the defaults."""
         if self.scenario is None:
             return ""
         chosen = self.scenario.estimator, self.scenario.fusion
-        return "" if self.data_set and chosen == USUAL else " + ".join(chosen)
+        return "" if chosen == USUAL else " + ".join(chosen)
 
     @property
     def matched_by(self) -> str:

@@ -1,14 +1,18 @@
 """Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
-Each robot's dead-reckoned odometry with odom → base on the transform topic, and the messages of
-`teamslam.team.ros2_answers`. Log times are team time.
+Each robot's dead-reckoned odometry with odom → base on the transform topic, the messages of
+`teamslam.team.ros2_answers`, and the smoothed path as stamped poses, which evo reads. Log times
+are team time.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
+from teamslam.central.desk.paths import smoothed_paths
+from teamslam.central.desk.verification.recorded import RerunError, recorded
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.recording.reader import Log, LogError
@@ -19,6 +23,7 @@ from teamslam.team.ros2.encoding import (
     compose,
     encode,
     odometry,
+    pose_with_covariance,
     transform,
     transforms,
 )
@@ -67,7 +72,7 @@ class _Robot:
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
-    """ROS 2 messages of a log, in log order."""
+    """ROS 2 messages of a log, in log order; then the smoothed poses."""
     robots: dict[str, _Robot] = {}
     team = Answers(Names(TEAM_SPACE))
     final = False
@@ -88,6 +93,20 @@ def answers_of(log: Log) -> Iterator[Answer]:
                 continue
             final |= is_final
             yield from team.convert(message)
+    with suppress(RerunError):  # a log without what recomputation needs
+        yield from _smoothed(log)
+
+
+def _smoothed(log: Log) -> Iterator[Answer]:
+    """Poses of every robot's smoothed path, at keyframe rate."""
+    for robot, path in smoothed_paths(recorded(log)).items():
+        names = Names(f"/{robot}")
+        for stamp_ns, (x, y, theta), P in zip(
+            path.stamps_ns.tolist(), path.poses.tolist(), path.covariances, strict=True
+        ):
+            pose = pose_with_covariance(stamp_ns, names.map_frame, (x, y, theta), P)
+            kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
+            yield Answer(names.topic("smoothed_pose"), kind, stamp_ns, encode(pose))
 
 
 def export_rosbag2(

@@ -545,7 +545,7 @@ def test_a_run_on_a_data_set_is_titled_with_its_name():
     run = evaluate(named)
     assert title_of(run) == "my_set"
     assert to_json(run)["data_set"] == "my_set"
-    assert title_of(evaluate(joined_log(of, 0.1))) == "small, seed 1: hybrid + join"
+    assert title_of(evaluate(joined_log(of, 0.1))) == "small, seed 1"
 
 
 def test_truth_is_not_extrapolated():

@@ -195,6 +195,6 @@ def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path, place)
     (tmp_path / place).mkdir(exist_ok=True)
     (tmp_path / place / "wheels.csv").write_text(TRACK)
     with pytest.raises(
-        DatasetError, match=r"names of their own .*: `teamslam import .* -o FOLDER`"
+        DatasetError, match=r"names of their own .*: `teamslam import .* --columns columns.toml`"
     ):
         kind_of(tmp_path)

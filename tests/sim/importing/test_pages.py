@@ -46,7 +46,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
     assert "`teamslam calibrate my_set -o my_set/scenario.toml` learns" in (
         launch._how_to_learn(Path("my_set"), world)
     )
-    assert "without ground truth" in launch._how_to_learn(
+    assert "without true paths and landmarks" in launch._how_to_learn(
         Path("my_set"), replace(world, landmarks=None)
     )
     with monkeypatch.context() as without_scipy:
@@ -55,7 +55,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
     assert " install 'scipy" in advice.partition("`, then `teamslam calibrate my_set")[0]
     unknown = [replace(each, truth=None, truth_ns=None) for each in world.streams]
     advice = launch._how_to_learn(Path("my_set"), replace(world, streams=tuple(unknown)))
-    assert "learns the odometry's scales; without ground truth not the noise" in advice
+    assert "learns the odometry's scales; without true paths and landmarks not the noise" in advice
     short = [
         replace(each, intervals=each.intervals.where(each.intervals.end_ns < 100_000_000_000))
         for each in world.streams

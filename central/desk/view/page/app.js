@@ -236,7 +236,8 @@ function lookAtMap() {
   put('landmarks', shown ? shown.ids.length : '0');
   const here = [...store.robots.values()].filter((r) => store.isOutside(r, state.time) || r.pose.at(state.time) >= 0);
   put('robot-count', here.filter((r) => store.stateAt(r, state.time) !== 'lost').length);
-  $('rmse-box').hidden = $('nees-box').hidden = !store.trueMap;
+  $('rmse-box').hidden = !store.trueMap;
+  $('nees-box').hidden = !store.trueMap || !shown || shown.nees === null;
   put('rmse', shown && shown.rmse !== null ? metresText(shown.rmse) : '–');
   put('nees', shown && shown.nees !== null ? shown.nees.toFixed(2) : '–', '');
   const figures = store.figuresAt('central', state.time);
@@ -434,7 +435,8 @@ function lookAtTraffic() {
   }
   found.sort((a, b) => b[2] - a[2]);
   const rate = state.time > 0 ? ` · ${bytesText(total / state.time)}/s` : '';
-  $('traffic-total').textContent = found.length ? `${bytesText(total)}${rate} of ${found.length} keys` : '';
+  const listed = found.length > TRAFFIC_ROWS ? `, the largest ${TRAFFIC_ROWS} here` : '';
+  $('traffic-total').textContent = found.length ? `${bytesText(total)}${rate} of ${found.length} keys${listed}` : '';
   const body = $('traffic').tBodies[0];
   const shown = found.slice(0, TRAFFIC_ROWS);
   while (body.rows.length > shown.length) body.deleteRow(-1);
@@ -514,6 +516,7 @@ function drawConsistency() {
     const scales = found.t.map((t, i) => [t, found.f[i].covariance_scale]).filter(([, v]) => v !== undefined);
     line(scales.map((k) => k[0]), scales.map((k) => k[1]), { colour: colour('warn'), width: 1.5 });
     if (scales.length) legend.push(['warn', 'covariance scale of the team']);
+    legend.push(['warn', `above ${WARN}: covariances too small`, 'dashed'], ['bad', `above ${FAIL}: not to be trusted`, 'dashed']);
     for (const [, v] of [...kept, ...scales]) high = Math.max(high, Math.min(1.15 * v, 5));
   }
   drawInnovations();
@@ -530,8 +533,9 @@ function drawConsistency() {
   });
   if ($('cost-legend').dataset.key !== String(legend)) {
     $('cost-legend').dataset.key = String(legend);
-    $('cost-legend').replaceChildren(...legend.map(([name, text]) => {
+    $('cost-legend').replaceChildren(...legend.map(([name, text, kind = '']) => {
       const item = document.createElement('span');
+      item.className = kind;
       item.style.setProperty('--c', colour(name));
       item.textContent = text;
       return item;

@@ -73,8 +73,11 @@ export class MapView {
     this.resize();
     const w = this.canvas.width / this.ratio, h = this.canvas.height / this.ratio;
     const room = 34, above = Math.max(46, document.querySelector('.chips').offsetHeight + 12);
-    this.scale = Math.min((w - 2 * room) / width, (h - above - 2 * room) / height, 400);
-    this.centre = [(left + right) / 2, (bottom + top) / 2 + above / 2 / this.scale];
+    const beside = document.querySelector('.tools').offsetWidth;
+    this.scale = Math.min((w - beside - 2 * room) / width, (h - above - 2 * room) / height, 400);
+    this.centre = [
+      (left + right) / 2 + beside / 2 / this.scale, (bottom + top) / 2 + above / 2 / this.scale,
+    ];
     this.fitted = true;
   }
 
