@@ -53,7 +53,7 @@ def stamp(stamp_ns: int) -> Timestamp:
 
 def scene(entities: Iterable[SceneEntity]) -> bytes:
     """Scene update; an entity replaces an earlier one of its name."""
-    return SceneUpdate(entities=list(entities)).SerializeToString()
+    return _encode(SceneUpdate(entities=list(entities)))
 
 
 def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> SceneEntity:
@@ -146,14 +146,14 @@ def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]
                 rotation=_turn(theta),
             )
         )
-    return FrameTransforms(transforms=found).SerializeToString()
+    return _encode(FrameTransforms(transforms=found))
 
 
 def pose_in_map(stamp_ns: int, pose: Float[np.ndarray, "3"]) -> bytes:
     """A pose in the frame of the map."""
     x, y, theta = (float(v) for v in pose)
     found = PoseInFrame(timestamp=stamp(stamp_ns), frame_id=MAP_FRAME, pose=_pose(x, y, theta))
-    return found.SerializeToString()
+    return _encode(found)
 
 
 def cloud(
@@ -180,14 +180,19 @@ def cloud(
         fields=fields,
         data=packed.tobytes(),
     )
-    return found.SerializeToString()
+    return _encode(found)
 
 
 def log_line(stamp_ns: int, name: str, text: str, *, warns: bool) -> bytes:
     """A line of a log."""
     level = Log.WARNING if warns else Log.INFO
     found = Log(timestamp=stamp(stamp_ns), level=level, message=text, name=name)
-    return found.SerializeToString()
+    return _encode(found)
+
+
+def _encode(message: Any) -> bytes:
+    """Encode a message of Protobuf, whose classes have no types."""
+    return bytes(message.SerializeToString())
 
 
 def _entity(stamp_ns: int, name: str, **primitives: Any) -> SceneEntity:
