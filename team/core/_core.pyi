@@ -80,6 +80,26 @@ class Consensus:
         Take a keyframe: the motion since the last one, then its measurements (there may be none).
         """
 
+    def accept(self) -> bool:
+        """
+        Accept the new measurements that agree with others so far, or all anew where one that was accepted
+        before does not agree any more; return whether those accepted before stay accepted.
+        """
+
+    def confirm(self) -> bool:
+        """
+        Accept the `confirmed` measurements; return whether others are accepted now.
+        """
+
+    def accepted(self, begin: int, end: int) -> NDArray[numpy.bool_] | None:
+        """
+        Mark the accepted measurements among begin ... end - 1; None where they all are.
+        """
+
+    @property
+    def rejected(self) -> int:
+        """Number of measurements that are not accepted."""
+
     def agreeing(self) -> NDArray[numpy.bool_]:
         """
         Mark the measurements that agree with others of their landmark under the odometry alone.
@@ -510,9 +530,11 @@ class WholeMap:
         of `joined`, 2 where a single landmark's innovation is singular.
         """
 
-def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], errors: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+def corrected(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], factor: float, sensitivity: NDArray[numpy.float64], curvature: NDArray[numpy.float64], errors: Sequence[tuple[float, float, int]]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
-    Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).
+    Correct N(mean, P) by errors (b, sigma, row) with the rows S of the sensitivity and D of the curvature, (k, n).
+
+    Returns mean + sum(S b + D b^2 / 2) and f P + sum(sigma^2 (S + b D)' (S + b D)).
     """
 
 class Chain:
@@ -1037,6 +1059,7 @@ class Window:
 
         Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother
         about the particles' mean path; rows of second derivatives, that of clock_offset with nodes, else zero; and the index in `gaussian.FAULTS` of why there are none.
+        Numbers are in single precision, as in a message.
         """
 
     @property

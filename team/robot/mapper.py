@@ -40,9 +40,6 @@ MOST_SET_ASIDE = 8
 """After so many measurements of one window were set aside, the window is not computed again for
 further ones."""
 
-NOTHING_PASSES = -(2**63)
-"""Time before which no odometry ends."""
-
 MOST_WARNINGS = 64
 """Number of the newest warnings that are kept."""
 
@@ -81,7 +78,6 @@ class Mapper:
         self._digest = digest
         self._replaced, self._on_window = replaced, on_window
         self._on_disposition = on_disposition
-        self._offset_ns = round(config.clock_offset_s * 1e9)
         self._period_ns = round(config.pose_s * 1e9)
         self.gated = 0
         self.now_ns = self.passed_ns = 0
@@ -152,36 +148,11 @@ class Mapper:
     def take(self, measurement: m.Measurement) -> bool:
         """Take the next measurement; returns whether it closed a window."""
         self._taking = measurement
-        if type(measurement) is m.Odometry and self._go_on(measurement):
-            return False
-        self._due_ns = NOTHING_PASSES
         self.note_input(measurement.number)
         if isinstance(measurement, m.AnyOdometry):
-            stamp_ns = measurement.stamp_ns + self._offset_ns
-            return self.drive(measurement, self._note_time(stamp_ns, stamp_ns))
-        # A scan comes before the odometry that ends at its stamp, and that may end a window.
-        is_near = self._note_time(measurement.stamp_ns, measurement.stamp_ns - 1)
-        self.account(measurement, self._observe(measurement, is_near))
+            return self.drive(measurement)
+        self.account(measurement, self._observe(measurement))
         return False
-
-    def _go_on(self, measurement: m.Odometry) -> bool:
-        """Take an odometry message within all bounds that reaches nothing which is due.
-
-        Most messages of odometry that is faster than scans are such. Returns False, and takes
-        nothing, for any other; `drive` would take this one to the same state.
-        """
-        stamp_ns = measurement.stamp_ns + self._offset_ns
-        if stamp_ns >= self._due_ns:
-            return False
-        interval = OdometryInterval(
-            stamp_ns, measurement.duration_ns, measurement.forward, measurement.yaw_rate
-        )
-        if not (self._note_time(stamp_ns, stamp_ns) and self._judge.admit(interval)):
-            return False
-        self._slam.last_measurement = measurement.number
-        self._slam.go_on(interval)
-        self.account(measurement, None)
-        return True
 
     def _note_time(self, stamp_ns: int, passed_ns: int) -> bool:
         """Note the team time of a measurement and the time that has passed with it.
@@ -203,52 +174,55 @@ class Mapper:
         self._window.append(measurement)
         self._taking = None
 
-    def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
+    def drive(self, measurement: m.AnyOdometry) -> bool:
         """Take an odometry interval; returns whether it closed the window."""
         before_ns = self._slam.last_keyframe_ns
-        interval, rejected = self.judge_interval(measurement, is_near)
+        interval, rejected = self.judge_interval(measurement)
         closed = None
         if interval is not None:
             closed = self._slam.drive(interval, measured=rejected is None)
         if closed is not None:
             self._close(closed, measurement, rejected)
-            self._due_ns = self._slam.due_ns
             return True
         self.account(measurement, rejected)
-        self._due_ns = self._slam.due_ns
         keyframe_ns = self._slam.last_keyframe_ns
         if keyframe_ns != before_ns and keyframe_ns is not None:
             self.out += self.poses.publish(keyframe_ns, self)
         return False
 
     def judge_interval(
-        self, measurement: m.AnyOdometry, is_near: bool
+        self, measurement: m.AnyOdometry
     ) -> tuple[OdometryInterval | None, Rejection | None]:
         """The interval of an odometry message, and the reason if it, or its motion, is rejected.
 
         Where only the motion is rejected, the interval's time is used.
         """
-        if not is_near:
-            return None, Rejection.TIME
         interval = translate.interval_of(measurement, self.config)
+        if not self._note_time(interval.end_ns, interval.end_ns):
+            return None, Rejection.TIME
         rejected = self._judge.odometry(interval)
         return interval if rejected in UNMEASURED else None, rejected
 
-    def _observe(self, measurement: m.Measurement, is_near: bool) -> Rejection | None:
-        """Take a scan or an initial pose; returns the reason if it is rejected."""
+    def _observe(self, measurement: m.Measurement) -> Rejection | None:
+        """Take a scan or an initial pose; returns the reason if it is rejected.
+
+        A scan comes before the odometry that ends at its stamp, and that may end a window.
+        """
+        stamp_ns = measurement.stamp_ns
+        is_near = self._note_time(stamp_ns, stamp_ns - 1)
+        beyond = self._judge.time(stamp_ns) if is_near else Rejection.TIME
         match measurement:
             case m.Observations() | m.Points() | m.Detections():
-                return self._observe_landmarks(measurement, is_near)
+                return self._observe_landmarks(measurement, beyond)
             case m.Sightings():
-                return self._observe_teammates(measurement, is_near)
+                return self._observe_teammates(measurement, beyond)
             case m.Fix():
-                rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
-                return rejected or self.fix(measurement)
+                return beyond or self.fix(measurement)
             case _:
                 return None
 
     def _observe_landmarks(
-        self, measurement: m.AnyScan | m.Detections, is_near: bool
+        self, measurement: m.AnyScan | m.Detections, beyond: Rejection | None
     ) -> Rejection | None:
         if isinstance(measurement, m.Detections) and not self.associates:
             return Rejection.NO_ASSOCIATION
@@ -256,20 +230,20 @@ class Mapper:
         near = self._judge.near(scan.ranges)
         if scan.own.size:
             near &= sensible(scan.own, scan.ranges, self.config.bounds)
-        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
-        if rejected is not None:
-            return rejected
-        if not near.all():
+        if beyond is not None:
+            return beyond
+        if not all(near.tolist()):  # so few are tested sooner as a list
             if not near.any():
                 return Rejection.RANGE
             scan = scan.only(near)
         return self.observe(measurement.stamp_ns, scan)
 
-    def _observe_teammates(self, measurement: m.Sightings, is_near: bool) -> Rejection | None:
+    def _observe_teammates(
+        self, measurement: m.Sightings, rejected: Rejection | None
+    ) -> Rejection | None:
         teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self.config.id for name in teammates], dtype=np.bool_)
         near = self._judge.near(ranges) & others
-        rejected = self._judge.time(measurement.stamp_ns) if is_near else Rejection.TIME
         if rejected is None and len(near) and not near.any():
             rejected = Rejection.RANGE if others.any() else Rejection.ITSELF
         if rejected is not None:
@@ -338,7 +312,7 @@ class Mapper:
     def forget_window(self) -> None:
         """Forget the measurements of the open window."""
         self._window: list[m.Measurement] = []
-        self._aside, self._due_ns = 0, NOTHING_PASSES
+        self._aside = 0
 
     def set_aside(self) -> bool:
         """Reset to the state before the measurement whose handling raised an exception.
@@ -358,20 +332,17 @@ class Mapper:
         """Compute the open window again from its measurements."""
         self._reopen_window()
         for measurement in self._window:
-            is_odometry = isinstance(measurement, m.AnyOdometry)
-            stamp_ns = measurement.stamp_ns + (self._offset_ns if is_odometry else 0)
-            is_near = another_time(stamp_ns, self._began_ns) is None
             self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
-                interval, rejected = self.judge_interval(measurement, is_near)
+                interval, rejected = self.judge_interval(measurement)
                 if interval is not None:
                     self._slam.drive(interval, measured=rejected is None)
             else:
-                self._observe(measurement, is_near)
+                self._observe(measurement)
 
     def _reopen_window(self) -> None:
         """Open the window behind the last submap anew, without measurements."""
-        last, self._due_ns = self.submaps.last, NOTHING_PASSES
+        last = self.submaps.last
         self._slam = HybridSlam(self.config, self.writer.incarnation)
         if last is None:
             self.note_input(0)

@@ -53,22 +53,6 @@ class StreamJudge:
         )
         return None if sensible else Rejection.SPEED
 
-    def admit(self, interval: OdometryInterval) -> bool:
-        """Note an interval of measured speeds that is within all bounds; False, and nothing noted,
-        for any other.
-        """
-        bounds, stamp_ns, duration_ns = self._bounds, interval.end_ns, interval.duration_ns
-        if (
-            self._now_ns is None
-            or not 0 < stamp_ns - self._now_ns <= self._jump_ns
-            or not 0 < duration_ns <= self._longest_ns
-            or not abs(interval.forward) <= bounds.speed_m_s
-            or not abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
-        ):
-            return False
-        self._now_ns, self._jumped_ns = stamp_ns, None
-        return True
-
     def time(self, stamp_ns: int) -> Rejection | None:
         """Why a measurement at this time is refused."""
         is_ahead = self._now_ns is not None and stamp_ns - self._now_ns > self._jump_ns

@@ -6,7 +6,7 @@ size.
 """
 
 from functools import cache
-from typing import Any, NoReturn, TypeVar, Union, cast
+from typing import Any, NoReturn, TypeVar, Union
 
 import msgspec
 
@@ -58,10 +58,14 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
     try:
         if len(payload) > SMALL:
             check_structure(payload)
-        message = cast(M, _decoder(expected).decode(payload))
+        message: M = _decoder(expected).decode(payload)
     except (StructureError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         _refuse(payload, expected, error)
-    _check(message)
+    try:
+        message.check()
+    except ValueError as error:
+        reason, _, detail = str(error).partition(": ")
+        raise WireError(reason, f"{type(message).__name__}.{detail}") from None
     return message
 
 
@@ -122,14 +126,6 @@ def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
 def _decoder(kinds: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder[Any]:
     """Return a decoder of the messages of these classes; without any, of all."""
     return msgspec.msgpack.Decoder(Union[kinds or tuple(BY_TAG.values())])  # noqa: UP007
-
-
-def _check(message: Message) -> None:
-    try:
-        message.check()
-    except ValueError as error:
-        reason, _, detail = str(error).partition(": ")
-        raise WireError(reason, f"{type(message).__name__}.{detail}") from None
 
 
 def tag_in(payload: bytes) -> str:

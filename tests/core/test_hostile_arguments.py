@@ -88,7 +88,7 @@ EXAMPLES = {
     },
     "sensitivity": lambda: np.ones((1, 7)),
     "curvature": lambda: np.ones((1, 7)),
-    "errors": lambda: np.array([[0.1, 0.2]]),
+    "errors": lambda: [(0.1, 0.2, 0)],
     "prior": lambda: core.WholeMap(IDS, MEAN, covariance(7)),
     # the graph
     "SubmapFactor.landmarks": lambda: np.array([[0.1, 0.0, 0.2]] * 2),
@@ -149,6 +149,7 @@ EXAMPLES = {
     "keyframes": lambda: np.array([0, 0]),
     "seen": IDS.copy,
     "Window.sensitivity.mean": MEAN.copy,
+    **dict.fromkeys(("Consensus.accepted.begin", "Consensus.accepted.end"), lambda: 0),
     # odometry
     **dict.fromkeys(("duration_s", "interval_s", "yaw_rate"), lambda: 0.1),
     **{

@@ -77,9 +77,10 @@ class Recorded:
         except WireError:
             self.unsound += 1
             return
+        if m.is_measurement(message):  # first: most messages are measurements
+            self.measurements[message.robot, message.incarnation].put(message)
+            return
         match message:
-            case m.Measurement():
-                self.measurements[message.robot, message.incarnation].put(message)
             case m.Configuration():
                 of_a_fold = channel is ch.TEAM_CONFIG
                 self.configured["central" if of_a_fold else message.node] = message

@@ -130,9 +130,9 @@ class StreamMapper(ExchangingMapper):
             raise TypeError(f"the estimator {self.config.estimator} absorbs no map")
         self.estimator.absorb(landmarks)
 
-    def drive(self, measurement: m.AnyOdometry, is_near: bool) -> bool:
+    def drive(self, measurement: m.AnyOdometry) -> bool:
         """Process an odometry interval."""
-        interval, rejected = self.judge_interval(measurement, is_near)
+        interval, rejected = self.judge_interval(measurement)
         estimates = None
         if interval is not None:
             estimates = self.estimator.drive(interval, measured=rejected is None)

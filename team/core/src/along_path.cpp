@@ -158,29 +158,24 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const Seen> measurements, 
 
 }  // namespace
 
-Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
-                           std::span<const WindowMeasurement> measurements, const Noise& noise) {
-  Rows solved(starts.count(), starts.rows());
+void solve_along_paths(std::uint32_t id, std::size_t slot, const Rows& starts, const Rows& path,
+                       std::span<const WindowMeasurement> measurements, const Noise& noise, Rows& solved) {
   std::vector<Seen> of_one;
-  std::vector<Pack> range_weights(measurements.size());
-  for (std::size_t slot = 0; slot < ids.size(); slot++) {
-    of_one.clear();
-    for (const WindowMeasurement& each : measurements)
-      if (each.id == ids[slot])
-        of_one.push_back({each.keyframe, models::reading_of(each.range, each.bearing, noise, each.claim), each.claim.is_made()});
-    for (std::size_t at = 0; at < starts.stride(); at += WIDTH) {
-      const auto row = [&](std::size_t k) { return load(starts[5 * slot + k] + at); };
-      const auto pose_at = [&](std::size_t keyframe) {
-        return se2::Pose<Pack>{load(path[3 * keyframe] + at), load(path[3 * keyframe + 1] + at),
-                               load(path[3 * keyframe + 2] + at)};
-      };
-      const Landmark<Pack> found =
-          solve<Pack>({row(0), row(1), row(2), row(3), row(4)}, of_one, noise, pose_at, range_weights);
-      std::size_t k = 5 * slot;
-      for (const Pack& each : {found.x, found.y, found.xx, found.xy, found.yy}) store(solved[k++] + at, each);
-    }
+  for (const WindowMeasurement& each : measurements)
+    if (each.id == id)
+      of_one.push_back({each.keyframe, models::reading_of(each.range, each.bearing, noise, each.claim), each.claim.is_made()});
+  std::vector<Pack> range_weights(of_one.size());
+  for (std::size_t at = 0; at < starts.stride(); at += WIDTH) {
+    const auto row = [&](std::size_t k) { return load(starts[5 * slot + k] + at); };
+    const auto pose_at = [&](std::size_t keyframe) {
+      return se2::Pose<Pack>{load(path[3 * keyframe] + at), load(path[3 * keyframe + 1] + at),
+                             load(path[3 * keyframe + 2] + at)};
+    };
+    const Landmark<Pack> found =
+        solve<Pack>({row(0), row(1), row(2), row(3), row(4)}, of_one, noise, pose_at, range_weights);
+    std::size_t k = 5 * slot;
+    for (const Pack& each : {found.x, found.y, found.xx, found.xy, found.yy}) store(solved[k++] + at, each);
   }
-  return solved;
 }
 
 }  // namespace teamslam::window

@@ -13,7 +13,7 @@ struct WindowMeasurement {
   Claim claim;
 };
 
-// Solves each landmark of each particle over its measurements, given the particle's path.
+// Solves a landmark of each particle over its measurements, given the particle's path.
 //
 // Minimises Σ ‖z − h(path, landmark) − b‖² in R⁻¹ plus ‖b‖² in B⁻¹ from the EKF's mean with at most
 // three steps, each kept only if the cost falls. R is the white part of the noise, of the range
@@ -22,9 +22,9 @@ struct WindowMeasurement {
 // C = Σ Hᵀ R⁻¹ the covariance is (Σ Hᵀ R⁻¹ H − C D⁻¹ Cᵀ)⁻¹ at the result. Where no evaluation is
 // finite the EKF's mean and covariance stay.
 //
-// ids, starts: the landmarks, five rows each as of `Particles::map`; path: x, y, heading of each
-// keyframe. Returns rows as `starts` has them.
-Rows landmarks_along_paths(std::span<const std::uint32_t> ids, const Rows& starts, const Rows& path,
-                           std::span<const WindowMeasurement> measurements, const Noise& noise);
+// id, slot: the landmark and its place among `starts`, five rows each as of `Particles::map`; path: x, y,
+// heading of each keyframe. The landmark's rows of `solved`, which has the rows of `starts`, are written.
+void solve_along_paths(std::uint32_t id, std::size_t slot, const Rows& starts, const Rows& path,
+                       std::span<const WindowMeasurement> measurements, const Noise& noise, Rows& solved);
 
 }  // namespace teamslam::window

@@ -1,4 +1,6 @@
 // Bindings of a robot's map and of the submaps after a prior.
+#include <nanobind/stl/vector.h>
+
 #include "binding.hpp"
 #include "chain.hpp"
 
@@ -81,18 +83,23 @@ void bind_maps(nb::module_& m) {
           "of `joined`, 2 where a single landmark's innovation is singular.");
   m.def(
       "corrected",
-      [](std::vector<double> mean, dense::Matrix covariance, double factor, const Table& sensitivity, const Table& errors) {
-        const std::size_t n = mean.size(), k = errors.shape(0);
+      [](std::vector<double> mean, dense::Matrix covariance, double factor, const Table& sensitivity, const Table& curvature,
+         const std::vector<std::tuple<double, double, std::size_t>>& errors) {
+        const std::size_t n = mean.size(), rows = sensitivity.shape(0);
         check(covariance.rows() == n && covariance.columns() == n, "covariance must be (n, n) of a mean of n numbers");
-        check(errors.shape(1) == 2 && sensitivity.shape(0) == k && (k == 0 || sensitivity.shape(1) == n),
-              "errors must be (k, 2), sensitivity (k, n)");
-        static_assert(sizeof(maps::SharedError) == 2 * sizeof(double));
-        maps::correct(mean, covariance.view(), factor, {reinterpret_cast<const maps::SharedError*>(errors.data()), k},
-                      matrix_of(sensitivity));
+        check((rows == 0 || sensitivity.shape(1) == n) && curvature.shape(0) == rows && curvature.shape(1) == sensitivity.shape(1),
+              "sensitivity and curvature must be (k, n)");
+        std::vector<maps::SharedError> shared;
+        for (const auto& [value, sigma, row] : errors) {
+          check(row < rows, "an error must have a row of the sensitivity");
+          shared.push_back({value, sigma, row});
+        }
+        maps::correct(mean, covariance.view(), factor, shared, matrix_of(sensitivity), matrix_of(curvature));
         return std::tuple(std::move(mean), std::move(covariance));
       },
-      "mean"_a, "covariance"_a, "factor"_a, "sensitivity"_a, "errors"_a,
-      "Compute mean + S' b and f P + S' diag(sigma^2) S of errors (b, sigma) (k, 2) with the rows S (k, n).");
+      "mean"_a, "covariance"_a, "factor"_a, "sensitivity"_a, "curvature"_a, "errors"_a,
+      "Correct N(mean, P) by errors (b, sigma, row) with the rows S of the sensitivity and D of the curvature, (k, n).\n\n"
+      "Returns mean + sum(S b + D b^2 / 2) and f P + sum(sigma^2 (S + b D)' (S + b D)).");
   nb::class_<Chain>(m, "Chain", "A prior and the submaps after it, each beginning at the end of the one before.")
       .def("__init__", [](Chain* self, const WholeMap& prior) { new (self) Chain(prior.view()); }, "prior"_a)
       .def(

@@ -1,5 +1,6 @@
 // Bindings of the window and of the functions on its particles.
 #include <algorithm>
+#include <numeric>
 
 #include "binding_scan.hpp"
 #include "sensitivity.hpp"
@@ -171,7 +172,10 @@ void bind_particles(nb::module_& m) {
       [](const Table& poses, const Numbers& weights, const Stack& means, const Stack& covariances, double between) {
         check(weights.size() > 0, "there must be a particle");
         const Rows map = map_of(weights.size(), means, covariances);
-        Gaussian found = window::moments(pose_rows_of(poses, weights.size()), finite(weights, "weights"), map, between, false);
+        std::vector<std::size_t> slots(means.shape(1));
+        std::iota(slots.begin(), slots.end(), std::size_t{0});
+        Gaussian found =
+            window::moments(pose_rows_of(poses, weights.size()), finite(weights, "weights"), map, slots, between, false);
         const std::size_t n = found.mean.size();
         return std::tuple(made_numbers(std::move(found.mean)), made<double, nb::ndim<2>>(std::move(found.covariance), {n, n}));
       },
@@ -196,9 +200,10 @@ void bind_particles(nb::module_& m) {
           taken.push_back({seen(k), std::size_t(keyframes(k)), measurements(k, 0), measurements(k, 1),
                             claims.empty() ? models::OF_SENSOR : claims[k]});
         }
-        const Rows solved =
-            window::landmarks_along_paths({ids.data(), ids.size()}, map_of(means.shape(0), means, covariances),
-                                          path_of(paths, means.shape(0)), taken, noise_of(noise));
+        const Rows starts = map_of(means.shape(0), means, covariances), path = path_of(paths, means.shape(0));
+        Rows solved(starts.count(), starts.rows());
+        for (std::size_t slot = 0; slot < ids.size(); slot++)
+          window::solve_along_paths(ids(slot), slot, starts, path, taken, noise_of(noise), solved);
         return std::tuple(made_landmarks(solved, 0, 2), made_landmarks(solved, 2, 3));
       },
       "ids"_a.noconvert(), "means"_a, "covariances"_a, "paths"_a, "keyframes"_a.noconvert(), "seen"_a.noconvert(), "measurements"_a, "own"_a, "noise"_a,
@@ -304,11 +309,11 @@ void bind_window(nb::module_& m) {
           },
           "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
           "Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.")
-      .def("close", [](const Window& self) { return made_gaussian(self.close()); },
+      .def("close", [](Window& self) { return made_gaussian(self.close()); },
            "Match moments with the landmarks solved again along the paths: the submap of the window.\n\n"
            "Returns ids, mean and covariance of (end pose, pose nodes, landmarks by ascending id), and the index in\n"
            "`gaussian.FAULTS` of why they are no Gaussian.")
-      .def("run", [](const Window& self) { return made_gaussian(self.run()); },
+      .def("run", [](Window& self) { return made_gaussian(self.run()); },
            "Match moments of (end pose, landmarks) so far, which are not fused; as `close` without pose nodes.\n\n"
            "Where all errors of the sensor are white the landmarks are those that the particles hold.")
       .def(
@@ -334,12 +339,16 @@ void bind_window(nb::module_& m) {
             const std::size_t nodes = with_nodes ? self.nodes().size() : 0;
             check(mean.size() == 3 + 3 * nodes + 2 * self.particles().landmarks(), "mean must be of this window");
             window::Sensitivity found = window::sensitivity_of(self, finite(mean, "mean"), with_nodes);
+            for (dense::Matrix* each : {&found.rows, &found.curvature})
+              for (std::size_t i = 0; i < each->rows(); i++)
+                for (std::size_t j = 0; j < each->columns(); j++) (*each)[i][j] = double(float((*each)[i][j]));
             return std::tuple(made_matrix(std::move(found.rows)), made_matrix(std::move(found.curvature)), int(found.fault));
           },
           "mean"_a, "with_nodes"_a,
           "Differentiate the mean of `close`, or of `run` without nodes, by errors that windows share.\n\n"
           "Returns a row for each of bearing, clock_offset, forward_scale, range_offset and range_scale, by the window's smoother\n"
-          "about the particles' mean path; rows of second derivatives, that of clock_offset with nodes, else zero; and the index in `gaussian.FAULTS` of why there are none.")
+          "about the particles' mean path; rows of second derivatives, that of clock_offset with nodes, else zero; and the index in `gaussian.FAULTS` of why there are none.\n"
+          "Numbers are in single precision, as in a message.")
       .def_prop_ro(
           "has_shifts",
           [](const Window& self) {

@@ -221,6 +221,20 @@ Consensus::Smoothed Consensus::started() const {
   return window;
 }
 
+bool Consensus::accept() {
+  std::vector<bool> agreed = agreeing();
+  bool stay = true;
+  for (std::size_t n = 0; n < accepted_.size(); n++) stay = stay && (agreed[n] || !accepted_[n]);
+  if (stay) std::copy(accepted_.begin(), accepted_.end(), agreed.begin());
+  accepted_ = std::move(agreed);
+  return stay;
+}
+
+bool Consensus::confirm() {
+  const std::vector<bool> before = std::exchange(accepted_, confirmed());
+  return accepted_ != before;
+}
+
 std::vector<bool> Consensus::confirmed() const {
   const std::vector<bool> taken = confirmed_by_others();
   double compared = 0.0, rejected = 0.0;

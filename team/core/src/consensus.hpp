@@ -29,6 +29,15 @@ class Consensus {
 
   std::size_t size() const { return measurements_.size(); }
 
+  // Takes what `agreeing` says of the measurements since the last call, or of all where one that was
+  // accepted before does not agree any more; returns whether those accepted before stay so.
+  bool accept();
+
+  // Takes what `confirmed` says of all measurements; returns whether that is another choice.
+  bool confirm();
+
+  const std::vector<bool>& accepted() const { return accepted_; }
+
   // Of each measurement whether it agrees with others of its landmark under the odometry alone.
   //
   // The measurement of a landmark that the others support best places it; it is accepted together with
@@ -83,6 +92,7 @@ class Consensus {
   std::vector<motion::Increment> to_last_;  // from each scan to the last one
   std::vector<Measurement> measurements_;
   std::map<std::uint32_t, Landmark> landmarks_;
+  std::vector<bool> accepted_;
 };
 
 }  // namespace teamslam::window

@@ -5,7 +5,7 @@
 
 namespace teamslam::window {
 
-using pack::load, pack::Pack, pack::padded, pack::store, pack::WIDTH;
+using pack::LANES, pack::load, pack::Pack, pack::padded, pack::store, pack::WIDTH;
 
 namespace {
 
@@ -14,11 +14,11 @@ constexpr double MOST_SQUARE = 0.1;   // Σ wᵢ² of ten particles of equal wei
 
 // Deviations of M particles in n numbers, a row a particle, padded.
 struct Deviations {
-  std::size_t count, stride;
+  std::size_t count, numbers, stride;
   std::vector<double> rows;
 
   Deviations(std::size_t count, std::size_t numbers)
-      : count(count), stride(padded(numbers)), rows(count * stride) {}
+      : count(count), numbers(numbers), stride(padded(numbers)), rows(count * stride) {}
   double& operator()(std::size_t i, std::size_t j) { return rows[i * stride + j]; }
   const double* row(std::size_t i) const { return &rows[i * stride]; }
 };
@@ -29,7 +29,7 @@ std::vector<double> scatter(const Deviations& D, std::span<const double> weights
   constexpr std::size_t TALL = 4;
   const std::size_t n = D.stride;
   std::vector<double> P(n * n);
-  for (std::size_t first = 0; first < n; first += TALL) {
+  for (std::size_t first = 0; first < D.numbers; first += TALL) {
     for (std::size_t column = 0; column < first + TALL; column += 2 * WIDTH) {
       const std::size_t next = column + WIDTH < n ? column + WIDTH : column;
       Pack sums[TALL][2] = {};
@@ -52,37 +52,54 @@ std::vector<double> scatter(const Deviations& D, std::span<const double> weights
 }
 
 // The mean of the landmarks' coordinates, and the deviations from it, behind p numbers of poses.
-void center_landmarks(const Rows& map, std::span<const double> weights, std::size_t p, std::vector<double>& mean,
-                      Deviations& D) {
-  for (std::size_t landmark = 0; landmark < map.rows() / 5; landmark++)
+void center_landmarks(const Rows& map, std::span<const std::size_t> slots, std::span<const double> weights, std::size_t p,
+                      std::vector<double>& mean, Deviations& D) {
+  for (std::size_t landmark = 0; landmark < slots.size(); landmark++)
     for (std::size_t axis = 0; axis < 2; axis++) {
-      const double* from = map[5 * landmark + axis];
+      const double* from = map[5 * slots[landmark] + axis];
       for (std::size_t i = 0; i < D.count; i++) D(i, p + 2 * landmark + axis) = from[i];
     }
   std::vector<double> sums(D.stride);
-  for (std::size_t column = 0; column < D.stride; column += WIDTH) {
-    Pack sum{};
-    for (std::size_t i = 0; i < D.count; i++) sum += weights[i] * load(D.row(i) + column);
-    store(&sums[column], sum);
-    for (std::size_t i = 0; i < D.count; i++) store(&D(i, column), load(D.row(i) + column) - sum);
+  for (std::size_t column = 0; column < D.stride; column += LANES) {
+    Pack sum[LANES / WIDTH] = {};
+    for (std::size_t i = 0; i < D.count; i++)
+      for (std::size_t q = 0; q < LANES / WIDTH; q++) sum[q] += weights[i] * load(D.row(i) + column + q * WIDTH);
+    for (std::size_t q = 0; q < LANES / WIDTH; q++) store(&sums[column + q * WIDTH], sum[q]);
+    for (std::size_t i = 0; i < D.count; i++)
+      for (std::size_t q = 0; q < LANES / WIDTH; q++) {
+        double* at = &D(i, column + q * WIDTH);
+        store(at, load(at) - sum[q]);
+      }
   }
   std::copy_n(sums.begin() + std::ptrdiff_t(p), mean.size() - p, mean.begin() + std::ptrdiff_t(p));
 }
 
 // The mean of the poses' coordinates, headings on the circle, and the deviations from it.
 void center_poses(const Rows& poses, std::span<const double> weights, std::vector<double>& mean, Deviations& D) {
-  for (std::size_t j = 0; j < poses.rows(); j++) {
-    const std::span<const double> numbers = poses.numbers(j);
-    const bool is_heading = j % 3 == 2;
-    double sum = 0.0;
-    for (std::size_t i = 0; i < D.count; i++) sum += weights[i] * numbers[i];
-    mean[j] = is_heading ? mean_direction(numbers, weights) : sum;
+  for (std::size_t first = 0; first < poses.rows(); first += 3) {
+    const auto [x, y, heading] = mean_pose(poses, first, weights);
+    mean[first] = x, mean[first + 1] = y, mean[first + 2] = heading;
     for (std::size_t i = 0; i < D.count; i++) {
-      const double off = numbers[i] - mean[j];
-      D(i, j) = is_heading ? se2::wrapped(off) : off;
+      D(i, first) = poses[first][i] - x;
+      D(i, first + 1) = poses[first + 1][i] - y;
+      D(i, first + 2) = se2::wrapped(poses[first + 2][i] - heading);
     }
   }
 }
+
+// Sines and cosines of angles, padded.
+struct Directions {
+  std::vector<double> sines, cosines;
+
+  explicit Directions(std::span<const double> angles) : sines(padded(angles.size())), cosines(sines.size()) {
+    for (std::size_t i = 0; i < angles.size(); i++) sines[i] = elementary::near(angles[i]);
+    for (std::size_t i = 0; i < sines.size(); i += WIDTH) {
+      const auto [s, c] = elementary::sin_cos_near(load(&sines[i]));
+      store(&sines[i], s);
+      store(&cosines[i], c);
+    }
+  }
+};
 
 Rows pose_rows(const Rows& poses, std::size_t first) {
   Rows pose(poses.count(), 3);
@@ -93,19 +110,26 @@ Rows pose_rows(const Rows& poses, std::size_t first) {
 }  // namespace
 
 double mean_direction(std::span<const double> angles, std::span<const double> weights) {
-  std::vector<double> sines(padded(angles.size())), cosines(sines.size());
-  for (std::size_t i = 0; i < angles.size(); i++) sines[i] = elementary::near(angles[i]);
-  for (std::size_t i = 0; i < sines.size(); i += WIDTH) {
-    const auto [s, c] = elementary::sin_cos_near(load(&sines[i]));
-    store(&sines[i], s);
-    store(&cosines[i], c);
-  }
+  const Directions of(angles);
   double sine = 0.0, cosine = 0.0;
   for (std::size_t i = 0; i < angles.size(); i++) {
-    sine += weights[i] * sines[i];
-    cosine += weights[i] * cosines[i];
+    sine += weights[i] * of.sines[i];
+    cosine += weights[i] * of.cosines[i];
   }
   return elementary::atan2(sine, cosine);
+}
+
+se2::Pose<double> mean_pose(const Rows& poses, std::size_t first, std::span<const double> weights) {
+  const Directions of(poses.numbers(first + 2));
+  const double *xs = poses[first], *ys = poses[first + 1];
+  double x = 0.0, y = 0.0, sine = 0.0, cosine = 0.0;  // side by side: a sum waits for itself
+  for (std::size_t i = 0; i < weights.size(); i++) {
+    x += weights[i] * xs[i];
+    y += weights[i] * ys[i];
+    sine += weights[i] * of.sines[i];
+    cosine += weights[i] * of.cosines[i];
+  }
+  return {x, y, elementary::atan2(sine, cosine)};
 }
 
 double sample_factor(std::span<const double> weights) {
@@ -148,12 +172,13 @@ OnGroup on_group(const Rows& poses, std::span<const double> weights) {
   return found;
 }
 
-Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows& map, double between, bool on_se2) {
-  const std::size_t count = weights.size(), p = poses.rows(), landmarks = map.rows() / 5, n = p + 2 * landmarks;
+Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows& map,
+                 std::span<const std::size_t> slots, double between, bool on_se2) {
+  const std::size_t count = weights.size(), p = poses.rows(), landmarks = slots.size(), n = p + 2 * landmarks;
   Gaussian found;
   found.mean.resize(n);
   Deviations D(count, n);
-  center_landmarks(map, weights, p, found.mean, D);
+  center_landmarks(map, slots, weights, p, found.mean, D);
   if (!on_se2) {
     center_poses(poses, weights, found.mean, D);
   } else {
@@ -173,7 +198,8 @@ Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows&
   const std::size_t stride = D.stride;
   for (std::size_t landmark = 0; landmark < landmarks; landmark++) {
     const std::size_t j = p + 2 * landmark;
-    const double *own_xx = map[5 * landmark + 2], *own_xy = map[5 * landmark + 3], *own_yy = map[5 * landmark + 4];
+    const std::size_t own = 5 * slots[landmark] + 2;
+    const double *own_xx = map[own], *own_xy = map[own + 1], *own_yy = map[own + 2];
     double xx = 0.0, xy = 0.0, yy = 0.0;
     for (std::size_t i = 0; i < count; i++) {
       const double dx = D(i, j), dy = D(i, j + 1), by_x = scaled[i] * dx, by_y = scaled[i] * dy;
@@ -194,20 +220,22 @@ Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows&
   return found;
 }
 
-Gaussian submap_moments(const Rows& poses, std::span<const double> log_weights, std::span<const std::uint32_t> ids,
-                        const Rows& map) {
-  const std::size_t count = log_weights.size(), n = poses.rows() + 2 * ids.size();
-  std::vector<double> weights(padded(count), -elementary::INF);
+std::vector<double> weights_of(std::span<const double> log_weights) {
+  std::vector<double> weights(padded(log_weights.size()), -elementary::INF);
   std::copy(log_weights.begin(), log_weights.end(), weights.begin());
   for (std::size_t i = 0; i < weights.size(); i += WIDTH) store(&weights[i], elementary::exp(load(&weights[i])));
-  weights.resize(count);
+  weights.resize(log_weights.size());
+  return weights;
+}
+
+Gaussian submap_moments(const Rows& poses, std::span<const double> log_weights, std::span<const std::uint32_t> ids,
+                        const Rows& map) {
+  const std::size_t n = poses.rows() + 2 * ids.size();
+  const std::vector<double> weights = weights_of(log_weights);
   std::vector<std::size_t> order(ids.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) { return ids[a] < ids[b]; });
-  Rows sorted(count, map.rows());
-  for (std::size_t landmark = 0; landmark < order.size(); landmark++)
-    for (std::size_t k = 0; k < 5; k++) sorted.set(5 * landmark + k, map[5 * order[landmark] + k], 1);
-  Gaussian found = moments(poses, weights, sorted, sample_factor(weights), true);
+  Gaussian found = moments(poses, weights, map, order, sample_factor(weights), true);
   for (const std::size_t slot : order) found.ids.push_back(ids[slot]);
   for (std::size_t j = 0; j < poses.rows(); j++) found.covariance[j * n + j] += POSE_JITTER[j % 3];
   found.fault = gaussian::factor_or_fault({found.covariance.data(), n, n, n}).fault;

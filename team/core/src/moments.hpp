@@ -30,8 +30,14 @@ struct OnGroup {
   Rows deviations;
 };
 
+// The exponentials of log weights.
+std::vector<double> weights_of(std::span<const double> log_weights);
+
 // The direction of Σ wᵢ (cos aᵢ, sin aᵢ).
 double mean_direction(std::span<const double> angles, std::span<const double> weights);
+
+// The mean of the poses in the rows from `first` on, headings on the circle.
+se2::Pose<double> mean_pose(const Rows& poses, std::size_t first, std::span<const double> weights);
 
 // The factor for the scatter of particles with which its inverse is right on average.
 //
@@ -51,10 +57,11 @@ OnGroup on_group(const Rows& poses, std::span<const double> weights);
 
 // Mean and covariance of the mixture Σ wᵢ N(μᵢ, blkdiag(0, Σ₁, …, Σ_L)) of poses and landmarks.
 //
-// poses: three rows each; map: five rows a landmark, in the order of the result. The scatter between
-// the particles is taken times `between`. on_se2: the poses' mean and deviations are `on_group`,
-// otherwise those of their coordinates.
-Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows& map, double between, bool on_se2);
+// poses: three rows each; map: five rows a landmark; slots: the landmarks' places in it, in the order of
+// the result. The scatter between the particles is taken times `between`. on_se2: the poses' mean and
+// deviations are `on_group`, otherwise those of their coordinates.
+Gaussian moments(const Rows& poses, std::span<const double> weights, const Rows& map,
+                 std::span<const std::size_t> slots, double between, bool on_se2);
 
 // The Gaussian of a submap: `moments` by ascending id, on SE(2), times `sample_factor`, with
 // POSE_JITTER on each pose, and why they are no covariance.

@@ -350,15 +350,19 @@ TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate) {
 }
 
 void correct(std::span<double> mean, View covariance, double factor, std::span<const SharedError> errors,
-             Const sensitivity) {
+             Const sensitivity, Const curvature) {
   const std::size_t n = mean.size();
+  Numbers bent(n), column(n);
+  for (const SharedError& each : errors)
+    for (std::size_t i = 0; i < n; i++) bent[i] += each.value * (each.value * curvature[each.row][i]);
+  for (std::size_t i = 0; i < n; i++) mean[i] -= 0.5 * bent[i];
   for (std::size_t i = 0; i < n; i++)
     for (std::size_t j = 0; j < n; j++) covariance[i][j] = factor * covariance[i][j];
-  for (std::size_t k = 0; k < errors.size(); k++) {
-    const double variance = errors[k].sigma * errors[k].sigma;
-    const double* column = sensitivity[k];
+  for (const auto& [value, sigma, row] : errors) {
+    const double variance = sigma * sigma;
+    for (std::size_t i = 0; i < n; i++) column[i] = sensitivity[row][i] + value * curvature[row][i];
     for (std::size_t i = 0; i < n; i++) {
-      mean[i] += errors[k].value * column[i];
+      mean[i] += value * column[i];
       for (std::size_t j = 0; j < n; j++) covariance[i][j] += variance * (column[i] * column[j]);
     }
   }

@@ -65,11 +65,13 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined);
 TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate);
 
 // A submap corrected by what the centre found out about errors b that all submaps of a robot share:
-// N(mean + Sᵀ b, f P + Sᵀ diag(σ²) S) with f a factor and a row of S for each error.
+// N(mean + Sᵀ b + ½ Dᵀ b², f P + S'ᵀ diag(σ²) S'), S' = S + b D, with f a factor and a row of the
+// sensitivity S and of the curvature D for each error.
 struct SharedError {
   double value, sigma;
+  std::size_t row;
 };
 void correct(std::span<double> mean, dense::View covariance, double factor, std::span<const SharedError> errors,
-             dense::Const sensitivity);
+             dense::Const sensitivity, dense::Const curvature);
 
 }  // namespace teamslam::maps

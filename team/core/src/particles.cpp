@@ -81,10 +81,12 @@ void Particles::forget_weights() {
   std::fill_n(log_weights.begin(), count(), -elementary::log(double(count())));
 }
 
-void Particles::resample(double uniform, Rows& path) {
+void Particles::resample(double uniform, std::initializer_list<Rows*> others) {
   std::vector<std::size_t> parents = systematic_parents({log_weights.data(), count()}, uniform);
   parents.resize(stride(), parents.back());
-  for (Rows* rows : {&pose, &map, &path}) rows->copy_from(parents);
+  pose.copy_from(parents);
+  map.copy_from(parents);
+  for (Rows* rows : others) rows->copy_from(parents);
   forget_weights();
 }
 

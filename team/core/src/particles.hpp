@@ -4,7 +4,7 @@
 // particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
 #pragma once
 
-#include <optional>
+#include <initializer_list>
 
 #include "proposal.hpp"
 #include "rows.hpp"
@@ -49,7 +49,9 @@ struct Particles {
 
   // Equal weights.
   void forget_weights();
-  void resample(double uniform, Rows& path);
+
+  // Copies each particle from its parent, with its numbers in other rows; equal weights.
+  void resample(double uniform, std::initializer_list<Rows*> others);
 
   // Finds the scan's landmarks, and makes room for those that are new.
   std::vector<ScanMeasurement> find(std::span<const std::uint32_t> ids, std::span<const Reading> readings);

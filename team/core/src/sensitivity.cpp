@@ -68,8 +68,11 @@ std::vector<se2::Motion> twists_of(const std::vector<Pose<double>>& path, std::s
 // delay: by so much the measurement was made before its stamp, at pose ∘ Exp(−delay · twist).
 Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& stamped, const Point<double>& at,
                const Noise& noise, const se2::Motion& twist, double delay) {
-  const Pose<double> since = se2::exponential({delay * twist.forward, delay * twist.left, delay * twist.turn});
-  const Pose<double> pose = delay == 0.0 ? stamped : se2::compose(stamped, se2::inverse(since));
+  Pose<double> pose = stamped, since{};
+  if (delay != 0.0) {
+    since = se2::exponential({delay * twist.forward, delay * twist.left, delay * twist.turn});
+    pose = se2::compose(stamped, se2::inverse(since));
+  }
   const auto [dx, dy, d, direction] = models::line_to(pose, at.x, at.y);
   const auto of_pose = models::pose_jacobian(d, direction - pose.heading);
   const auto of_landmark = models::landmark_jacobian(d, direction);
@@ -93,10 +96,10 @@ Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<doub
   sight.bearing.shifts[BEARING] = 1.0;
   sight.bearing.shifts[RANGE_OFFSET] = -slope;
   sight.bearing.shifts[RANGE_SCALE] = -slope * d;
-  const Matrix3 Ad = se2::adjoint(since);
   for (Line* line : {&sight.range, &sight.bearing}) {
     line->shifts[CLOCK_OFFSET] = -(line->H[0] * twist.forward + line->H[1] * twist.left + line->H[2] * twist.turn);
     if (delay == 0.0) continue;
+    const Matrix3 Ad = se2::adjoint(since);
     const std::array<double, 3> of_pose{line->H[0], line->H[1], line->H[2]};
     for (std::size_t j = 0; j < 3; j++) line->H[j] = of_pose[0] * Ad[0][j] + of_pose[1] * Ad[1][j] + of_pose[2] * Ad[2][j];
   }

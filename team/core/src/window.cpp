@@ -44,6 +44,7 @@ Window::Window(const Settings& settings)
     : settings_(settings),
       particles_(settings.particles),
       path_(settings.particles),
+      solved_(settings.particles),
       effective_(effective_sample_size({particles_.log_weights.data(), settings.particles})) {}
 
 std::vector<Reading> Window::readings_of(const Scan& scan) const {
@@ -71,7 +72,7 @@ Step Window::advance(const Increment& increment, const Scan& scan, double unifor
   const Lower3 L = factor_of(increment);
   const std::vector<Reading> readings = readings_of(scan);
   const Innovation innovation = innovation_of(particles_, increment.mean, L, slots_of(scan), readings);
-  if (uniform >= 0.0) particles_.resample(uniform, path_);
+  if (uniform >= 0.0) particles_.resample(uniform, {&path_, &solved_});
   const double log_evidence = take(increment, L, scan, readings, normals);
   return {effective_, log_evidence, innovation.squared, innovation.error.size()};
 }
@@ -93,8 +94,11 @@ double Window::take(const Increment& increment, const Lower3& L, const Scan& sca
   const std::span<double> log_weights(particles_.log_weights.data(), particles_.count());
   const double log_evidence = normalise(log_weights);
   effective_ = effective_sample_size(log_weights);
-  for (std::size_t k = 0; k < scan.ids.size(); k++)
+  is_solved_.resize(particles_.landmarks());
+  for (std::size_t k = 0; k < scan.ids.size(); k++) {
     measurements_.push_back({scan.ids[k], keyframes(), scan.ranges[k], scan.bearings[k], scan.claim(k)});
+    is_solved_[particles_.slot_of(scan.ids[k])] = false;
+  }
   path_.append(particles_.pose);
   keep(increment);
   return log_evidence;
@@ -114,23 +118,16 @@ void Window::mark() {
 }
 
 std::vector<se2::Pose<double>> Window::mean_path() const {
-  std::vector<double> weights;
-  for (std::size_t i = 0; i < particles_.count(); i++) weights.push_back(elementary::exp(particles_.log_weights[i]));
-  const auto mean = [&](std::size_t row) {
-    const std::span<const double> numbers = path_.numbers(row);
-    double sum = 0.0;
-    for (std::size_t i = 0; i < weights.size(); i++) sum += weights[i] * numbers[i];
-    return sum;
-  };
+  const std::vector<double> weights = weights_of({particles_.log_weights.data(), particles_.count()});
   std::vector<se2::Pose<double>> found;
-  for (std::size_t k = 0; k < keyframes(); k++)
-    found.push_back({mean(3 * k), mean(3 * k + 1), mean_direction(path_.numbers(3 * k + 2), weights)});
+  for (std::size_t k = 0; k < keyframes(); k++) found.push_back(mean_pose(path_, 3 * k, weights));
   return found;
 }
 
 void Window::replace(Particles particles, Rows path) {
   particles_ = std::move(particles);
   path_ = std::move(path);
+  is_solved_.assign(particles_.landmarks(), false);
   effective_ = effective_sample_size({particles_.log_weights.data(), particles_.count()});
 }
 
@@ -150,14 +147,20 @@ Window Window::of_base() const {
   return based;
 }
 
-Rows Window::solved_landmarks() const {
+const Rows& Window::solve_landmarks() {
   check_of_sensor();
-  return landmarks_along_paths(particles_.ids, particles_.map, path_, measurements_, settings_.noise);
+  solved_.resize(particles_.map.rows());
+  for (std::size_t slot = 0; slot < particles_.landmarks(); slot++) {
+    if (!is_solved_[slot])
+      solve_along_paths(particles_.ids[slot], slot, particles_.map, path_, measurements_, settings_.noise, solved_);
+    is_solved_[slot] = true;
+  }
+  return solved_;
 }
 
-Gaussian Window::run() const { return gaussian(false, settings_.noise.is_white() ? particles_.map : solved_landmarks()); }
+Gaussian Window::run() { return gaussian(false, settings_.noise.is_white() ? particles_.map : solve_landmarks()); }
 
-Gaussian Window::gaussian(bool with_nodes, Rows landmarks) const {
+Gaussian Window::gaussian(bool with_nodes, const Rows& landmarks) const {
   check_of_sensor();
   Rows poses = particles_.pose;
   if (with_nodes)
@@ -166,11 +169,12 @@ Gaussian Window::gaussian(bool with_nodes, Rows landmarks) const {
       for (std::size_t k = 0; k < 3; k++) node.set(k, path_[3 * keyframe + k], 1);
       poses.append(node);
     }
-  if (settings_.mount.is_mounted()) {
-    move_poses(settings_.mount, poses);
-    move_landmarks(settings_.mount, landmarks);
-  }
-  return submap_moments(poses, {particles_.log_weights.data(), particles_.count()}, particles_.ids, landmarks);
+  const std::span<const double> log_weights(particles_.log_weights.data(), particles_.count());
+  if (!settings_.mount.is_mounted()) return submap_moments(poses, log_weights, particles_.ids, landmarks);
+  Rows of_base = landmarks;
+  move_poses(settings_.mount, poses);
+  move_landmarks(settings_.mount, of_base);
+  return submap_moments(poses, log_weights, particles_.ids, of_base);
 }
 
 }  // namespace teamslam::window

@@ -80,15 +80,16 @@ class Window {
 
   // The Gaussian of (end pose, pose nodes, landmarks by ascending id), landmarks solved again along
   // the paths.
-  Gaussian close() const { return gaussian(true, solved_landmarks()); }
+  Gaussian close() { return gaussian(true, solve_landmarks()); }
 
   // The Gaussian of (end pose, landmarks) so far, which is not fused. Where all of the sensor's
   // errors are white the landmarks are those that the particles hold: solving them at every keyframe
   // moves that pose by a hundredth and costs a third of the time.
-  Gaussian run() const;
+  Gaussian run();
 
-  // The landmarks of each particle solved over all measurements, rows in order of first sight.
-  Rows solved_landmarks() const;
+  // The landmarks of each particle solved over all measurements, rows in order of first sight. One that
+  // was solved before is solved again only if it was measured since: the rest of its path is the same.
+  const Rows& solve_landmarks();
 
   // Poses and landmarks in the frame of the base's start. The measurements stay the sensor's, so this
   // window neither advances nor closes: `check_of_sensor` throws std::invalid_argument.
@@ -111,7 +112,7 @@ class Window {
   double effective() const { return effective_; }
 
  private:
-  Gaussian gaussian(bool with_nodes, Rows landmarks) const;
+  Gaussian gaussian(bool with_nodes, const Rows& landmarks) const;
   void keep(const Increment& increment);
   double take(const Increment& increment, const Lower3& L, const Scan& scan, std::span<const Reading> readings,
               std::span<const double> normals);
@@ -124,6 +125,8 @@ class Window {
   std::vector<WindowMeasurement> measurements_;
   std::vector<WindowMotion> motions_;
   std::vector<std::size_t> nodes_;  // the keyframe of each pose node
+  Rows solved_;                     // the landmarks along the paths, as of `Particles::map`
+  std::vector<bool> is_solved_;     // of each landmark, since its last measurement
   double effective_;
   bool is_of_base_ = false;
 };

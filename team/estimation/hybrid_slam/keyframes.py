@@ -9,7 +9,7 @@ from msgspec.structs import force_setattr, replace
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel, Sensor
-from teamslam.team.estimation.hybrid_slam.pose_grid import NEVER_NS, PoseGrid
+from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
 from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan, reduced
 from teamslam.team.estimation.models import Increment, model_of, scanned
 from teamslam.team.estimation.odometry import STANDING, OdometryInterval
@@ -119,7 +119,7 @@ class Segmenter:
             return Rejection.OLDER
         mask, r, b = scanned(self._sensor, ranges, bearings)
         noises = unclaimed(len(r)) if own is None else own
-        if not mask.all():
+        if not all(mask.tolist()):  # so few are tested sooner as a list
             if not mask.any():
                 return Rejection.SENSOR_LIMITS
             ids, r, b, noises = ids[mask], r[mask], b[mask], noises[mask]
@@ -130,22 +130,6 @@ class Segmenter:
         else:
             self._waiting.append(scan)
         return None
-
-    @property
-    def due_ns(self) -> int:
-        """The next time at which a scan or a node is reached, or a keyframe closes."""
-        due_ns = NEVER_NS if self._grid is None else self._grid.next_ns
-        if self._waiting:
-            due_ns = min(due_ns, self._waiting[0].stamp_ns)
-        return (
-            min(due_ns, self._keyframe_start_ns + self._keyframe_ns) if self._keyframe else due_ns
-        )
-
-    def go_on(self, interval: OdometryInterval) -> None:
-        """Integrate an interval of measured speeds that ends before `due_ns`, as `drive` does."""
-        self._last, self._unmeasured = interval, None
-        self._odometry.drive(interval.duration_ns * 1e-9, interval.forward, interval.yaw_rate, None)
-        self.now_ns = self._here_ns = interval.end_ns
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> list[Keyframe]:
         """Integrate one odometry interval; returns the keyframes in it, in order.

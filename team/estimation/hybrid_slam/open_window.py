@@ -102,8 +102,7 @@ class OpenWindow:
         if not self._solvable:
             return None
         try:
-            with np.errstate(all="ignore"):
-                return step(self.particles)
+            return step(self.particles)
         except (NotACovarianceError, np.linalg.LinAlgError):
             return None
 
@@ -113,8 +112,9 @@ class OpenWindow:
 
     def _admit(self, keyframe: Keyframe) -> None:
         most = self._config.bounds.submap_landmarks
-        bounded = nearest_landmarks(keyframe, self.particles.landmarks, most)
-        if self._gate.add(bounded):
+        if self.particles.core.landmarks + len(keyframe.ids) > most:
+            keyframe = nearest_landmarks(keyframe, self.particles.landmarks, most)
+        if self._gate.add(keyframe):
             self._take(self._gate.last)
         else:
             self._take_all(self._gate.keyframes)
@@ -135,6 +135,7 @@ class OpenWindow:
         if keyframe.is_node:
             windows.mark_node(self.particles, keyframe.stamp_ns)
 
+    @np.errstate(all="ignore")
     def _settle(self) -> None:
         has_others = self._gate.confirm()
         keyframes = self._gate.keyframes
@@ -169,7 +170,6 @@ class OpenWindow:
         """Apply a step to the particles, unless one has failed before."""
         if self._solvable:
             try:
-                with np.errstate(all="ignore"):
-                    step(*arguments)
+                step(*arguments)
             except (NotACovarianceError, np.linalg.LinAlgError):
                 self._solvable = False

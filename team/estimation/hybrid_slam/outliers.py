@@ -2,13 +2,10 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, noise_of
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
-from teamslam.team.shapes import Bool
 
 OUTLIER_SHARE = 0.01
 """Probability of an outlier before the window's measurements are compared. A landmark measurement
@@ -34,7 +31,6 @@ class OutlierGate:
         sensor = self._sensor
         self._all: list[Keyframe] = []
         self._begins = [0]
-        self._accepted: Bool[np.ndarray, " n"] = np.zeros(0, np.bool_)
         self._consensus = core.Consensus(
             noise_of(sensor), sensor.max_range, sensor.field_of_view, OUTLIER_SHARE
         )
@@ -42,7 +38,7 @@ class OutlierGate:
     @property
     def gated(self) -> int:
         """Number of measurements that are not accepted."""
-        return int(np.count_nonzero(~self._accepted))
+        return self._consensus.rejected
 
     @property
     def keyframes(self) -> Sequence[Keyframe]:
@@ -55,8 +51,8 @@ class OutlierGate:
         return self._reduced(len(self._all) - 1)
 
     def _reduced(self, k: int) -> Keyframe:
-        accepted = self._accepted[self._begins[k] : self._begins[k + 1]]
-        return self._all[k] if accepted.all() else self._all[k].only(accepted)
+        accepted = self._consensus.accepted(self._begins[k], self._begins[k + 1])
+        return self._all[k] if accepted is None else self._all[k].only(accepted)
 
     def add(self, keyframe: Keyframe) -> bool:
         """Add a keyframe; return whether all measurements accepted before it stay accepted."""
@@ -71,12 +67,8 @@ class OutlierGate:
                 keyframe.bearings,
                 keyframe.own,
             )
-        agreed, count = self._consensus.agreeing(), len(self._accepted)
-        stay = bool((self._accepted <= agreed[:count]).all())
-        self._accepted = np.concatenate([self._accepted, agreed[count:]]) if stay else agreed
-        return stay
+        return self._consensus.accept()
 
     def confirm(self) -> bool:
         """Compare all measurements of the window; return whether other ones are accepted now."""
-        before, self._accepted = self._accepted, self._consensus.confirmed()
-        return not np.array_equal(before, self._accepted)
+        return self._consensus.confirm()

@@ -96,18 +96,6 @@ class HybridSlam:
         now_ns = self._segmenter.now_ns
         return self._start_ns is None or (now_ns is not None and stamp_ns < now_ns)
 
-    @property
-    def due_ns(self) -> int:
-        """The next time at which odometry does more than move the robot, or a window may close."""
-        if self._start_ns is None:
-            return -LONGEST_NS
-        return min(self._start_ns + self._window_ns, self._segmenter.due_ns)
-
-    def go_on(self, interval: OdometryInterval) -> None:
-        """Take an odometry interval of measured speeds that ends before `due_ns`."""
-        self._driven_m += abs(interval.forward) * interval.duration_ns * 1e-9
-        self._segmenter.go_on(interval)
-
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> ClosedWindow | None:
         """Take one odometry interval; returns the window that it closes, if any."""
         stamp_ns = interval.end_ns

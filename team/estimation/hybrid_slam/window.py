@@ -169,8 +169,7 @@ def gaussian(window: Window, *, running: bool = False) -> LocalMap:
     stamps = window.node_stamps[: len(nodes)]
     if not window.front_end.biases:
         return LocalMap(ids, mean, covariance, stamps)
-    biases, *answers = _sensitivity(window, mean, running)
-    sensitivity, curvature = answers
+    biases, sensitivity, curvature = _sensitivity(window, mean, running)
     return LocalMap(ids, mean, covariance, stamps, biases, sensitivity, curvature=curvature)
 
 
@@ -196,11 +195,13 @@ def _sensitivity(
 
     That by `forward_scale` is left out where all of the window's motion is calibrated.
     """
-    uncalibrated = window.core.has_shifts
-    biases = tuple(b for b in window.front_end.biases if b != "forward_scale" or uncalibrated)
-    *answers, fault = window.core.sensitivity(mean, not running)
+    biases = window.front_end.biases
+    if "forward_scale" in biases and not window.core.has_shifts:
+        biases = tuple(each for each in biases if each != "forward_scale")
+    rows, curvature, fault = window.core.sensitivity(mean, not running)
     if fault:
         raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    chosen = [BIASES.index(bias) for bias in biases]
-    rows, curvature = (each[chosen].astype(np.float32).astype(np.float64) for each in answers)
+    if len(biases) < len(BIASES):
+        chosen = [BIASES.index(each) for each in biases]
+        rows, curvature = rows[chosen], curvature[chosen]
     return biases, rows, curvature

@@ -77,16 +77,14 @@ class SubmapCorrection(NamedTuple):
         """
         if self.covariance_factor == 1.0 and not local.biases:
             return local
-        known = [each for each in self.biases if each[0] in local.biases]
-        errors = np.array([(value, sigma) for _, value, sigma in known]).reshape(-1, 2)
-        rows = [local.biases.index(name) for name, _, _ in known]
-        bent = errors[:, :1] * local.curvature[rows]
+        rows = {name: row for row, name in enumerate(local.biases)}
         mean, covariance = core.corrected(
-            local.mean - 0.5 * (errors[:, :1] * bent).sum(axis=0),
+            local.mean,
             local.covariance,
             self.covariance_factor,
-            local.sensitivity[rows] + bent,
-            errors,
+            local.sensitivity,
+            local.curvature,
+            [(value, sigma, rows[name]) for name, value, sigma in self.biases if name in rows],
         )
         return LocalMap(local.ids, mean, covariance, local.node_stamps)
 
