@@ -51,9 +51,11 @@ LAUNCHED = tuple(f"{SYSTEM}test_{name}.py" for name in ("launch", "replay"))
 """They look at the same launches, which are made once for the worker that runs both."""
 FIRST = (
     *LAUNCHED, f"{SYSTEM}test_bad_input.py", SYSTEM,
-    "tests/recording/", "tests/keys/", "tests/wire/", "tests/sim/",
+    "tests/recording/", "tests/keys/", "tests/wire/", "tests/sim/", "tests/central/", "tests/test_",
+    "tests/studies/", "tests/estimation/", "tests/hostile/",
 )  # fmt: skip
-"""The tests that start processes come first, since they take longest; long ones are not last."""
+"""The tests that start processes come first, since they take longest; short files are last, so that
+the workers end together."""
 TEAMS = 2
 """So many workers run tests of processes at a time; the third has what they leave of the time."""
 BESIDE = 5

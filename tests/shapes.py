@@ -44,11 +44,13 @@ def checked(function: F) -> Callable[..., object]:
 
     def counted(*args: object, **kwargs: object) -> object:
         nonlocal check
-        if check is None:
-            check = beartype(function, conf=_CONFIGURATION)
         _calls[name] += 1
+        if _calls[name] > 2 * CALLS:  # one within a function, which is not let through
+            return None
         if _calls[name] == 2 * CALLS:
             _let_through(*name)
+        if check is None:
+            check = beartype(function, conf=_CONFIGURATION)
         return check(*args, **kwargs)
 
     return counted

@@ -13,13 +13,13 @@ from teamslam.central import tick_fold
 from teamslam.central.desk.verification.verification import verify
 from teamslam.central.withdrawal import disagreement
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
 from teamslam.team.wire.bus import Sample, opened
 from tests.central.test_withdrawal import messages, of_set, team_run
+from tests.final_maps import scenario_in
 from tests.sim.reruns import written
 from tests.trials.stress_world import StressWorld, write
 
@@ -31,8 +31,7 @@ def mirrored_run(robot: str) -> tuple[Sample, ...]:
     """
     with TemporaryDirectory() as place:
         world = StressWorld(seed=3, seconds=60.0, mirrored=(robot,) if robot else ())
-        folder = write(world, Path(place) / "world")
-        of = with_options(load(folder / "scenario.toml"), dataset=folder)
+        of = scenario_in(write(world, Path(place) / "world"))
         return tuple(run_team(of, streams_of(of)))
 
 

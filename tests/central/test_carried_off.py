@@ -10,7 +10,6 @@ from teamslam.central.carried_off import cuts_of
 from teamslam.central.diagnosis import describe, diagnose
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, bias_estimates, joint_cost
@@ -18,6 +17,7 @@ from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from tests.central.test_withdrawal import messages, scenario, team_run
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
 FIRST, LAST = 4, 6
@@ -117,7 +117,7 @@ def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_pat
     """A scan of the stress world every 0.5 s: none lies between the seam at 50 s and 50.2 s."""
     off = CarriedOff("r2", 4.0, 0.6, 50.2)
     folder = write(StressWorld(seed=5, seconds=100.0, carried_off=(off,)), tmp_path)
-    of = with_options(load(folder / "scenario.toml"), dataset=folder)
+    of = final_only(scenario_in(folder))
     final = final_map(list(run_team(of, streams_of(of))))
     assert not final.withdrawn
     (found,) = (each for each in final.diagnosis if each.cause == "carried_off")

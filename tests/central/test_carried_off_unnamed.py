@@ -13,13 +13,13 @@ import pytest
 from teamslam.central.carried_off import cuts_of
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import opened
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
 AT_S = 100.0
@@ -30,13 +30,17 @@ INSIDE = CarriedOff("r2", 15.0, 2.0, AT_S + 4.3)
 
 
 class Run:
-    """A run of a world with hidden identities: its samples, the true landmarks, r2's true path."""
+    """A run of a world with hidden identities: its samples, the true landmarks, r2's true path.
+
+    Running maps and poses are published where r2 is carried far, whose poses are judged.
+    """
 
     def __init__(self, seed: int, *off: CarriedOff) -> None:
         world = StressWorld(seed=seed, seconds=220.0, hidden=True, carried_off=off)
         with TemporaryDirectory() as folder:
             place = write(world, Path(folder))
-            self.scenario = with_options(load(place / "scenario.toml"), dataset=place)
+            live = scenario_in(place)
+            self.scenario = live if off == (FAR,) else final_only(live)
             self.samples = list(run_team(self.scenario, streams_of(self.scenario)))
             self.landmarks = _rows(place / "landmarks.csv")[:, 1:]
             self.path = _rows(place / "r2" / "truth.csv")

@@ -8,9 +8,10 @@ import pytest
 
 from teamslam.central.diagnosis import describe, to_object
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import messages as m
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(robots=2, landmarks=12, half_m=10.0, seconds=120.0)
@@ -18,8 +19,7 @@ TEAM = StressWorld(landmarks=15, half_m=12.0, seconds=100.0)
 
 
 def scenario(world: StressWorld, place: Path) -> Scenario:
-    folder = write(world, place)
-    return with_options(load(str(folder / "scenario.toml")), dataset=folder)
+    return final_only(scenario_in(write(world, place)))
 
 
 def diagnosed(of: Scenario) -> tuple[m.Diagnosis, ...]:

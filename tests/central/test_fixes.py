@@ -25,6 +25,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
 from tests.central.test_survey import errors
+from tests.final_maps import final_only
 
 SIGMA_M = 0.3
 ANTENNA = (0.8, -0.5)
@@ -54,7 +55,9 @@ def day(
     unknown=("*",),
     origin=(0.0, 0.0),
     jumps=(),
+    live=False,
 ):
+    """The samples of a team with fixes, and its world; live: with running maps and poses."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=250)
     robots = tuple(
@@ -74,6 +77,7 @@ def day(
         with_fixes(each, seed, np.array(origin), jumps) if each.robot in fixed else each
         for each in streams.streams
     )
+    scenario = scenario if live else final_only(scenario)
     return list(run_team(scenario, dataclasses.replace(streams, streams=own))), streams
 
 
@@ -138,7 +142,7 @@ def test_a_fix_beyond_the_bounds_is_refused(changed, why):
 
 def test_maps_with_fixes_are_recomputed_from_the_log():
     recorded = Recorded()
-    recorded.take_all(day(3)[0])
+    recorded.take_all(day(3, live=True)[0])
     computed = recomputed_centre(recorded)
     maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
     assert maps

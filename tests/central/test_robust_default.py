@@ -10,8 +10,8 @@ from teamslam.central.desk.evaluation.errors import MapErrors, map_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(seed=3, landmarks=20, half_m=14.0, seconds=150.0)
@@ -29,8 +29,7 @@ WRONG = (7, 9)
 
 
 def final(world: StressWorld, folder: Path) -> MapResult:
-    place = write(world, folder)
-    scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
+    scenario = final_only(scenario_in(write(world, folder)))
     found = evaluate(list(run_team(scenario, streams_of(scenario)))).map
     assert found is not None
     return found

@@ -3,13 +3,14 @@
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import messages as m
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import StressWorld, write
 
 TEAM = ("r1", "r2", "r3")
@@ -18,14 +19,12 @@ CAUSES = ("clock_offset", "odometry_scale", "bearing_offset", "range_offset")
 
 def mapped(world: StressWorld, place: Path, *, blind: bool = False) -> MapResult:
     """The team's final map of this world; blind: without the states of calibration errors."""
-    folder = write(world, place)
+    scenario = final_only(scenario_in(write(world, place)))
     if blind:
-        path = folder / "scenario.toml"
-        text = path.read_text("utf-8")
-        path.write_text(
-            text.replace("[defaults.front_end]", "[defaults.front_end]\nbiases = []"), "utf-8"
+        robots = (
+            replace(each, front_end=replace(each.front_end, biases=())) for each in scenario.robots
         )
-    scenario = with_options(load(str(folder / "scenario.toml")), dataset=folder)
+        scenario = replace(scenario, robots=tuple(robots))
     found = evaluate(run_team(scenario, streams_of(scenario))).map
     assert found.errors is not None
     return found

@@ -1,6 +1,7 @@
-"""Mistakes of a user: exit status 2, one clear message, no traceback, nothing left running.
+"""Mistakes of a user that a process meets: one clear message, exit status 2, nothing left running.
 
-And unusual input that works: a data set without ground truth, a robot without odometry.
+And unusual input that works: a data set without ground truth, a robot without odometry. Mistakes
+that a command refuses by itself are in `tests/sim/cli/test_wrong_use.py`.
 """
 
 import asyncio
@@ -13,20 +14,15 @@ import pytest
 from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
-from tests.support import ROOT, nobody_listens
+from tests.sim.cli.test_wrong_use import message_in
+from tests.support import nobody_listens
 from tests.system.processes import Process, Processes
 from tests.system.scenarios import short
-
-WRONG_USE = 2
 
 
 def told(process: Process) -> str:
     """The one message of a command that was used wrongly."""
-    assert "Traceback" not in process.said()
-    assert process.exit == WRONG_USE, process.said()
-    errors = [line for line in process.said().splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, process.said()
-    return errors[0]
+    return message_in(process.said(), process.exit)
 
 
 async def refused(team: Processes, *arguments: str | Path) -> str:
@@ -35,68 +31,6 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
     await process.ended()
     await team.none_left(0.0)
     return told(process)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        (["launch", "atlantis"], ["atlantis: no such scenario", "thesis", "waypoints"]),
-        (["launch", "thesis", "--robots", "0"], ["0 robots: a team has 1 to 1000"]),
-        (["launch", "thesis", "--robots", "1001"], ["1001 robots: a team has 1 to 1000"]),
-        (
-            ["launch", "thesis", "--estimator", "hybrid-thesis"],
-            ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],
-        ),
-        (["launch", "thesis", "--fusion", "mean"], ["'mean' at fusion", "covariance-intersection"]),
-        (["launch", "thesis", "--speed", "banana"], ["--speed banana", "positive number, or max"]),
-        (["launch", "thesis", "--speed", "-1"], ["--speed -1", "positive number, or max"]),
-        (["launch", "--dataset", "nowhere.zip"], ["nowhere.zip: no such file or folder"]),
-        (["launch", "thesis", "--dataset", "x.zip"], ["takes no data set", "utias"]),
-        (["launch", "utias"], ["no data set given", "--dataset"]),
-        (["robot", "thesis", "r9"], ["thesis has no robot 'r9'", "r1, r2"]),
-        (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
-        (["launch", "thesis", "-o", "/dev/null"], ["/dev/null: File exists; give another path"]),
-        (["rerun", "none", "-o", "/dev/null"], ["-o /dev/null: File exists; give a folder"]),
-        (["repair", "/dev/null", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
-        (["record", "thesis", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
-        (["experiment", "ma-6a"], ["ma-6a: give the sets with --dataset"]),
-        (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
-        (["view", "nowhere.mcap"], ["nowhere.mcap: not found"]),
-        (
-            ["view", "nowhere.mcap", "--follow", "--layout", "x"],
-            ["nowhere.mcap: not found", "need"],
-        ),
-        (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
-        (["router", "--listen", "banana"], ["can not listen at banana", "tcp/HOST:PORT"]),
-        (
-            ["router", "--listen", "tcp/203.0.113.1:7447"],
-            ["--listen tcp/203.0.113.1:7447", "--keys", "--insecure"],
-        ),
-        (
-            ["router", "--insecure", "--listen", "tcp/203.0.113.1:7447"],
-            ["can not listen", "not this machine's"],
-        ),
-    ],
-)
-async def test_wrong_use_is_told_with_what_to_do(arguments, parts, team):
-    message = await refused(team, *arguments)
-    assert [part for part in parts if part not in message] == [], message
-
-
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ('base = "thesis"\nrobotcount = 2', ["unknown field `robotcount`", "robot_count"]),
-        ('base = "thesis"\n[world]\nsteps = "many"', ["world.steps", "int", "str"]),
-        ('base = "thesis"\n[defaults.sensor]\nrange_sigma = -1', ["range_sigma"]),
-        ('base = "thesis"\nseed = nan', ["seed"]),
-        ("steps =", ["not valid TOML"]),
-    ],
-)
-async def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(text, parts, team):
-    (team.folder / "mine.toml").write_text(text)
-    message = await refused(team, "launch", "mine.toml")
-    assert [part for part in ["mine.toml: ", *parts] if part not in message] == [], message
 
 
 @pytest.fixture
@@ -180,20 +114,3 @@ async def test_a_router_that_is_not_there_is_told(team):
         await asyncio.gather(*(process.ended() for process in processes))
     for process in processes:
         assert f"no router answers at {endpoint}" in told(process)
-
-
-EMPTY, FOREIGN = b"", (ROOT / "README.md").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("command", "content", "what"),
-    [
-        (["replay"], EMPTY, "empty file"),
-        (["replay"], FOREIGN, "not an MCAP file"),
-        (["report", "--output", "out"], EMPTY, "empty file"),
-        (["repair", "--output", "out"], FOREIGN, "not an MCAP file"),
-    ],
-)
-async def test_what_is_no_log_is_told(command, content, what, team):
-    (team.folder / "mine.mcap").write_bytes(content)
-    assert f"mine.mcap: {what}" in await refused(team, *command, "mine.mcap")

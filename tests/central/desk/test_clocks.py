@@ -30,6 +30,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.digest import configured
 from tests import build
+from tests.final_maps import scenario_in
 from tests.sim.logs import final_map, samples
 from tests.trials.stress_world import StressWorld, write
 
@@ -38,7 +39,7 @@ LATE_S = 0.1
 
 def published(world: StressWorld, place: Path) -> list[Sample]:
     """The log of a data set's measurements, without the data set's truth, and a final map."""
-    of = with_options(load(str(write(world, place) / "scenario.toml")), dataset=place)
+    of = scenario_in(write(world, place))
     node = WorldNode(streams_of(of), frozenset(), configured("world", 0, 0, of))
     out = node.begin()
     while not node.ended:

@@ -1,6 +1,5 @@
 """A clock of a robot's detections that is off is found, and is not taken for a mount."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -16,20 +15,17 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire.arrays import floats, ids
+from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import StressWorld, write
 
 OFFSET_S = 0.5
 SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
 
 
-def opened(place: Path) -> Scenario:
-    return with_options(load(str(place / "scenario.toml")), dataset=place)
-
-
 def map_error(scenario: Scenario) -> float:
     """The RMSE of the final map in the team's frame [m]."""
     streams = streams_of(scenario)
-    fused = final_map(list(run_team(scenario, streams)))
+    fused = final_map(list(run_team(final_only(scenario), streams)))
     assert streams.landmarks is not None
     true = dict(zip(streams.landmark_ids.tolist(), streams.landmarks, strict=True))
     means = floats(fused.means, "means").reshape(-1, 2)
@@ -54,7 +50,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     """
     monkeypatch.setattr(calibrate, "joined_team", lambda *_: SimpleNamespace(fold=None))
     monkeypatch.setattr(calibrate, "central_figures", lambda *_: ())
-    right, late = (opened(place) for place in places)
+    right, late = (scenario_in(place) for place in places)
     begun = msgspec.structs.replace(late.robots[1], clock_offset_s=0.1)
     scenario = msgspec.structs.replace(late, robots=(late.robots[0], begun))
     found = calibrate_models([("late", streams_of(scenario))], scenario, lambda _: None)
@@ -84,7 +80,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
 
 
 def test_clocks_that_are_right_are_left_alone(places):
-    right = opened(places[0])
+    right = scenario_in(places[0])
     data = against_truth([("right", streams_of(right))], right)[0]
     clocks = clocks_of(data, right.robots[0].sensor)
     assert list(clocks) == ["r1", "r2"]
@@ -108,7 +104,7 @@ def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path):
 
 def test_a_late_robot_is_compared_with_its_teammates_at_one_time(places):
     """Detections and odometry are moved to the clock of the true paths, which all robots share."""
-    streams = streams_of(opened(places[0]))
+    streams = streams_of(scenario_in(places[0]))
     late = Clock(*(Figure(name, s, 0.01, "s") for name, s in (("a", 0.3), ("b", -0.2), ("c", 0.5))))
     before, after = (world.streams[1] for world in (streams, on_one_clock(streams, {"r2": late})))
     assert after.truth_ns is before.truth_ns

@@ -1,0 +1,112 @@
+"""Mistakes of a user: exit status 2 and one clear message, without a traceback."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from teamslam.sim.cli.entry import main
+from teamslam.sim.cli.options import WRONG_USE
+from tests.support import ROOT
+
+
+def message_in(said: str, status: object) -> str:
+    """The one message of a command that was used wrongly."""
+    assert "Traceback" not in said
+    assert status == WRONG_USE, said
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, said
+    return errors[0]
+
+
+@pytest.fixture
+def told(monkeypatch, tmp_path, capfd):
+    """Run a command that can not do what it is asked for, in an empty folder; its message."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["teamslam", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return message_in("".join(capfd.readouterr()), ended.value.code)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["launch", "atlantis"], ["atlantis: no such scenario", "thesis", "waypoints"]),
+        (["launch", "thesis", "--robots", "0"], ["0 robots: a team has 1 to 1000"]),
+        (["launch", "thesis", "--robots", "1001"], ["1001 robots: a team has 1 to 1000"]),
+        (
+            ["launch", "thesis", "--estimator", "hybrid-thesis"],
+            ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],
+        ),
+        (["launch", "thesis", "--fusion", "mean"], ["'mean' at fusion", "covariance-intersection"]),
+        (["launch", "thesis", "--speed", "banana"], ["--speed banana", "positive number, or max"]),
+        (["launch", "thesis", "--speed", "-1"], ["--speed -1", "positive number, or max"]),
+        (["launch", "--dataset", "nowhere.zip"], ["nowhere.zip: no such file or folder"]),
+        (["launch", "thesis", "--dataset", "x.zip"], ["takes no data set", "utias"]),
+        (["launch", "utias"], ["no data set given", "--dataset"]),
+        (["launch", "thesis", "--record", "/dev/null"], ["/dev/null: not a regular file"]),
+        (["launch", "thesis", "-o", "/dev/null"], ["/dev/null: File exists; give another path"]),
+        (["rerun", "none", "-o", "/dev/null"], ["-o /dev/null: File exists; give a folder"]),
+        (["repair", "/dev/null", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
+        (["record", "thesis", "-o", "/dev/null"], ["/dev/null exists: choose another name"]),
+        (["experiment", "ma-6a"], ["ma-6a: give the sets with --dataset"]),
+        (["replay", "nowhere.mcap"], ["nowhere.mcap: not found"]),
+        (["view", "nowhere.mcap"], ["nowhere.mcap: not found"]),
+        (
+            ["view", "nowhere.mcap", "--follow", "--layout", "x"],
+            ["nowhere.mcap: not found", "need"],
+        ),
+        (["report", "nowhere.mcap", "-o", "out"], ["nowhere.mcap: not found"]),
+        (["router", "--listen", "banana"], ["can not listen at banana", "tcp/HOST:PORT"]),
+        (
+            ["router", "--listen", "tcp/203.0.113.1:7447"],
+            ["--listen tcp/203.0.113.1:7447", "--keys", "--insecure"],
+        ),
+        (
+            ["router", "--insecure", "--listen", "tcp/203.0.113.1:7447"],
+            ["can not listen", "not this machine's"],
+        ),
+    ],
+)
+def test_wrong_use_is_told_with_what_to_do(arguments, parts, told):
+    message = told(*arguments)
+    assert [part for part in parts if part not in message] == [], message
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ('base = "thesis"\nrobotcount = 2', ["unknown field `robotcount`", "robot_count"]),
+        ('base = "thesis"\n[world]\nsteps = "many"', ["world.steps", "int", "str"]),
+        ('base = "thesis"\n[defaults.sensor]\nrange_sigma = -1', ["range_sigma"]),
+        ('base = "thesis"\nseed = nan', ["seed"]),
+        ("steps =", ["not valid TOML"]),
+    ],
+)
+def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(text, parts, told):
+    Path("mine.toml").write_text(text)
+    message = told("launch", "mine.toml")
+    assert [part for part in ["mine.toml: ", *parts] if part not in message] == [], message
+
+
+EMPTY, FOREIGN = b"", (ROOT / "README.md").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("command", "content", "what"),
+    [
+        (["replay"], EMPTY, "empty file"),
+        (["replay"], FOREIGN, "not an MCAP file"),
+        (["report", "--output", "out"], EMPTY, "empty file"),
+        (["repair", "--output", "out"], FOREIGN, "not an MCAP file"),
+    ],
+)
+def test_what_is_no_log_is_told(command, content, what, told):
+    Path("mine.mcap").write_bytes(content)
+    assert f"mine.mcap: {what}" in told(*command, "mine.mcap")
