@@ -17,7 +17,6 @@ from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, wr
 WORLD = StressWorld(seed=3, landmarks=20, half_m=14.0, seconds=150.0)
 FAULTS = {
     "1 % outliers": replace(WORLD, outlier_share=0.01),
-    "5 % outliers": replace(WORLD, outlier_share=0.05),
     "20 % outliers": replace(WORLD, outlier_share=0.2),
     "moved by 2 m": replace(WORLD, moved=(MovedLandmark(7, (1.4, 1.4), 75.0),)),
     "moved by 0.5 m": replace(WORLD, moved=(MovedLandmark(7, (0.35, 0.35), 75.0),)),

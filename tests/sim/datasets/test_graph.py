@@ -20,6 +20,7 @@ from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.config import GraphWorld
 from teamslam.team.estimation.se2 import between, compose
+from tests.final_maps import final_only
 
 CITY = Path(__file__).parents[4] / "shared" / "benchmarks" / "citytrees" / "cityTrees10000.txt"
 ISAM = """# three poses, one landmark
@@ -153,7 +154,7 @@ def test_a_team_maps_a_graph(tmp_path, robots):
     path = written(tmp_path, drive())
     written(tmp_path, drive(noise=0.0), "graph_groundtruth.txt")
     scenario = with_options(load("graph"), dataset=path, robots=robots)
-    joined = evaluate(run_team(scenario, streams_of(scenario))).map
+    joined = evaluate(run_team(final_only(scenario), streams_of(scenario))).map
     assert len(joined.ids) == len(read_graph(path).landmarks)
     assert joined.errors.rmse_m < 0.2
 
@@ -225,6 +226,6 @@ def test_import_writes_tables_of_a_graph(tmp_path):
 @pytest.mark.skipif(not CITY.is_file(), reason="no cityTrees10000 here")
 def test_city_trees_is_mapped_as_well_as_by_the_batch():
     scenario = with_options(load("graph"), dataset=CITY, robots=5)
-    run = evaluate(run_team(scenario, streams_of(scenario)))
+    run = evaluate(run_team(final_only(scenario), streams_of(scenario)))
     assert run.map.errors.aligned_rmse_m < 1.03 * 0.0510
     assert 0.9 < run.map.cost_per_dof < 1.1
