@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.team.association import profile_for
 from teamslam.team.config import UNNAMED, Sensor
 from teamslam.team.estimation.association.closure import search_other_island
 from teamslam.team.estimation.association.island_view import IslandView
 from teamslam.team.estimation.association.verification import Closure
 from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.map_joining.alignment import procrustes
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, fold_submaps
@@ -29,6 +31,9 @@ SITES = ("forest", "parking", "indoor")
 ROBOTS = (0, 1, 2)
 RIGHT = 0.95
 """Probability that an object's class is right."""
+TAILS = 4.0
+"""Degrees of freedom of the differences of paired objects."""
+STEPS = 100
 
 
 def contribution(rows: np.ndarray, robot: int, sigma: float, classes: np.ndarray) -> Contribution:
@@ -68,13 +73,20 @@ def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[
 
 
 def fit_motion(one: IslandView, two: IslandView, closure: Closure) -> np.ndarray:
-    """Least-squares motion of the first map's paired landmarks onto the second's."""
+    """Motion of the first map's paired landmarks onto the second's, by maximum likelihood.
+
+    The differences of objects' centres have heavy tails: they are taken as Student's t of TAILS
+    degrees of freedom, by expectation maximisation (Lange, Little and Taylor 1989).
+    """
     a = one.joint.mean[[pair.first for pair in closure.pairs]]
     b = two.joint.mean[[pair.second for pair in closure.pairs]]
-    p, q = a - a.mean(axis=0), b - b.mean(axis=0)
-    turn = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
-    rotated = compose(np.array([0.0, 0.0, turn]), np.array([*a.mean(axis=0), 0.0]))[:2]
-    return np.array([*(b.mean(axis=0) - rotated), turn])
+    weights = np.ones(len(a))
+    for _ in range(STEPS):
+        motion = procrustes(b, a, weights)
+        off = ((b - transform_points(np.array(motion), a)) ** 2).sum(axis=1)
+        variance = (weights * off).sum() / (2 * len(a))
+        weights = (TAILS + 2) / (TAILS + off / variance)
+    return np.array(motion)
 
 
 def loop_error(found: dict[tuple[int, int], Closure]) -> tuple[float, float]:
