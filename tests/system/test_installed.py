@@ -1,4 +1,4 @@
-"""The program as it is installed: from its wheel, and beside folders that are named as its own."""
+"""The program as it is installed from its wheel."""
 
 import shutil
 import subprocess
@@ -12,29 +12,12 @@ from pathlib import Path
 import pytest
 
 from teamslam.sim.scenarios.scenario import builtin_names
-from teamslam.team.recording.reader import open_log
 from tests.support import ROOT
 from tests.system.processes import Processes
-from tests.system.scenarios import short
 
 FOLDERS = ("team", "central", "sim")
-COMMAND = Path(sys.executable).with_name("teamslam")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 OFFLINE = ("--no-deps", "--no-index")
-
-
-async def test_a_user_s_own_folders_do_not_shadow_ours(team):
-    for package in (*FOLDERS, "teamslam"):
-        folder = team.folder / package
-        folder.mkdir()
-        (folder / "__init__.py").write_text("raise RuntimeError('this is the user\\'s own')\n")
-        (team.folder / f"{package}.py").write_text("raise RuntimeError('the user\\'s own')\n")
-    launch = await team.run(
-        "launch",
-        [COMMAND, "launch", short(team.folder, steps=20), "--no-report", "--output", "run"],
-    )
-    assert await launch.ended() == 0, launch.said()
-    assert open_log(team.folder / "run" / "log.mcap").complete
 
 
 async def done(team: Processes, name: str, command: Sequence[object]) -> str:
