@@ -128,28 +128,28 @@ $(VENV)/.python:
 	fi; \
 	echo "Setting up $(VENV) with $$("$$found" --version)"; \
 	"$$found" -m venv --clear $(VENV)
-	sed -n '/^pip==/,/[^\\]$$/p' hashes-run.txt > $(VENV)/pip.txt
-	$(PIP) $(LISTED) $(VENV)/pip.txt
-	touch $@
+	@sed -n '/^pip==/,/[^\\]$$/p' hashes-run.txt > $(VENV)/pip.txt
+	@$(PIP) $(LISTED) $(VENV)/pip.txt
+	@touch $@
 
 $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes-run.txt) packages at pinned versions into $(VENV): a minute or two, once"
 	@cp hashes-run.txt $(VENV)/run.txt  # without CMake (86 MB) where the machine has one
 	@! $(BIN)/python team/core/building/backend.py --find cmake > /dev/null || \
 	  sed '/^cmake==/,/[^\]$$/d' hashes-run.txt > $(VENV)/run.txt
-	$(PIP) $(LISTED) $(VENV)/run.txt
+	@$(PIP) $(LISTED) $(VENV)/run.txt
 	$(NEEDS_ZIG)
 	@echo "Compiling the core for this processor: about a minute on two cores, once"
-	$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings levels=own --editable .
-	touch $@
+	@$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings levels=own --editable .
+	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes.txt) packages at pinned versions into $(VENV): a minute or two, once"
-	$(PIP) $(LISTED) hashes.txt
+	@$(PIP) $(LISTED) hashes.txt
 	$(NEEDS_ZIG)
 	@echo "Compiling the core for all processors: two minutes on two cores, once"
-	$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
-	touch $(VENV)/.runtime $@
+	@$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	@touch $(VENV)/.runtime $@
 
 # An install has built the core; it is built again once one of its sources is newer: for a run at
 # the level of this processor, for everything else at all levels.

@@ -115,7 +115,9 @@ def show(
     write_json(json_file, figures)
     landmarks = figures.pop("landmarks")
     for key, value in figures.items():
-        typer.echo(f"# {key}: {value}")
+        if value or not isinstance(value, list | tuple):
+            is_list = isinstance(value, list | tuple)
+            typer.echo(f"# {key}: {', '.join(map(str, value)) if is_list else value}")
     placed = "latitude_deg" in landmarks[0]
     typer.echo("landmark,x,y,sigma_x,sigma_y,submaps" + ",latitude,longitude" * placed)
     for each in landmarks:

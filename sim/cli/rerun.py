@@ -321,16 +321,17 @@ def _processes() -> int:
 
 def _print_verification(result: "Verification", elapsed_s: float) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table()
-    for heading in ("channel", "messages", "equal", "within tolerance", "different", "inputs lost"):
-        table.add_column(heading, justify="left" if heading == "channel" else "right")
-    for row in result.channels:
-        cells = (row.messages, row.equal, row.close, row.different, row.lacking)
-        table.add_row(row.channel, *(f"{n:,}" for n in cells))
+    from teamslam.central.desk.report.tables import Sheet, terminal_table
+
+    counts = (
+        (row.channel, row.messages, row.equal, row.close, row.different, row.lacking)
+        for row in result.channels
+    )
+    rows = [(channel, *(f"{n:,}" for n in numbers)) for channel, *numbers in counts]
+    headings = ("channel", "messages", "equal", "within tolerance", "different", "inputs lost")
     console = Console()
-    console.print(table)
+    console.print(terminal_table(Sheet(headings, rows)))
     for row in result.channels:
         if row.first is not None:
             console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)

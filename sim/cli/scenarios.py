@@ -1,6 +1,10 @@
 """Commands on scenarios: scenarios, simulate."""
 
+import re
+import shutil
+import textwrap
 from importlib.resources import files
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +24,8 @@ from teamslam.sim.cli.options import (
 from teamslam.sim.scenarios.scenario import builtin_names, load, with_options
 
 app = typer.Typer()
+_PARENTHESES = re.compile(r"\s*\([^()]*\)")
+_CLAUSE_END = re.compile(r"[:;]|(?<!\b[A-Z])\.(?=\s|$)")
 
 
 @app.command(cls=Command, epilog="teamslam scenarios --show waypoints > mine.toml")
@@ -33,13 +39,26 @@ def scenarios(
         if show not in builtin_names():
             known = ", ".join(builtin_names())
             fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        text = files("teamslam.sim.scenarios.builtin").joinpath(f"{show}.toml").read_text("utf-8")
-        typer.echo(text, nl=False)
+        typer.echo(_text(show), nl=False)
         return
+    width = shutil.get_terminal_size().columns
     for name in builtin_names():
-        found = load(name)
-        team = count_noun(len(found.robots), "robot")
-        typer.echo(f"{name:12} {team:10} {found.estimator} with {found.fusion}")
+        team = count_noun(len(load(name).robots), "robot")
+        start = f"{name:14} {team:10} "
+        typer.echo(start + textwrap.shorten(_summary(name), width - len(start), placeholder=" …"))
+
+
+def _summary(name: str) -> str:
+    """The first clause of a scenario's opening comment, without parentheses."""
+    lines = takewhile(lambda line: line.startswith("#"), _text(name).splitlines())
+    comment = " ".join(line.lstrip("# ") for line in lines)
+    while comment != (comment := _PARENTHESES.sub("", comment)):
+        pass
+    return _CLAUSE_END.split(comment)[0]
+
+
+def _text(name: str) -> str:
+    return files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8")
 
 
 @app.command(cls=Command, epilog="teamslam simulate waypoints -o my_world")

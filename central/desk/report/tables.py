@@ -24,7 +24,7 @@ ABSURD_NEES = 1000
 """NEES per degree of freedom above which words replace it."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
-LEFT = ("robot", "disposition")
+LEFT = ("robot", "disposition", "channel")
 """Headings of text columns."""
 Rows = Sequence[tuple[str, str]]
 

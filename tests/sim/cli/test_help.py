@@ -13,6 +13,7 @@ from teamslam.sim.cli.help import SECTIONS
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.plain import parse_plainly
 from teamslam.sim.cli.steps import Steps
+from teamslam.sim.scenarios.scenario import builtin_names
 from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import joined_log, scenario
 from tests.test_architecture import unknown
@@ -143,3 +144,11 @@ def test_one_run_and_a_picture_of_no_kind_are_refused(tmp_path):
     assert (alone.exit_code, "two or more" in alone.output) == (2, True)
     wrong = CliRunner().invoke(app, ["compare", "a", "b", "-o", str(tmp_path / "x.jpeg")])
     assert (wrong.exit_code, ".svg" in wrong.output) == (2, True)
+
+
+def test_the_list_of_scenarios_describes_each_in_one_line():
+    lines = RUN.invoke(app, ["scenarios"], env={"COLUMNS": "80"}).output.splitlines()
+    assert [line.split()[0] for line in lines] == list(builtin_names())
+    assert all(len(line) <= 80 and len(line.split()) > 4 for line in lines)
+    (waypoints,) = (line for line in lines if line.startswith("waypoints "))
+    assert "3 robots   Three different robots drive to random" in waypoints
