@@ -9,7 +9,7 @@ reflection. The covariance scale is judged last, beside all accepted causes.
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from statistics import median
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from teamslam.central.carried_off import CarriedOff
 from teamslam.central.monitor import SCALE_SIGMAS, finding
@@ -64,6 +64,7 @@ class _SharedError(NamedTuple):
     remedy: str
 
 
+NOISY: Final = "noise_underestimated"
 _CLOCK = "add {value:.3g} to its clock_offset_s"
 _ERRORS: Mapping[str, _SharedError] = {
     "clock_offset": _SharedError("clock_offset", 0.02, " s", "late", "early", _CLOCK),
@@ -280,7 +281,7 @@ def _wrong_minimum(fold: Fold) -> Iterator[m.Diagnosis]:
 def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
     factor = math.sqrt(value)
     return m.Diagnosis(
-        cause="noise_underestimated" if value > 1.0 else "noise_overestimated",
+        cause=NOISY if value > 1.0 else "noise_overestimated",
         robot=robot,
         value=(value,),
         sigma=(value * log_sigma,),
@@ -288,6 +289,14 @@ def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
         remedy=f"multiply the sigmas of sensor and odometry by {factor:.2g}, or with ground truth "
         "learn them by `teamslam calibrate`",
     )
+
+
+def widening(found: Sequence[m.Diagnosis]) -> float:
+    """Return the factor on the final map's covariances: the team's covariance scale where it is
+    above 1 beyond doubt, else 1.
+    """
+    scales = (each.value[0] for each in found if each.cause == NOISY and not each.robot)
+    return next(scales, 1.0)
 
 
 def describe(found: m.Diagnosis) -> str:
@@ -319,9 +328,10 @@ def _statement(found: m.Diagnosis) -> str:
             return f"another map, up to {value[0]:.1f} m away, fits about as well as this one"
         case "noise_underestimated" | "noise_overestimated":
             too, factor = ("small", value[0]) if value[0] > 1.0 else ("large", 1.0 / value[0])
+            widened = "" if found.robot or value[0] < 1.0 else ", which the final map's include"
             return (
-                f"{found.robot or 'team'}: the reported covariances are too {too} by a factor of "
-                f"{factor:.1f}, by the differences between submaps"
+                f"{found.robot or 'team'}: the submaps' covariances are too {too} by a factor of "
+                f"{factor:.1f}{widened}, by the differences between submaps"
             )
         case _:
             return _describe_shared_error(found)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from teamslam.central.carried_off import cuts_of
 from teamslam.central.config import CentralConfig
-from teamslam.central.diagnosis import describe, diagnose
+from teamslam.central.diagnosis import describe, diagnose, widening
 from teamslam.central.fused_map import receivable
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
@@ -238,6 +238,9 @@ class SubmapFold:
             final=final,
         )
         self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)
+        if final and not self.config.localise:
+            fold = marginals.widen_covariances(fold, widening(self.diagnosis))
+            biases = marginals.bias_estimates(fold)
         store = self.store
         fused = team_map(
             fold,

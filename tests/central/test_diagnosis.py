@@ -2,15 +2,23 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 
+from teamslam.central.desk.evaluation.errors import map_errors
+from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.diagnosis import describe, to_object
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.studies.experiments.true_minimum import final_fold
+from teamslam.team.estimation.map_joining.marginals import landmark_map
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample
 from tests.final_maps import final_only, scenario_in
 from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
@@ -20,6 +28,14 @@ TEAM = StressWorld(landmarks=15, half_m=12.0, seconds=100.0)
 
 def scenario(world: StressWorld, place: Path) -> Scenario:
     return final_only(scenario_in(write(world, place)))
+
+
+@cache
+def noisy(noise: float) -> list[Sample]:
+    """The log of a team whose noise is so many times the stated one."""
+    with TemporaryDirectory() as place:
+        of = scenario(replace(TEAM, noise=noise), Path(place))
+        return list(run_team(of, streams_of(of)))
 
 
 def diagnosed(of: Scenario) -> tuple[m.Diagnosis, ...]:
@@ -79,10 +95,19 @@ def test_a_mirrored_robot_is_named_as_mirrored(tmp_path):
 @pytest.mark.parametrize(
     ("noise", "cause"), [(2.0, "noise_underestimated"), (0.5, "noise_overestimated")]
 )
-def test_noise_that_is_stated_wrong_is_named_with_its_factor(tmp_path, noise, cause):
-    (found,) = diagnosed(scenario(replace(TEAM, noise=noise), tmp_path))
+def test_noise_that_is_stated_wrong_is_named_with_its_factor(noise, cause):
+    (found,) = final_map(noisy(noise)).diagnosis
     assert (found.cause, found.robot) == (cause, "")
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
+
+
+def test_noise_that_is_stated_too_small_widens_the_covariance_of_the_final_map():
+    samples = noisy(2.0)
+    found = evaluate(samples).map
+    stated = landmark_map(final_fold(samples, is_robust=True, has_biases=True), found.ids.tolist())
+    before, after = map_errors(stated.means, stated.covariance, found.truth), found.errors
+    assert after.rmse_m < 1.05 * before.rmse_m
+    assert after.nees_per_dof < after.band[1] < 2.0 < before.nees_per_dof
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -396,15 +396,34 @@ def unbounded_costs(island: Island) -> list[SubmapCost]:
     )
     if not settings.robust or scale is None or scale.value < FAR_TOO_SMALL:
         return found
-    factor = scale.value * settings.covariance_factor
     try:
-        solved, *_ = solve_island(
-            replace(island, settings=replace(settings, covariance_factor=factor))
-        )
-        again = terms(solved).submaps
+        again = terms(_widened(island, scale.value)).submaps
     except UNSOLVABLE:
         return found
     return [each._replace(chi2=scale.value * each.chi2) for each in again]
+
+
+def _widened(island: Island, factor: float) -> Island:
+    """Solve an island again with the submaps' covariances times a factor."""
+    settings = replace(
+        island.settings, covariance_factor=factor * island.settings.covariance_factor
+    )
+    solved, *_ = solve_island(replace(island, settings=settings))
+    return solved
+
+
+def widen_covariances(fold: Fold, factor: float) -> Fold:
+    """Solve the main island again with the submaps' covariances times a factor; return the fold as
+    it was where that has no solution.
+    """
+    if factor == 1.0 or fold.main_key is None:
+        return fold
+    try:
+        with np.errstate(all="ignore"):
+            island = _widened(fold.main, factor)
+    except UNSOLVABLE:
+        return fold
+    return replace(fold, islands={**fold.islands, fold.main_key: island})
 
 
 def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
