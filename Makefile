@@ -140,7 +140,7 @@ $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.pytho
 	@$(PIP) $(LISTED) $(VENV)/run.txt
 	$(NEEDS_ZIG)
 	@echo "Compiling the core for this processor: about a minute on two cores, once"
-	@$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings levels=own --editable .
+	@$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings cmake.define.TEAMSLAM_LEVELS=own --editable .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python

@@ -112,6 +112,7 @@ def save(figure: "Figure", path: Path) -> None:
     if style.look is not Look.PAPER:
         figure.savefig(path, dpi=DPI)
         if style.vectors:
+            figure.set_layout_engine("none")  # laid out by the first format
             figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
         return
     figure.suptitle("")

@@ -192,10 +192,13 @@ def build_wheel(
 def build_editable(
     directory: str, config_settings: Settings = None, metadata_directory: str | None = None
 ) -> str:
-    """Build the core in place; the wheel holds the path of the source tree and the metadata."""
+    """Build the core in place; the wheel holds the path of the source tree and the metadata.
+
+    The setting `cmake.define.TEAMSLAM_LEVELS=own` builds for this machine's processor alone.
+    """
     from scikit_build_core import build
 
-    build_in_place(own=(config_settings or {}).get("levels") == "own")
+    build_in_place(own=(config_settings or {}).get("cmake.define.TEAMSLAM_LEVELS") == "own")
     link = ROOT / "build" / "editable" / "teamslam"
     if not link.is_symlink():
         link.parent.mkdir(parents=True, exist_ok=True)
