@@ -7,9 +7,11 @@ reflection. The covariance scale is judged last, beside all accepted causes.
 """
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from teamslam.central.carried_off import CarriedOff
 from teamslam.central.monitor import SCALE_SIGMAS, finding
@@ -33,6 +35,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     terms,
     unbounded_costs,
 )
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
 SIGMAS = 4.0
@@ -238,11 +241,17 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
             seen_by.setdefault(id_, set()).add(joined.contribution.robot)
     for robot, chain in sorted({**own, **withdrawn}.items()):
         others = {i for i, robots in seen_by.items() if i < UNNAMED and robots - {robot}}
-        gains = [
-            gain for each in chain if (gain := _gain_of_reflection(fold, each, others)) is not None
-        ]
-        right = [gain for gain in gains if gain > 0.0]
-        if len(gains) >= LEAST_MIRRORED and len(right) >= MIRRORED * len(gains):
+        points = dict(zip(sorted(others), points_of(fold.main, sorted(others)), strict=True))
+        gains: list[float] = []
+        wrong = 0
+        for each in chain:
+            gain = _gain_of_reflection(points, each)
+            if gain is not None:
+                gains.append(gain)
+                wrong += not gain > 0.0
+            if len(chain) - wrong < MIRRORED * len(chain):  # whatever the others' gains are
+                break
+        if len(gains) >= LEAST_MIRRORED and len(gains) - wrong >= MIRRORED * len(gains):
             evidence = math.fsum(gains) / len(gains)
             yield m.Diagnosis(
                 cause="mirrored",
@@ -254,13 +263,18 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
             )
 
 
-def _gain_of_reflection(fold: Fold, submap: Contribution, others: Collection[int]) -> float | None:
-    """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection."""
+def _gain_of_reflection(
+    places: Mapping[int, Float[np.ndarray, "2"]], submap: Contribution
+) -> float | None:
+    """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection.
+
+    places: the others' landmarks [m], by id.
+    """
     ids = submap.local.ids.tolist()
-    own = [k for k, id_ in enumerate(ids) if id_ in others]
+    own = [k for k, id_ in enumerate(ids) if id_ in places]
     if len(own) < LEAST_SHARED:
         return None
-    points, local = points_of(fold.main, [ids[k] for k in own]), submap.local.landmarks[own]
+    points, local = np.array([places[ids[k]] for k in own]), submap.local.landmarks[own]
     x, y = (points - points.mean(axis=0)).T
     u, v = (local - local.mean(axis=0)).T
     rotated = core.hypot((x * u + y * v).sum(), (y * u - x * v).sum())

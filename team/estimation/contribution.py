@@ -143,6 +143,15 @@ class Contribution:
         return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
 
     @cached_property
+    def with_errors(
+        self,
+    ) -> dict[tuple[Bias | int, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]]:
+        """Sensitivity and factor by the errors of a graph, as the last graph with them has both
+        (`submap_graph.Joined`).
+        """
+        return {}
+
+    @cached_property
     def factor(self) -> core.SubmapFactor:
         """The submap as a factor of a graph. Raises NotACovarianceError that names the submap."""
         local = self.local

@@ -12,8 +12,6 @@ IN_SIGHTING = "in a sighting factor"
 INITIAL_POSE = "start pose"
 """The disposition of an incarnation's measurement 0."""
 
-NO_SCAN = m.AnyOdometry | m.InitialPose
-
 OnDisposition = Callable[[int, str], None]
 """Receives the counter of a measurement and its disposition; a later call for the same one replaces
 it.
@@ -39,16 +37,15 @@ class Ledger:
         self._detections: dict[int, int] = {}
         self._sighted: set[int] = set()
 
-    def count(
-        self, measurement: m.Measurement, rejected: Rejection | None, used: str | None = None
-    ) -> None:
+    def count(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
         """Count one more measurement: rejected for this reason, or used."""
-        number = measurement.number
-        disposition = used or self.used
+        number, disposition = measurement.number, self.used
         if rejected is not None:
             disposition = rejected.disposition
-        elif isinstance(measurement, NO_SCAN):  # first: most measurements are odometry
+        elif isinstance(measurement, m.AnyOdometry):  # first: most measurements are
             pass
+        elif isinstance(measurement, m.InitialPose):
+            disposition = INITIAL_POSE
         elif isinstance(measurement, m.Sightings | m.Fix):
             self._sighted.add(number)
             disposition = IN_SIGHTING

@@ -26,7 +26,7 @@ from teamslam.team.estimation.scans import Scan, sensible
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import UNMEASURED, Rejection
 from teamslam.team.robot.landmark_classes import classify_landmarks
-from teamslam.team.robot.ledger import INITIAL_POSE, Ledger, OnDisposition
+from teamslam.team.robot.ledger import Ledger, OnDisposition
 from teamslam.team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.statements import MessageWriter
@@ -169,8 +169,7 @@ class Mapper:
 
     def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
         """Account for the measurement in progress and add it to the open window."""
-        used = INITIAL_POSE if isinstance(measurement, m.InitialPose) else None
-        self.ledger.count(measurement, rejected, used)
+        self.ledger.count(measurement, rejected)
         self._window.append(measurement)
         self._taking = None
 

@@ -95,7 +95,8 @@ class Inbox:
         while True:
             measurement = self.ahead.pop(self.next_measurement, None)
             if measurement is not None:
-                self._of_source.discard(self.next_measurement)
+                if self._of_source:
+                    self._of_source.discard(self.next_measurement)
                 self.next_measurement += 1
                 if type(measurement) is InitialPose:
                     self._began_ns = measurement.stamp_ns

@@ -26,7 +26,6 @@ from teamslam.team import core
 from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.least_squares import (
     HALVINGS,
@@ -126,8 +125,7 @@ class Island:
         """Widening of each submap's gates at its age; PLAIN for a saved map (see `saved_maps`)."""
         scale = self._scale_at(self.age)
         if self.settings.robust:
-            saved = [is_map(each.contribution.stream) for each in self.graph.submaps]
-            scale[np.flatnonzero(saved)] = PLAIN
+            scale[self.graph.saved_maps] = PLAIN
         return scale
 
     @cached_property
@@ -241,7 +239,8 @@ def age_factors(island: Island, iterations: int | None) -> Island:
 
 def final_cost(island: Island) -> float:
     """Evaluate the cost with final robust scales, for comparison of islands."""
-    return age_factors(island, FULL_AGE).cost
+    is_final = (island.age >= FULL_AGE).all() and (island.sighting_age >= FULL_AGE).all()
+    return island.cost if is_final else age_factors(island, FULL_AGE).cost
 
 
 def is_solvable(island: Island) -> bool:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -208,7 +209,7 @@ class Fold:
         """Number of submaps in the fold, condensed ones included."""
         return sum(island.graph.size for island in self.islands.values())
 
-    @property
+    @cached_property
     def main_key(self) -> Stream | None:
         """Key of the island with a known initial pose and a robot, else of one with a saved map and
         a robot, else of the one with the smallest stream, of a robot if there is any.

@@ -89,11 +89,17 @@ class Joined(NamedTuple):
     @property
     def factor(self) -> core.SubmapFactor:
         """The factor over the submap's nodes. Raises NotACovarianceError that names the submap."""
-        factor = self.contribution.factor
-        if self.biases == self.contribution.local.biases:
-            return factor
-        powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
-        return factor.with_errors(self.sensitivity, np.array(powers, np.int64), self.curvature)
+        of = self.contribution
+        if self.biases == of.local.biases:
+            return of.factor
+        made = of.with_errors.get(self.biases)
+        if made is None or made[0] is not self.sensitivity:
+            powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
+            factor = of.factor.with_errors(
+                self.sensitivity, np.array(powers, np.int64), self.curvature
+            )
+            made = of.with_errors[self.biases] = self.sensitivity, factor
+        return made[1]
 
     @property
     def curvature(self) -> Float[np.ndarray, "B _"]:
@@ -193,6 +199,11 @@ class Graph:
     def pattern(self) -> core.Pattern:
         """Blocks of the normal equations (a variable per node) and their places in the factor."""
         return self.factors.pattern
+
+    @cached_property
+    def saved_maps(self) -> Indices:
+        """Indices of the submaps that are saved maps."""
+        return np.flatnonzero([is_map(each.contribution.stream) for each in self.submaps])
 
     @cached_property
     def boundary(self) -> Indices:
