@@ -141,7 +141,7 @@ $(VENV)/.runtime: pyproject.toml constraints.txt hashes-run.txt | $(VENV)/.pytho
 	$(NEEDS_ZIG)
 	@echo "Compiling the core for this processor: about a minute on two cores, once"
 	@$(OWN) install --constraint constraints.txt --no-build-isolation --config-settings cmake.define.TEAMSLAM_LEVELS=own --editable .
-	@touch $@
+	@touch $(VENV)/.own $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
 	@echo "Installing $$(grep -c == hashes.txt) packages at pinned versions into $(VENV): a minute or two, once"
@@ -149,7 +149,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt hashes.txt | $(VENV)/.python
 	$(NEEDS_ZIG)
 	@echo "Compiling the core for all processors: two minutes on two cores, once"
 	@$(OWN) install --constraint constraints.txt --no-build-isolation --editable '.[dev]'
-	@touch $(VENV)/.runtime $@
+	@touch $(VENV)/.runtime $(VENV)/.own $(VENV)/.core $@
 
 # An install has built the core; it is built again once one of its sources is newer: for a run at
 # the level of this processor, for everything else at all levels.

@@ -200,6 +200,17 @@ def test_an_extra_is_installed_by_its_packages_wherever_we_come_from(monkeypatch
     assert extras.install_command("studies").endswith("pip install '.[studies]'")
 
 
+def test_the_settings_of_make_s_installation_are_known_to_the_build(tmp_path):
+    named = re.findall(r"--config-settings (\S+)=(\S+)", (ROOT / "Makefile").read_text())
+    assert named
+    code = "import sys; from scikit_build_core import build; "
+    code += f"build.prepare_metadata_for_build_editable(sys.argv[1], {dict(named)!r})"
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert ran.returncode == 0, ran.stderr
+    assert list(tmp_path.glob("teamslam-*.dist-info"))
+
+
 COMPOSE = ROOT / "docker-compose.yml"
 
 
