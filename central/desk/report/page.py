@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -248,7 +249,8 @@ def _image(pictures: Mapping[str, Path], name: str, *, wide: bool = True) -> str
 
 
 def _note(text: str) -> str:
-    return f'<p class="note">{escape(text)}</p>'
+    """Paragraph of small text; `backticks` enclose code."""
+    return f'<p class="note">{re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))}</p>'
 
 
 def _sheet(sheet: Sheet) -> str:

@@ -459,7 +459,7 @@ _APE = (
 APE_NOTE = (
     "RMS with evo's definitions; by itself: after the rigid motion that aligns this path, not the "
     "map; RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
-    "evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum gives the same."
+    "`evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum` gives the same."
 )
 
 
