@@ -250,7 +250,8 @@ def _image(pictures: Mapping[str, Path], name: str, *, wide: bool = True) -> str
 
 def _note(text: str) -> str:
     """Paragraph of small text; `backticks` enclose code."""
-    return f'<p class="note">{re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))}</p>'
+    shown = re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
+    return f'<p class="note">{shown}</p>'
 
 
 def _sheet(sheet: Sheet) -> str:
