@@ -34,7 +34,6 @@ from teamslam.team.estimation.map_joining.path_elimination import (
     MarkedFactors,
     eliminate_paths,
     nodes_of,
-    quadratic,
 )
 from teamslam.team.estimation.map_joining.resting import FIRST, eliminate, find_idle, put_to_rest
 from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
@@ -184,7 +183,7 @@ def _condense_island(
     if before is None:
         union, H, g, cost = eliminate_paths(island, union, factors, eliminated)
     else:
-        H, g, cost = quadratic(island, union, factors)
+        H, g, cost = island.estimate.quadratic(union, *factors)
     parts = eliminate(H, g, np.repeat(eliminated[union], sizes[union]))
     left, node_of = remove_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
     remaining = union[~eliminated[union]]

@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -269,7 +268,7 @@ def iterate_tick(island: Island) -> Island:
     for k in range(island.settings.iterations_per_tick):
         if k and bounded and damping == 0.0 and _stands_still(island):
             break
-        island, (damping, _) = _iteration(island, damping)
+        island, damping, _ = take_step(island, damping)
     return island
 
 
@@ -279,36 +278,22 @@ def _stands_still(island: Island) -> bool:
         return island.estimate.squared_length <= STILL * len(island.graph.submaps)
 
 
-class Iteration(NamedTuple):
-    """The outcome of one step: the next damping (or STUCK), and the full step's largest change."""
-
-    damping: float
-    change: float
-
-
-def _iteration(island: Island, damping: float) -> tuple[Island, Iteration]:
-    """Take one step; the island ages by one even where no step lowers the cost."""
-    after, outcome = take_step(island, _eased(damping))
-    return age_factors(island, 1) if after is island else after, outcome
-
-
-def take_step(island: Island, damping: float) -> tuple[Island, Iteration]:
-    """Take one step: return the next island and the outcome of the step.
+def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
+    """Take one step: return the island, an iteration older, the next damping, and the full step's
+    largest change.
 
     The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
-    of it; else a more damped one. Where no damping helps the island is returned unchanged, with the
-    change of the first step.
+    of it; else a more damped one. Where no damping helps the state stays, and the next damping is
+    STUCK, from which the next step begins undamped.
     """
     with island.determined():
-        state, damping, change = island.estimate.take_step(damping, HALVINGS, MOST_DAMPING)
+        state, damping, change = island.estimate.take_step(
+            0.0 if damping == STUCK else damping, HALVINGS, MOST_DAMPING
+        )
+    older = age_factors(island, 1)
     if state is None:
-        return island, Iteration(STUCK, change)
-    older = replace(age_factors(island, 1), state=state)
-    return older, Iteration(damping, change)
-
-
-def _eased(damping: float) -> float:
-    return 0.0 if damping == STUCK else damping
+        return older, STUCK, change
+    return replace(older, state=state), damping, change
 
 
 def solve_island(island: Island) -> tuple[Island, int, float]:
@@ -347,7 +332,7 @@ def _descend(island: Island) -> tuple[Island, int, float]:
     while count < settings.max_iterations:
         scales = np.concatenate([island.scale, island.sighting_scale])
         narrow = not settings.robust or bool(((scales == 1.0) | (scales == PLAIN)).all())
-        island, (damping, change) = _iteration(island, damping)
+        island, damping, change = take_step(island, damping)
         count += 1
         if narrow and (damping == STUCK or (damping == 0.0 and change < settings.step_tolerance)):
             break

@@ -15,7 +15,12 @@ from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island
-from teamslam.team.estimation.map_joining.submap_graph import CommonError, Joined, Prior
+from teamslam.team.estimation.map_joining.submap_graph import (
+    CommonError,
+    Joined,
+    Prior,
+    append_nodes,
+)
 
 
 def add_markers(island: Island) -> Island:
@@ -27,23 +32,20 @@ def add_markers(island: Island) -> Island:
         return island
     sigma = island.settings.common_bias_sigma["marker"]
     marked = [_list_numbers(each, number) for each in graph.submaps]
-    first = len(graph.fixed)
     errors = dict.fromkeys(error for each in marked for error in each)
-    nodes: dict[CommonError, int] = {error: first + k for k, error in enumerate(errors)}
+    graph, state, new = append_nodes(graph, island.state, [np.zeros(1) for _ in errors])
+    nodes: dict[CommonError, int] = dict(zip(errors, new, strict=True))
     certainty = np.array([[1.0 / core.squared(sigma)]])
-    count = len(nodes)
     graph = replace(
         graph,
         common={**graph.common, **nodes},
-        offset=np.append(graph.offset, graph.offset[-1] + 1 + np.arange(count)),
-        fixed=np.append(graph.fixed, np.zeros(count, np.bool_)),
         submaps=tuple(
             _add_rows(each, own, nodes, number)
             for each, own in zip(graph.submaps, marked, strict=True)
         ),
         priors=(*graph.priors, *(Prior(node, np.zeros(1), certainty) for node in nodes.values())),
     )
-    return replace(island, graph=graph, state=np.append(island.state, np.zeros(count)))
+    return replace(island, graph=graph, state=state)
 
 
 def warn_of_unmarked(island: Island) -> list[str]:

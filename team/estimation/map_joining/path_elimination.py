@@ -41,17 +41,6 @@ class Left(NamedTuple):
     slope: Values
 
 
-def quadratic(
-    island: Island,
-    union: Indices,
-    factors: MarkedFactors,
-) -> tuple[Matrix, Values, float]:
-    """Sum these factors and the condensed one to matrix A, half the gradient and the cost, over the
-    union of their nodes.
-    """
-    return island.estimate.quadratic(union, *factors)
-
-
 def eliminate_paths(
     island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
 ) -> tuple[Indices, Matrix, Values, float]:
@@ -77,13 +66,13 @@ def eliminate_paths(
         beside = [each for each in left if path[each.nodes].any()]
         left = [each for each in left if not path[each.nodes].any()]
         nodes = nodes_of(island, taken, (each.nodes for each in beside))
-        H, g, cost = quadratic(island, nodes, taken)
+        H, g, cost = island.estimate.quadratic(nodes, *taken)
         _add(H, g, sizes, nodes, beside)
         parts = eliminate(H, g, np.repeat(path[nodes], sizes[nodes]))
         left.append(Left(nodes[~path[nodes]], parts.information, parts.slope))
         total += cost - parts.lowered
     union = union[~eliminated[union] | (sizes[union] == 2)]
-    H, g, cost = quadratic(island, union, rest)
+    H, g, cost = island.estimate.quadratic(union, *rest)
     _add(H, g, sizes, union, left)
     return union, H, g, total + cost
 

@@ -18,7 +18,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.map_joining.condensed_factor import Resting, places
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.landmark_view import resting_of
-from teamslam.team.estimation.map_joining.submap_graph import Graph, add_landmark_nodes
+from teamslam.team.estimation.map_joining.submap_graph import Graph, append_nodes
 from teamslam.team.estimation.map_joining.upper_triangle import between, upper_of
 from teamslam.team.shapes import Bool, Float, Int64
 
@@ -142,7 +142,8 @@ def wake_landmarks(island: Island, ids: Collection[int]) -> Island:
     upper = upper_of(rest.upper, left, len(left))
     core.add_product(-share, np.ascontiguousarray(cross.T), upper, upper=True)
     points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.boundary))
-    grown, nodes = add_landmark_nodes(graph, rest.ids[wakes].tolist())
+    grown, state, nodes = append_nodes(graph, island.state, [*points.reshape(-1, 2)])
+    awake = dict(zip(rest.ids[wakes].tolist(), nodes, strict=True))
     condensed = replace(
         old,
         nodes=np.concatenate([old.nodes, nodes]),
@@ -157,6 +158,6 @@ def wake_landmarks(island: Island, ids: Collection[int]) -> Island:
     )
     return replace(
         island,
-        graph=replace(grown, condensed=condensed),
-        state=np.concatenate([island.state, points]),
+        graph=replace(grown, landmarks={**graph.landmarks, **awake}, condensed=condensed),
+        state=state,
     )

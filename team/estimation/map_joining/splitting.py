@@ -12,6 +12,7 @@ import numpy as np
 
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
+    STUCK,
     UNSOLVABLE,
     Island,
     age_factors,
@@ -20,6 +21,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     solve_island,
     take_step,
 )
+from teamslam.team.estimation.map_joining.submap_graph import append_nodes
 from teamslam.team.shapes import Float
 
 ITERATIONS = 15
@@ -43,19 +45,14 @@ def split(
     """Give some submaps, by place in the graph, a node of their own in place of `node`, the last
     one, at a value.
     """
-    graph, new = island.graph, len(island.graph.fixed)
-    grown = replace(
-        graph,
-        offset=np.append(graph.offset, graph.offset[-1] + len(value)),
-        fixed=np.append(graph.fixed, False),
-        submaps=tuple(
-            each._replace(nodes=np.where(each.nodes == node, new, each.nodes))
-            if at in submaps
-            else each
-            for at, each in enumerate(graph.submaps)
-        ),
+    grown, state, new = append_nodes(island.graph, island.state, [value])
+    split_up = tuple(
+        each._replace(nodes=np.where(each.nodes == node, new[0], each.nodes))
+        if at in submaps
+        else each
+        for at, each in enumerate(grown.submaps)
     )
-    return replace(island, graph=grown, state=np.concatenate([island.state, value]))
+    return replace(island, graph=replace(grown, submaps=split_up), state=state)
 
 
 def without(island: Island, places: Collection[int]) -> Island:
@@ -82,8 +79,8 @@ def resolved(island: Island) -> tuple[Island, float] | None:
     try:
         damping = 0.0
         for _ in range(ITERATIONS):
-            island, (damping, change) = take_step(island, damping)
-            if change < TOLERANCE or damping == np.inf:
+            island, damping, change = take_step(island, damping)
+            if change < TOLERANCE or damping == STUCK:
                 break
         return (island, final_cost(island)) if is_solvable(island) else None
     except UNSOLVABLE:

@@ -381,23 +381,18 @@ def add_submaps(
         errors += [growth.common[error] for error in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
         submaps.append(Joined.of(contribution, nodes, own, tuple(common)))
-    grown = Graph(
+    grown, state, _ = append_nodes(graph, state, growth.values, growth.fixed)
+    grown = replace(
+        grown,
         streams=growth.streams,
         landmarks=growth.landmarks,
         poses=growth.poses,
         biases=growth.biases,
-        offset=_continue_starts(graph.offset, [len(value) for value in growth.values]),
-        fixed=np.concatenate([graph.fixed, np.array(growth.fixed, dtype=np.bool_)]),
         submaps=tuple(submaps),
-        sightings=graph.sightings,
         priors=tuple(priors),
         common=growth.common,
-        condensed=graph.condensed,
-        gone=graph.gone,
-        former=graph.former,
-        memory=graph.memory,
     )
-    return grown, np.concatenate([state, *growth.values])
+    return grown, state
 
 
 def _drop_unscaled_biases(
@@ -487,17 +482,20 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
     )
 
 
-def add_landmark_nodes(graph: Graph, ids: Sequence[int]) -> tuple[Graph, Indices]:
-    """Add landmarks that no factor contains yet; return their nodes."""
-    first = len(graph.fixed)
-    nodes = range(first, first + len(ids))
+def append_nodes(
+    graph: Graph, state: Values, values: Sequence[Values], fixed: Sequence[bool] = ()
+) -> tuple[Graph, Values, range]:
+    """Append nodes at these values, free ones unless `fixed` marks them; return the graph, the
+    state and the new nodes, which no factor contains yet.
+    """
+    marks = np.array(fixed or [False] * len(values), np.bool_)
     grown = replace(
         graph,
-        landmarks={**graph.landmarks, **dict(zip(ids, nodes, strict=True))},
-        offset=_continue_starts(graph.offset, [2] * len(ids)),
-        fixed=np.concatenate([graph.fixed, np.zeros(len(ids), np.bool_)]),
+        offset=np.concatenate([graph.offset[:-1], graph.offset[-1] + _starts([*map(len, values)])]),
+        fixed=np.concatenate([graph.fixed, marks]),
     )
-    return grown, np.arange(first, first + len(ids))
+    nodes = range(len(graph.fixed), len(grown.fixed))
+    return grown, np.concatenate([state, *values]), nodes
 
 
 def add_former_place(
@@ -513,21 +511,14 @@ def add_former_place(
         landmarks = {each: at for each, at in graph.landmarks.items() if each != id_}
         former = {**graph.former, (stream, id_): node}
         return replace(graph, landmarks=landmarks, former=former), state
-    new = len(graph.fixed)
+    grown, state, (new,) = append_nodes(graph, state, [value])
     submaps = tuple(
         each._replace(nodes=np.where(each.nodes == node, new, each.nodes))
         if each.contribution.stream == stream
         else each
         for each in graph.submaps
     )
-    grown = replace(
-        graph,
-        submaps=submaps,
-        former={**graph.former, (stream, id_): new},
-        offset=_continue_starts(graph.offset, [2]),
-        fixed=np.concatenate([graph.fixed, [False]]),
-    )
-    return grown, np.concatenate([state, value])
+    return replace(grown, submaps=submaps, former={**graph.former, (stream, id_): new}), state
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
@@ -557,10 +548,6 @@ def teammate_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
     if sighting.is_fix:
         return graph.poses.get((sighting.stream, sighting.stamp_ns))
     return pose_node(graph, sighting.teammate, sighting.stamp_ns)
-
-
-def _continue_starts(starts: Indices, lengths: Sequence[int]) -> Indices:
-    return np.concatenate([starts, starts[-1] + _starts(lengths)[1:]])
 
 
 def merge_graphs(
@@ -596,23 +583,21 @@ def merge_graphs(
         len(prior.mean) == 1 and prior.node not in common  # of a bias, not of an initial pose
         for prior in other.priors
     ]
-    graph = Graph(
+    grown, joint, _ = append_nodes(main, state, values)
+    graph = replace(
+        grown,
         streams={**main.streams, **moved.streams},
         landmarks={**moved.landmarks, **main.landmarks},
         poses={**main.poses, **moved.poses},
         biases={**main.biases, **moved.biases},
-        offset=_continue_starts(main.offset, [len(value) for value in values]),
-        fixed=np.concatenate([main.fixed, np.zeros(len(values), dtype=np.bool_)]),
         submaps=(*main.submaps, *moved.submaps),
         sightings=(*main.sightings, *moved.sightings),
         priors=(*main.priors, *compress(moved.priors, kept)),
         common={**moved.common, **main.common},
-        condensed=main.condensed,
         gone={**main.gone, **other.gone},
         former={**main.former, **moved.former},
-        memory=main.memory,
     )
-    return graph, np.concatenate([state, *values])
+    return graph, joint
 
 
 def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:

@@ -26,7 +26,6 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.map_joining.memory import MOST, Memory, Observed
 from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
-from teamslam.team.estimation.map_joining.path_elimination import quadratic
 from teamslam.team.estimation.map_joining.relinearising import is_due, restore_submaps
 from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from tests.estimation.association.unnamed_worlds import (
@@ -182,7 +181,7 @@ def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monke
     monkeypatch.setattr(
         condensing,
         "eliminate_paths",
-        lambda island, union, factors, _: (union, *quadratic(island, union, factors)),
+        lambda island, union, factors, _: (union, *island.estimate.quadratic(union, *factors)),
     )
     at_once = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     assert by_runs.submaps == 21

@@ -300,7 +300,7 @@ def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(
     hessian = dense(island.graph.pattern, values)
     damped = hessian + damping * np.diag(np.diag(hessian))
     expected = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-    moved, (eased, largest) = take_step(island, damping)
+    moved, eased, largest = take_step(island, damping)
     np.testing.assert_allclose((moved.state - island.state)[free], expected, rtol=1e-6, atol=1e-10)
     np.testing.assert_array_equal(moved.state[~free], island.state[~free])
     assert largest == pytest.approx(np.abs(expected).max())
