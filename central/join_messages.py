@@ -22,8 +22,10 @@ from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.alignment import NEEDED, SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
+    Repetition,
     find_lost_streams,
     find_missed,
+    find_repetitions,
     find_weakly_placed,
 )
 from teamslam.team.estimation.map_joining.fold_association import view_island
@@ -31,7 +33,6 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.minima import RIVAL
 from teamslam.team.estimation.map_joining.refusal import describe_refusals
-from teamslam.team.estimation.map_joining.repetition import Repetition, find_repetitions
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

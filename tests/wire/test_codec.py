@@ -19,14 +19,18 @@ from teamslam.team.core import check_packed_covariance, check_pose_covariance
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.channels import OBSERVATIONS
-from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, decoded, encoded, tag_in
-from teamslam.team.wire.structure import (
+from teamslam.team.wire.codec import (
     DEEPEST,
+    LARGEST_PAYLOAD,
     MOST_VALUES,
     SMALL,
     StructureError,
+    WireError,
     check_structure,
+    decoded,
+    encoded,
     read_tag,
+    tag_in,
 )
 from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from tests import build

@@ -6,6 +6,8 @@ Linearised at the state `at` of the nodes when the submaps were condensed,
 
 where the poses that occur in no other factor are eliminated (Schur complement). This is exact but
 for the linearisation point, which stays `at`, and the robust weights, which keep their values.
+
+The covariance of landmarks at rest (`Resting`) is stored as its upper triangle.
 """
 
 from collections import Counter
@@ -19,11 +21,11 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream
-from teamslam.team.estimation.map_joining.upper_triangle import packed_of, unpacked_of
 from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "n n"]
 
 
 HISTORY = 50
@@ -234,3 +236,35 @@ def tie_nodes(
         cost=old.cost + float(2.0 * dense.product(old.slope, moved) + dense.product(moved, half)),
         departed=departed,
     )
+
+
+def upper_of(upper: Matrix, chosen: Indices, size: int) -> Float[np.ndarray, "m m"]:
+    """Return the upper triangle among these ascending numbers, at the corner of a larger matrix."""
+    result = np.zeros((size, size))
+    for a, row in enumerate(chosen.tolist()):
+        result[a, a : len(chosen)] = upper[row, chosen[a:]]
+    return result
+
+
+def packed_of(upper: Matrix) -> Float[np.ndarray, " _"]:
+    """Pack the upper triangle, row after row."""
+    return np.concatenate([np.zeros(0), *(row[a:] for a, row in enumerate(upper))])
+
+
+def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
+    """Unpack to a square matrix with zeros below the diagonal."""
+    result, at = np.zeros((size, size)), 0
+    for a in range(size):
+        result[a, a:] = packed[at : at + size - a]
+        at += size - a
+    return result
+
+
+def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
+    """Return the entries of these rows and columns of a symmetric matrix stored as upper
+    triangle.
+    """
+    entries: Float[np.ndarray, "r c"] = upper[
+        np.minimum.outer(rows, columns), np.maximum.outer(rows, columns)
+    ]
+    return entries

@@ -1,19 +1,41 @@
-"""Landmarks that a final map leaves out: placed by an uncertain heading, or missed by most submaps
-that look there; and streams that were lost.
+"""Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps that
+look there, or in a part of the map that repeats another one; and streams that were lost.
 
 `teamslam.team.estimation.association.verification.find_possible_duplicates` finds duplicates.
+
+A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time,
+elsewhere. The set contains no contradiction: from there on only odometry connects its submaps with
+the rest. The shape of the copy remains. For each boundary between two submaps of a stream beyond
+which it observes hardly any landmark of the rest, the landmarks first observed beyond it are
+aligned with all others by a rigid motion (`voting`). With n of them, N others in an area A, and
+points that match within r, the expected number of motions that match m or more by chance is
+
+    E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
+
+since each pair on a pair defines one motion. The set does not determine whether a robot was carried
+off or the building repeats itself.
 """
 
 import math
 from collections.abc import Collection
+from typing import NamedTuple
 
 import numpy as np
 
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.voting import (
+    PointSet,
+    Vote,
+    apply_motion,
+    propose_alignments,
+)
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.memory import MOST
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
+from teamslam.team.shapes import Bool, Float, Int64
 
 
 def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
@@ -73,3 +95,141 @@ def find_lost_streams(island: Island) -> dict[Stream, float]:
     }
     limit = island.settings.alignment_heading_sigma
     return {stream: sigma for stream, sigma in worst.items() if sigma > limit}
+
+
+LEAST_PAIRS = 6
+"""Least number of landmarks that repeat others."""
+LEAST_SHARE = 0.5
+"""Least share of the landmarks beyond the boundary that repeat others."""
+MOST_SHARED = 0.25
+"""Largest share of these submaps' landmarks that the rest has, too."""
+BY_CHANCE = -14.0
+"""Largest ln E: one in a million."""
+FARTHER = 4.0
+"""Least distance of the two places, in distances of matched points."""
+MOST_POINTS = 400
+"""Larger maps are not searched: voting would take seconds."""
+TRIED = 4
+"""Most boundaries of a stream that are examined, by least shared part."""
+
+
+class Repetition(NamedTuple):
+    """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
+
+    ids: all landmarks that only these submaps have. pairs: those of them that match another one.
+    begin_ns, end_ns: the end of the last submap before the boundary, and of the stream's last one.
+    place: of the stream at the boundary (x, y) [m]. displacement: the move (x, y) [m] and turn
+    [rad] of that place if the pairs were one landmark each.
+    """
+
+    stream: Stream
+    first: int
+    ids: tuple[int, ...]
+    pairs: tuple[tuple[int, int], ...]
+    begin_ns: int
+    end_ns: int
+    place: tuple[float, float]
+    displacement: tuple[float, float, float]
+
+
+def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
+    """Find the repetitions among these landmarks of an island, at most one of each stream."""
+    unnamed = sorted(id_ for id_ in ids if id_ >= UNNAMED)
+    if not 2 * LEAST_PAIRS <= len(unnamed) <= MOST_POINTS:
+        return []
+    node_of, offset = island.graph.landmarks, island.graph.offset
+    points = np.array([island.state[offset[node_of[i]] :][:2] for i in unnamed])
+    at = np.full(len(island.graph.fixed), -1, np.int64)
+    at[[node_of[i] for i in unnamed]] = np.arange(len(unnamed))
+    streams = [each.contribution.stream for each in island.graph.submaps]
+    sees = np.zeros((len(streams), len(unnamed)), np.bool_)
+    for row, submap in zip(sees, island.graph.submaps, strict=True):
+        known = at[submap.landmarks[submap.landmarks >= 0]]
+        row[known[known >= 0]] = True
+    found = []
+    for stream in sorted(island.graph.streams):
+        own = np.array([each == stream for each in streams], np.bool_)
+        one = _find_in_stream(island, stream, sees, own, points, unnamed)
+        found += [] if one is None else [one]
+    return found
+
+
+def _find_in_stream(
+    island: Island,
+    stream: Stream,
+    sees: Bool[np.ndarray, "K n"],
+    own: Bool[np.ndarray, " K"],
+    points: Float[np.ndarray, "n 2"],
+    ids: list[int],
+) -> Repetition | None:
+    rows = np.flatnonzero(own)
+    elsewhere = sees[~own].any(axis=0)
+    candidates = []
+    for k in range(1, len(rows)):
+        rest = elsewhere | sees[rows[:k]].any(axis=0)
+        beyond = sees[rows[k:]]
+        fresh = np.flatnonzero(beyond.any(axis=0) & ~rest)
+        shared = float((beyond & rest).sum()) / max(float(beyond.sum()), 1.0)
+        if len(fresh) >= LEAST_PAIRS and shared <= MOST_SHARED:
+            candidates.append((shared, k, fresh))
+    candidates.sort(key=lambda each: each[:2])
+    for _, k, fresh in candidates[:TRIED]:
+        others = np.setdiff1d(np.arange(len(ids)), fresh)
+        vote = _align_beyond_chance(points[fresh], points[others], island.settings.association.same)
+        if vote is None:
+            continue
+        submap = island.graph.submaps[rows[k]].contribution
+        start = island.graph.submaps[rows[k]].nodes[0]
+        place = island.state[island.graph.offset[start] :][:2]
+        there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
+        gone = there - place
+        if math.hypot(*gone.tolist()) < FARTHER * island.settings.association.same:
+            continue
+        before = island.graph.submaps[rows[k - 1]].contribution
+        pairs = zip(fresh[vote.first].tolist(), others[vote.second].tolist(), strict=True)
+        return Repetition(
+            stream=stream,
+            first=submap.sequence,
+            ids=tuple(ids[i] for i in fresh.tolist()),
+            pairs=tuple((ids[one], ids[two]) for one, two in pairs),
+            begin_ns=before.end_ns,
+            end_ns=island.graph.submaps[rows[-1]].contribution.end_ns,
+            place=(float(place[0]), float(place[1])),
+            displacement=(float(gone[0]), float(gone[1]), float(vote.motion[2])),
+        )
+    return None
+
+
+def _align_beyond_chance(
+    own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
+) -> Vote | None:
+    if min(len(own), len(others)) < LEAST_PAIRS:
+        return None
+    a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
+    votes = propose_alignments(
+        a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max())
+    )
+    if not votes:
+        return None
+    matched = len(votes[0].first)
+    if matched < max(LEAST_PAIRS, LEAST_SHARE * min(len(own), len(others))):
+        return None
+    return votes[0] if log_by_chance(len(own), others, matched, same) < BY_CHANCE else None
+
+
+def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius: float) -> float:
+    """Compute ln E of n points of which `matched` match others."""
+    count = len(others)
+    area = max(float(np.ptp(others, axis=0).prod()), math.pi * core.squared(radius))
+    p = min(math.pi * core.squared(radius) * count / area, 1.0 - 1e-9)
+    left, least = n - 2, matched - 2
+    terms: Int64[np.ndarray, " k"] = np.arange(least, left + 1)
+    logs = np.array([_log_choose(left, int(k)) for k in terms])
+    logs = logs + terms * core.log(p) + (left - terms) * core.log(1.0 - p)
+    most = float(logs.max())
+    tail = most + core.log(float(core.exp(logs - most).sum()))
+    return tail + core.log(float(n * (n - 1)) * count * (count - 1))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return core.log(float(math.comb(n, k)))

@@ -10,9 +10,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.map_joining.condensed_factor import Resting, make_empty_rest, places
+from teamslam.team.estimation.map_joining.condensed_factor import (
+    Resting,
+    between,
+    make_empty_rest,
+    places,
+)
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
-from teamslam.team.estimation.map_joining.upper_triangle import between
 from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]

@@ -15,11 +15,10 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.map_joining.condensed_factor import Resting, places
+from teamslam.team.estimation.map_joining.condensed_factor import Resting, between, places, upper_of
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.landmark_view import resting_of
 from teamslam.team.estimation.map_joining.submap_graph import Graph, append_nodes
-from teamslam.team.estimation.map_joining.upper_triangle import between, upper_of
 from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]

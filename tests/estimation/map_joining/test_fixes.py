@@ -7,13 +7,13 @@ from teamslam.team.config import GNSS
 from teamslam.team.estimation.contribution import STATION, Contribution, InitialPoseFactor
 from teamslam.team.estimation.inter_robot import STATION_POSE, InterRobotFactor, from_station
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.island_ties import MOST_FIXES, sound_ties, ties
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     add_start,
     fold_submaps,
     solve_fold,
 )
+from teamslam.team.estimation.map_joining.merging import MOST_FIXES, sound_ties, ties
 from teamslam.team.estimation.map_joining.submap_graph import observer_of
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap

@@ -20,12 +20,12 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.cutting import SPOILT, cut_tick, find_part
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
-from teamslam.team.estimation.map_joining.repetition import (
+from teamslam.team.estimation.map_joining.distinctness import (
     BY_CHANCE,
     find_repetitions,
     log_by_chance,
 )
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.association.unnamed_worlds import circle, drive
 
