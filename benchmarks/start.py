@@ -21,8 +21,7 @@ from statistics import mean
 from typing import Any
 
 from benchmarks.baseline import concluded
-from teamslam.sim.launch.launch import launch
-from teamslam.sim.launch.plan import Plan
+from teamslam.sim.launch.launch import Plan, launch
 from teamslam.sim.launch.processes import PROGRAM, Starter
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.team.recording.reader import open_log

@@ -7,7 +7,7 @@ import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.main import PeerCentre
 from teamslam.central.peers.peer import CENTRE
 from teamslam.central.peers.robot import PeerRobot
 from teamslam.sim.in_memory.team import ROUND_S, World

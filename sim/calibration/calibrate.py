@@ -27,7 +27,14 @@ from teamslam.sim.calibration.consistency import (
     central_figures,
     factor_by_cost,
 )
-from teamslam.sim.calibration.data import Reference, references, true_paths
+from teamslam.sim.calibration.data import (
+    LEAST_SPANS,
+    Reference,
+    moving_stretches,
+    references,
+    too_short,
+    true_paths,
+)
 from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
 from teamslam.sim.calibration.figures import (
     CalibrationError,
@@ -37,7 +44,6 @@ from teamslam.sim.calibration.figures import (
 )
 from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
 from teamslam.sim.calibration.own import marker_spread, own_constants
-from teamslam.sim.calibration.stretches import LEAST_SPANS, moving_stretches, too_short
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import MotionModel, MotionNoise

@@ -7,9 +7,16 @@ import numpy as np
 from scipy.optimize import minimize
 
 from teamslam.central.desk.evaluation.errors import on_circle
-from teamslam.sim.calibration.data import Reference, poses_at, sinc
+from teamslam.sim.calibration.data import (
+    LEAST_SPANS,
+    LEAST_WAY_M,
+    SPAN_S,
+    Reference,
+    poses_at,
+    sinc,
+    too_short,
+)
 from teamslam.sim.calibration.figures import CalibrationError, huber
-from teamslam.sim.calibration.stretches import LEAST_SPANS, LEAST_WAY_M, SPAN_S, too_short
 from teamslam.team.shapes import Float
 
 STEPS = 40

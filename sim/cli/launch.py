@@ -55,8 +55,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from teamslam.central.desk.report.run import Run
-    from teamslam.sim.launch.launch import Outcome
-    from teamslam.sim.launch.plan import Plan
+    from teamslam.sim.launch.launch import Outcome, Plan
     from teamslam.sim.world.streams import WorldStreams
 
 INTERRUPTED = 130
@@ -186,7 +185,7 @@ def launch(
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
     check_joins(resolved, saved_maps(map_))
-    from teamslam.sim.launch.plan import Plan
+    from teamslam.sim.launch.launch import Plan
 
     plan = Plan(
         scenario=resolved,
@@ -278,7 +277,7 @@ def _time_warnings(streams: "WorldStreams | None") -> list[str]:
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
     """Advice on calibrating models for a data set without any."""
-    from teamslam.sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+    from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 
     found = moving_stretches(streams.streams)
     if found >= LEAST_SPANS:

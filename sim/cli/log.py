@@ -226,8 +226,7 @@ def export(
 
 def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
     """Table exporter; exits if it is not installed."""
-    from teamslam.team.recording.csv_tables import export_csv
-    from teamslam.team.recording.parquet_tables import export_parquet
+    from teamslam.team.recording.tables import export_csv, export_parquet
 
     if form is Format.CSV:
         return export_csv

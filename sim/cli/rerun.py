@@ -192,7 +192,7 @@ def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
 
 
 def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
-    from teamslam.sim.recorded.noise import KINDS
+    from teamslam.sim.recorded.changed_run import KINDS
 
     factors: dict[str, float] = {}
     for text in asked:

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import CsvTable, cells_of, read_table
+from teamslam.sim.datasets.csv_table import CsvTable, cells_of, covariances_of, read_table
 from teamslam.sim.datasets.folder_files import name_table
 from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
 from teamslam.sim.datasets.scans import on_circle
-from teamslam.sim.datasets.some_rows import covariances_of
 from teamslam.sim.datasets.tables import File
 from teamslam.sim.world.identities import in_order
 from teamslam.sim.world.streams import NO_LABEL, Detections

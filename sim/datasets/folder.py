@@ -22,11 +22,15 @@ from pathlib import Path
 import numpy as np
 
 from teamslam.sim.datasets import folder_tables as rows
-from teamslam.sim.datasets.csv_table import CsvTable, UnknownColumnError, read_table
+from teamslam.sim.datasets.csv_table import (
+    POSE_COVARIANCE,
+    CsvTable,
+    UnknownColumnError,
+    read_table,
+)
 from teamslam.sim.datasets.detections_table import detections_of, together
 from teamslam.sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
 from teamslam.sim.datasets.folder_odometry import intervals_of
-from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
 from teamslam.sim.datasets.tables import DatasetError, File
 from teamslam.sim.world.config import FolderWorld, starts_unknown
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams

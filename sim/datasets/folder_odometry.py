@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import CsvTable, conversion
+from teamslam.sim.datasets.csv_table import (
+    POSE_COVARIANCE,
+    CsvTable,
+    conversion,
+    numbers_in,
+    pose_covariances,
+)
 from teamslam.sim.datasets.folder_tables import (
     DEGREE,
     INCREMENTS,
@@ -13,7 +19,6 @@ from teamslam.sim.datasets.folder_tables import (
     Rows,
 )
 from teamslam.sim.datasets.scans import on_circle
-from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, numbers_in, pose_covariances
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.streams import Intervals, moved
 from teamslam.team.config import Bounds

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import CsvTable, conversion
-from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
-from teamslam.sim.datasets.some_rows import (
+from teamslam.sim.datasets.csv_table import (
     POSE_COVARIANCE,
+    CsvTable,
+    conversion,
     covariances_of,
     numbers_in,
     pose_covariances,
 )
+from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.world.streams import StartPose
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 

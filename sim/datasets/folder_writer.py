@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import cells_of
+from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, cells_of
 from teamslam.sim.datasets.detections_table import rows_of, split
 from teamslam.sim.datasets.folder_tables import (
     INCREMENTS,
@@ -17,7 +17,6 @@ from teamslam.sim.datasets.folder_tables import (
     SPEEDS,
     STEERED,
 )
-from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 
 Row = Sequence[object]

@@ -15,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable, matrices, read_table
 from teamslam.sim.datasets.detections_table import labels_of, scans_of
 from teamslam.sim.datasets.folder_odometry import pace_notes
 from teamslam.sim.datasets.graph_lines import turned
-from teamslam.sim.datasets.some_rows import POSE_COVARIANCE, matrices
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import (

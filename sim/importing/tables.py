@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from teamslam.sim.datasets.csv_table import POSE_COVARIANCE
 from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSES, SPEEDS
 from teamslam.sim.datasets.folder_writer import Row, seconds, write_table
-from teamslam.sim.datasets.some_rows import POSE_COVARIANCE
 from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 
 

@@ -13,7 +13,7 @@ class Changes:
     without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
     centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
     when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
-    kind (`teamslam.sim.recorded.noise`). maps: saved maps of earlier days, by path.
+    kind (`teamslam.sim.recorded.changed_run`). maps: saved maps of earlier days, by path.
     localise: robots are localised in the map, which stays as it is.
     """
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from teamslam.central.team_config import TeamConfig
-from teamslam.sim.scenarios.checks import ScenarioError, check_fields, plain, types_of
+from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, plain, types_of
 from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,
     Fields,
@@ -22,11 +22,13 @@ from teamslam.sim.scenarios.document import (
     named_document,
     resolved,
 )
-from teamslam.sim.scenarios.worlds import WORLDS, check_world
 from teamslam.sim.world.config import (
+    FolderWorld,
+    GraphWorld,
     LiveWorld,
     Radio,
     SimulatedWorld,
+    UnlabelledWorld,
     UtiasWorld,
     World,
 )
@@ -308,3 +310,40 @@ def _check_team(ids: list[str], world: World) -> None:
                 f"world.unknown_starts names {named}, no such robot; known: {', '.join(ids)}, "
                 'and "*" for all of them'
             )
+
+
+WORLDS: dict[str, type[World]] = {
+    "simulated": SimulatedWorld,
+    "utias": UtiasWorld,
+    "folder": FolderWorld,
+    "live": LiveWorld,
+    "unlabelled": UnlabelledWorld,
+    "graph": GraphWorld,
+}
+
+
+def check_world(world: Fields) -> None:
+    """Check a world's kind and field names; raises ScenarioError."""
+    kind = world.get("kind")
+    if not isinstance(kind, str) or kind not in WORLDS:
+        raise ScenarioError(_which(kind))
+    for name in world:
+        kinds = [each for each, declared in WORLDS.items() if name in types_of(declared)]
+        if kinds and kind not in kinds:
+            belongs = " or ".join(f'"{each}"' for each in kinds)
+            raise ScenarioError(
+                f'`{name}` is no field of a world of kind "{kind}", which this file or its base '
+                f"has, but of kind = {belongs} at world; known: {', '.join(types_of(WORLDS[kind]))}"
+            )
+    check_fields(world, WORLDS[kind], "world")
+
+
+def _which(kind: object) -> str:
+    known = ", ".join(f'"{each}"' for each in WORLDS)
+    if kind is not None:
+        return f"expected one of {known}, got {kind!r} at world.kind{close(kind, WORLDS)}"
+    return (
+        'no kind of world: put base = "recorded" (or another built-in scenario: '
+        f"{', '.join(builtin_names())}) at the top of the file, or a table [world] with kind = "
+        f'one of {known}; "live" is for robots with drivers, "folder" for CSV tables'
+    )

@@ -19,9 +19,7 @@ from teamslam.sim.world.forms import (
     seen_from,
     with_errors,
 )
-from teamslam.sim.world.layouts import laid_out
 from teamslam.sim.world.odometry import measured_speeds, slip
-from teamslam.sim.world.outliers import spoilt
 from teamslam.sim.world.paths import Drive, Limits, Pose, Step, driven, followed
 from teamslam.sim.world.sensing import (
     SHORTEST_MEASUREMENT_M,
@@ -29,6 +27,7 @@ from teamslam.sim.world.sensing import (
     measurements,
     on_circle,
     persistent,
+    spoilt,
     visible,
 )
 from teamslam.sim.world.streams import (
@@ -381,3 +380,26 @@ def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
     nearest, farthest = _limits(world, sensor)
     across = hypot(world.size_m, world.size_m) if world.radius_m is None else 2.0 * world.radius_m
     return nearest, max(nearest, min(farthest, across))
+
+
+INNER = 0.1
+"""Least wall distance of a landmark, as a share of a room's side."""
+
+
+def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
+    """Draw landmark_count points of the square, rounded down to equal rooms."""
+    if world.layout == "twins":
+        return _twins(world, rng)
+    side = world.size_m / world.rooms
+    each = max(world.landmark_count // world.rooms**2, 1)
+    pattern = side * rng.uniform(INNER, 1.0 - INNER, (each, 2))
+    corners = side * np.stack(np.divmod(np.arange(world.rooms**2), world.rooms), axis=1)
+    return np.asarray((corners[:, None] + pattern[None]).reshape(-1, 2))
+
+
+def _twins(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
+    count = world.landmark_count
+    first = rng.uniform(0.0, world.size_m, ((count + 1) // 2, 2))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(first))
+    second = first + world.twin_m * np.column_stack((core.cos(angle), core.sin(angle)))
+    return np.asarray(np.concatenate((first, second))[:count])

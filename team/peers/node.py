@@ -10,16 +10,72 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from teamslam.team.peers.exchange import is_oversized, list_requested, make_answer, make_request
-from teamslam.team.peers.feed import feed_order, new_of_streams
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.proofs import Proofs
 from teamslam.team.peers.replica import SHARE, RefusedError, Replica
-from teamslam.team.peers.send_limit import GIVEN_BYTES, Given
 from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import WireError, decoded, encoded
+
+GIVEN_BYTES = 32 * 2**20
+"""Most bytes of members per second, to all nodes together."""
+
+
+class Given:
+    """Bytes sent within the current second: bounds the cost of endless requests.
+
+    Not counted by node, since the name in a request is not authenticated.
+    """
+
+    def __init__(self) -> None:
+        self._second = 0
+        self._bytes = 0
+
+    def allows(self, now_s: float) -> bool:
+        """Whether more may be sent now."""
+        if int(now_s) != self._second:
+            self._second, self._bytes = int(now_s), 0
+        return self._bytes < GIVEN_BYTES
+
+    def note(self, size: int) -> None:
+        """Count bytes sent."""
+        self._bytes += size
+
+
+def feed_order(message: m.Message) -> int:
+    """Rank of a statement in a fold's input: before the streams (negative) or after them."""
+    match message:
+        case m.Withdrawal() | m.Verdict() | m.SavedMap():
+            return -1
+        case m.GivenUp():  # a given-up robot whose stream has ended is complete
+            return 2
+        case _:
+            return 1
+
+
+def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
+    """Yield members of streams that `fed` does not count yet: initial poses, then submaps by end
+    time, each after its inter-robot measurements.
+
+    A fold in the order of time undoes nothing.
+    """
+    parcels: list[tuple[int, Stream, int]] = []
+    for stream, share in sorted(replica.streams.items()):
+        given = fed.get(stream, -1)
+        if share.start is None or given >= share.count:
+            continue
+        if given < 0:
+            yield share.start.message
+        latest_ns = 0
+        for sequence in range(max(given, 0), share.count):
+            latest_ns = max(latest_ns, share.submaps[sequence].message.stamp_ns)
+            parcels.append((latest_ns, stream, sequence))
+        fed[stream] = share.count
+    for _, stream, sequence in sorted(parcels):
+        yield from (member.message for member in replica.streams[stream].parcel(sequence))
+
 
 SUMMARY_S = 1.0
 """Shortest interval [s] between two summaries."""

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 
 import msgspec
@@ -11,7 +11,6 @@ import msgspec
 from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
 from teamslam.team.recording.recorder import Recorder, RecorderError
-from teamslam.team.recording.replayer import schedule
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
 from teamslam.team.wire.channels import (
     ALIVE,
@@ -49,6 +48,23 @@ from teamslam.team.wire.messages import (
     Tally,
 )
 from teamslam.team.wire.request_times import RequestTimes
+
+
+def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
+    """(delay [s] after the previous one, sample), in the given order, at `speed` × team time.
+
+    delay = max(0, t − newest stamp so far)/speed: late samples and the first one are published at
+    once, and delays sum to the elapsed team time. Infinite speed has no delay. Raises ValueError
+    unless speed > 0.
+    """
+    if not speed > 0.0:
+        raise ValueError(f"out of bounds: speed {speed} is not positive")
+    newest: int | None = None
+    for sample in samples:
+        ahead_ns = 0 if newest is None else max(0, sample.stamp_ns - newest)
+        newest = sample.stamp_ns if newest is None else max(newest, sample.stamp_ns)
+        yield 1e-9 * ahead_ns / speed, sample
+
 
 NODE = "recorder"
 PROGRESS_EVERY = 256

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teamslam.central.stored_set import StoredSet
+from teamslam.central.main import StoredSet
 from teamslam.team.peers.set_file import SetFileError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Sample

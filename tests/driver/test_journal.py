@@ -8,9 +8,8 @@ import msgspec
 import pytest
 
 from teamslam.team.driver import journal as j
-from teamslam.team.driver.journal import Journal, JournalError, opened
+from teamslam.team.driver.journal import Journal, JournalError, Sorter, opened
 from teamslam.team.driver.node import SourceNode
-from teamslam.team.driver.order import Sorter
 from teamslam.team.wire.codec import encoded
 from tests import build
 

@@ -19,7 +19,7 @@ import pytest
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.view.node import ViewerNode
 from teamslam.central.node import CentralNode
-from teamslam.central.peers.centre import PeerCentre
+from teamslam.central.peers.main import PeerCentre
 from teamslam.central.peers.robot import PeerRobot
 from teamslam.team.config import FrontEnd, RobotConfig
 from teamslam.team.containment import Boundary

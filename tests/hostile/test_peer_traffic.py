@@ -4,8 +4,8 @@ import msgspec
 import pytest
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.peers.centre import PeerCentre
 from teamslam.central.peers.fold import PeerFold
+from teamslam.central.peers.main import PeerCentre
 from teamslam.team.door import MOST_LIVES
 from teamslam.team.keys.roster import Issued
 from teamslam.team.peers.exchange import MOST_ASKED

@@ -12,9 +12,8 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.door import MOST_COUNT
 from teamslam.team.peers.exchange import MOST_ASKED, make_answer, make_request
 from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
-from teamslam.team.peers.node import PeerNode
+from teamslam.team.peers.node import GIVEN_BYTES, PeerNode
 from teamslam.team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
-from teamslam.team.peers.send_limit import GIVEN_BYTES
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample

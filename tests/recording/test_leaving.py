@@ -7,10 +7,9 @@ from contextlib import contextmanager
 
 from teamslam.team import shell
 from teamslam.team.recording.check import holes
-from teamslam.team.recording.inventory import Inventory
+from teamslam.team.recording.inventory import Inventory, Received
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.sample_counts import Received
 from teamslam.team.recording.shell import RecordLoop
 from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as c

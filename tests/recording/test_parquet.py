@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 from teamslam.sim.cli import log as cli_log
 from teamslam.sim.cli.main import app
-from teamslam.team.recording import parquet_tables
-from teamslam.team.recording.parquet_tables import export_parquet
-from teamslam.team.recording.tables import numbers_of, table_of
+from teamslam.team.recording import tables
+from teamslam.team.recording.tables import export_parquet, numbers_of, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
@@ -48,7 +47,7 @@ def test_every_field_of_every_message_reads_back(tmp_path):
 
 
 def test_a_long_table_is_written_in_groups(tmp_path, monkeypatch):
-    monkeypatch.setattr(parquet_tables, "GROUP_ROWS", 10)
+    monkeypatch.setattr(tables, "GROUP_ROWS", 10)
     samples = [sampled(c.ODOMETRY, "alpha", odometry(k), k) for k in range(35)]
     log = recorded(tmp_path / "log.mcap", samples)
     assert export_parquet(log, tmp_path / "out", [c.ODOMETRY]).rows == {
@@ -57,7 +56,7 @@ def test_a_long_table_is_written_in_groups(tmp_path, monkeypatch):
     file = pq.ParquetFile(tmp_path / "out" / "odometry.parquet")
     assert file.num_row_groups == 4
     assert file.read().column("number").to_pylist() == list(range(35))
-    monkeypatch.setattr(parquet_tables, "GROUP_BYTES", 1)
+    monkeypatch.setattr(tables, "GROUP_BYTES", 1)
     export_parquet(log, tmp_path / "fine")
     assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35
 

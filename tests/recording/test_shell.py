@@ -16,8 +16,7 @@ from teamslam.team.recording import recorder as recorder_module
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.replayer import schedule
-from teamslam.team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay
+from teamslam.team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay, schedule
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened

@@ -15,7 +15,6 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.counters import Counters
-from teamslam.team.recording.csv_tables import export_csv
 from teamslam.team.recording.cut import cut
 from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.merge import MERGED, merge
@@ -23,7 +22,7 @@ from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.schemas import schema_of
 from teamslam.team.recording.summary import summarise_log
-from teamslam.team.recording.tables import table_of
+from teamslam.team.recording.tables import export_csv, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

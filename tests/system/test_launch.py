@@ -11,7 +11,7 @@ import msgspec
 import pytest
 import pytest_asyncio
 
-from teamslam.central.stored_set import StoredSet
+from teamslam.central.main import StoredSet
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.roster import nodes_of
 from teamslam.team.recording.reader import open_log

@@ -1,5 +1,5 @@
-"""Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps that
-look there, or in a part of the map that repeats another one; and streams that were lost.
+"""Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps
+that look there, or in a part of the map that repeats another one; and streams that were lost.
 
 `teamslam.team.estimation.association.verification.find_possible_duplicates` finds duplicates.
 

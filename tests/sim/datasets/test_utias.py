@@ -15,8 +15,7 @@ from teamslam.sim.calibration.source import measurements_of, own_scenario
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets import errata
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.utias import utias
-from teamslam.sim.datasets.utias_rows import start_pose
+from teamslam.sim.datasets.utias import start_pose, utias
 from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode

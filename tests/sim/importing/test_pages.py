@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from teamslam.sim.calibration.stretches import LEAST_SPANS, SPAN_S, moving_stretches
+from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 from teamslam.sim.cli import launch
 from teamslam.sim.cli.main import app
 from teamslam.sim.importing.columns import load_map

@@ -17,9 +17,8 @@ from teamslam.central.desk.verification.differences import ARRAYS
 from teamslam.central.desk.verification.recorded import RerunError
 from teamslam.central.desk.verification.verification import Verification, verify
 from teamslam.sim.cli.rerun import app
-from teamslam.sim.recorded.changed_run import changed_run
+from teamslam.sim.recorded.changed_run import changed_run, with_noise
 from teamslam.sim.recorded.changes import Changes
-from teamslam.sim.recorded.noise import with_noise
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.models import increment_of
