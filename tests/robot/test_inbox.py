@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.team.stream.inbox import Inbox
+from teamslam.team.robot.stream import Inbox
 from teamslam.team.wire import messages as m
 from tests import build
 

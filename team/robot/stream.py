@@ -1,0 +1,380 @@
+"""A robot's sensor stream: the order of its measurements, their plausibility, and its end."""
+
+import math
+
+import numpy as np
+
+from teamslam.team.config import Bounds
+from teamslam.team.door import MOST_COUNT, MOST_LIVES, absurd, another_time
+from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.plausibility import is_motion_spread as _spread
+from teamslam.team.rejection import Rejection
+from teamslam.team.shapes import Bool, Float
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.message_order import later_end, later_head
+
+NEAR_LIVES = 16
+"""Largest accepted step of the incarnation, which grows one by one, and seldom."""
+
+
+class Inbox:
+    """Hold measurements until their turn: Zenoh guarantees no order across keys.
+
+    Duplicates and measurements of earlier incarnations are dropped. A later incarnation begins when
+    its measurement 0 arrives.
+
+    ahead: measurements of the incarnation that wait for their turn, by number. later: those of
+    later incarnations.
+    """
+
+    def __init__(self) -> None:
+        self.incarnation = 0
+        self.next_measurement = 0
+        self.ahead: dict[int, m.Measurement] = {}
+        self.later: dict[int, dict[int, m.Measurement]] = {}
+        self._received = 0
+        self._began_ns: int | None = None
+        self._of_source: set[int] = set()
+
+    def confirm(self, measurement: m.Measurement) -> None:
+        """Confirm a measurement by the source's answer, whatever its stamp."""
+        if measurement.incarnation == self.incarnation:
+            self._of_source.add(measurement.number)
+
+    def resume(self, incarnation: int, next_measurement: int) -> None:
+        """Skip measurements of `incarnation` consumed by an earlier process."""
+        self.incarnation = incarnation
+        self.next_measurement = next_measurement
+        waiting = self.later.pop(incarnation, {}) | self.ahead
+        self.ahead = {
+            n: r
+            for n, r in waiting.items()
+            if r.incarnation == incarnation and n >= next_measurement
+        }
+        self._forget(incarnation)
+
+    def put(self, measurement: m.Measurement) -> None:
+        """Add a measurement, in any order."""
+        if measurement.incarnation > self.incarnation:
+            self.later.setdefault(measurement.incarnation, {})[measurement.number] = measurement
+        elif (
+            measurement.incarnation == self.incarnation
+            and measurement.number >= self.next_measurement
+        ):
+            self.ahead[measurement.number] = measurement
+
+    def refusal(self, measurement: m.Measurement) -> str | None:
+        """Why a measurement cannot belong to this stream; None if it can.
+
+        Counters are no absurd ones. Incarnations follow one another and begin with their only
+        initial pose, the earliest stamp.
+        """
+        number, incarnation = measurement.number, measurement.incarnation
+        if incarnation > MOST_LIVES or number > MOST_COUNT:
+            return absurd(measurement)
+        if (type(measurement) is m.InitialPose) != (number == 0):
+            what = type(measurement).__name__
+            return f"{what} as measurement {number}; the initial pose is measurement 0"
+        if incarnation != self.incarnation:
+            if self.next_measurement and incarnation > self.incarnation + NEAR_LIVES:
+                return f"of incarnation {incarnation}, while {self.incarnation} is in progress"
+            return None
+        if self._began_ns is None or number in self._of_source:
+            return None
+        return another_time(measurement.stamp_ns, self._began_ns)
+
+    def contradicts(self, end: m.End, robot: str) -> str | None:
+        """Why an announced end cannot be the end of the robot's stream."""
+        ends = {
+            stream.incarnation: stream.measurements
+            for stream in end.streams
+            if stream.robot == robot
+        }
+        if not ends and self.next_measurement:
+            return f"an end that omits {robot}"
+        last = ends.get(self.incarnation)
+        if last is not None and last < self.next_measurement:
+            return (
+                f"ends with measurement {last} of {robot}, which has consumed "
+                f"{self.next_measurement}"
+            )
+        return None
+
+    def take_next(self) -> m.Measurement | None:
+        """Remove and return the next measurement, if its turn has come."""
+        while True:
+            measurement = self.ahead.pop(self.next_measurement, None)
+            if measurement is not None:
+                if self._of_source:
+                    self._of_source.discard(self.next_measurement)
+                self.next_measurement += 1
+                if type(measurement) is m.InitialPose:
+                    self._began_ns = measurement.stamp_ns
+                return measurement
+            beginnings = [e for e, r in self.later.items() if 0 in r] if self.later else None
+            if not beginnings:
+                return None
+            following = min(beginnings)
+            self.incarnation, self.next_measurement = following, 0
+            self.ahead = self.later.pop(following)
+            self._forget(following)
+
+    def _forget(self, incarnation: int) -> None:
+        """Drop measurements whose turn cannot come after this incarnation."""
+        self._received = 0
+        self._of_source.clear()
+        self.later = {e: measurements for e, measurements in self.later.items() if e > incarnation}
+
+    @property
+    def received(self) -> int:
+        """Gap-free count of this incarnation's measurements, consumed or not."""
+        self._received = max(self._received, self.next_measurement)
+        while self._received in self.ahead:
+            self._received += 1
+        return self._received
+
+    @property
+    def gap(self) -> tuple[int, int, int] | None:
+        """Incarnation, first and last measurement of the gap before the earliest waiting one.
+
+        With only a later incarnation, the gap is at its beginning.
+        """
+        if self.ahead:
+            first = min(self.ahead)
+            return (
+                None
+                if first <= self.next_measurement
+                else (self.incarnation, self.next_measurement, first - 1)
+            )
+        if not self.later:
+            return None
+        following = min(self.later)
+        first = min(self.later[following])
+        return (following, 0, first - 1) if first else None
+
+    def complete(self, end: m.StreamEnd) -> bool:
+        """Whether every measurement of the stream has been consumed."""
+        return end.measurements == 0 or (
+            self.incarnation == end.incarnation and self.next_measurement >= end.measurements
+        )
+
+    def missing(self, end: m.StreamEnd | None) -> tuple[int, int, int] | None:
+        """Incarnation, first and last measurement to request from the source: a gap, or everything
+        up to the end.
+
+        The source has nothing after the end, or of incarnations other than the present and the
+        last.
+        """
+        gap = self.gap
+        if end is None:
+            return gap
+        of_stream = gap is not None and gap[0] in (self.incarnation, end.incarnation)
+        if gap is not None and of_stream and gap[:2] < (end.incarnation, end.measurements):
+            return gap
+        if self.complete(end) or end.incarnation < self.incarnation:
+            return None
+        first = self._here(end.incarnation)
+        return (end.incarnation, first, end.measurements - 1) if first < end.measurements else None
+
+    def _here(self, incarnation: int) -> int:
+        if incarnation == self.incarnation:
+            return self.received
+        later, first = self.later.get(incarnation, {}), 0
+        while first in later:
+            first += 1
+        return first
+
+    @property
+    def waiting(self) -> int:
+        """Number of measurements that wait for their turn."""
+        return len(self.ahead) + sum(len(r) for r in self.later.values())
+
+
+class StreamJudge:
+    """Checks one incarnation of a sensor stream against the time of its last odometry.
+
+    A stamp `jump_s` ahead of the odometry is refused, even of odometry, until the next interval
+    confirms that the clock has jumped.
+    """
+
+    def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
+        self._bounds = bounds
+        self._jump_ns = round(bounds.jump_s * 1e9)
+        self._longest_ns = bounds.interval_s * 1e9
+        self._now_ns = now_ns
+        self._jumped_ns: int | None = None
+
+    def odometry(self, interval: OdometryInterval) -> Rejection | None:
+        """Why an interval is refused: for `Rejection.SPEED` only its motion, otherwise all of
+        it.
+        """
+        stamp_ns, duration_ns, moved = interval.end_ns, interval.duration_ns, interval.moved
+        if duration_ns == 0:
+            return Rejection.NO_TIME
+        if self._now_ns is not None:
+            ahead_ns = stamp_ns - self._now_ns
+            if ahead_ns <= 0:
+                return Rejection.OLDER
+            if ahead_ns > self._jump_ns:
+                near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
+                if not 0 < stamp_ns - near_ns <= self._jump_ns:
+                    self._jumped_ns = stamp_ns
+                    return Rejection.TIME
+        self._now_ns, self._jumped_ns = stamp_ns, None
+        if math.isnan(interval.forward):
+            return Rejection.STEERING
+        bounds = self._bounds
+        sensible = (
+            duration_ns <= self._longest_ns
+            and abs(interval.speed) <= bounds.speed_m_s
+            and abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
+            and (moved is None or moved.covariance is None or _spread(moved.covariance, bounds))
+        )
+        return None if sensible else Rejection.SPEED
+
+    def admit(self, interval: OdometryInterval) -> bool:
+        """Note an interval of measured speeds that is within all bounds; False, and nothing noted,
+        for any other.
+        """
+        bounds, stamp_ns, duration_ns = self._bounds, interval.end_ns, interval.duration_ns
+        if (
+            self._now_ns is None
+            or not 0 < stamp_ns - self._now_ns <= self._jump_ns
+            or not 0 < duration_ns <= self._longest_ns
+            or not abs(interval.forward) <= bounds.speed_m_s
+            or not abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
+        ):
+            return False
+        self._now_ns, self._jumped_ns = stamp_ns, None
+        return True
+
+    def time(self, stamp_ns: int) -> Rejection | None:
+        """Why a measurement at this time is refused."""
+        is_ahead = self._now_ns is not None and stamp_ns - self._now_ns > self._jump_ns
+        return Rejection.TIME if is_ahead else None
+
+    def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Mask of the ranges within the bounds."""
+        within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
+        return within
+
+
+class EndOfStream:
+    """The end of one robot's stream. A world ends it by `End`, a driver by its `StreamHead`."""
+
+    def __init__(self, robot: str, inbox: Inbox) -> None:
+        self._robot = robot
+        self._inbox = inbox
+        self._last: m.StreamEnd | None = None
+        self._world_end: m.End | None = None
+        self._head: m.StreamHead | None = None
+        self.driver_is_there: bool | None = None
+        self.is_ordered = False
+        self.at_source: tuple[int, int] | None = None
+        """Incarnation and measurements at which a world ends the stream, by its own answer."""
+
+    def is_reached(self) -> bool:
+        """Whether every measurement up to the last one has been consumed.
+
+        A live team that is to end ends the stream where it is, if its driver is not present.
+        """
+        if self._last is None:
+            if self.driver_is_there or not self.is_ordered:
+                return False
+            self._last = self._at(self._inbox.received)
+        return self._inbox.complete(self._last)
+
+    def last_of(self, incarnation: int) -> int | None:
+        """The measurements of an incarnation that has ended; None while it has not."""
+        last = self._last
+        return last.measurements if last is not None and last.incarnation == incarnation else None
+
+    @property
+    def waits_for_driver(self) -> bool:
+        """Whether measurements must come from a driver that is not present."""
+        driven = self._head is not None and self.at_source is None
+        return driven and self.driver_is_there is False
+
+    def missing(self) -> tuple[int, int, int] | None:
+        """Incarnation, first and last measurement to ask the source for."""
+        return None if self.waits_for_driver else self._inbox.missing(self._known())
+
+    def _known(self) -> m.StreamEnd | None:
+        """The stream's last announced counter, whether it has ended or not."""
+        head = self._head
+        if self._last is not None or head is None:
+            return self._last
+        return m.StreamEnd(
+            robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
+        )
+
+    def announced_by(self, end: m.End) -> tuple[int, int]:
+        """Incarnation and measurements at which an announced end ends this robot's stream.
+
+        One that does not name the robot says that its stream has none.
+        """
+        ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self._robot]
+        return ends[0] if ends else (self._inbox.incarnation, 0)
+
+    def refusal(self, message: m.End | m.StreamHead) -> str | None:
+        """Why an announced end can not be true of the stream, in words."""
+        if isinstance(message, m.End):
+            of_source = self.at_source in _ends_of(message, self._robot)
+            return None if of_source else self._inbox.contradicts(message, self._robot)
+        if message.robot != self._robot:
+            return f"how far {message.robot} is"
+        ended = message.state == "ended"
+        return self._inbox.contradicts(_end_at(message), self._robot) if ended else None
+
+    def receive(self, message: m.Liveliness | m.End | m.TeamEnd) -> None:
+        """Take the driver's presence, a world's end or an order to end."""
+        match message:
+            case m.Liveliness():
+                if message.node == ch.source_node(self._robot):
+                    self.driver_is_there = message.alive
+            case m.End():
+                self.take(message)
+            case m.TeamEnd():
+                self.is_ordered = True
+
+    def take(self, end: m.End) -> None:
+        """Take a world's end; one that does not name this robot ends its stream where it is."""
+        self._world_end = end = later_end(end, self._world_end)
+        mine = [stream for stream in end.streams if stream.robot == self._robot]
+        if self.at_source is not None:  # no other word counts any more
+            incarnation, count = self.at_source
+            self._last = m.StreamEnd(robot=self._robot, incarnation=incarnation, measurements=count)
+            return
+        self._last = mine[0] if mine else self._at(0)
+
+    def take_head(self, head: m.StreamHead) -> m.StreamHead:
+        """Take the newest head of the driver.
+
+        The stream ends when the head says so, unless a later incarnation begins after that.
+        """
+        self._head = head = later_head(head, self._head)
+        if self.at_source is not None:
+            return head
+        if head.state == "ended":
+            self.take(_end_at(head))
+        elif self._last is not None and head.incarnation > self._last.incarnation:
+            self._last = None
+        return head
+
+    def _at(self, measurements: int) -> m.StreamEnd:
+        return m.StreamEnd(
+            robot=self._robot, incarnation=self._inbox.incarnation, measurements=measurements
+        )
+
+
+def _ends_of(end: m.End, robot: str) -> set[tuple[int, int]]:
+    return {(s.incarnation, s.measurements) for s in end.streams if s.robot == robot}
+
+
+def _end_at(head: m.StreamHead) -> m.End:
+    """The end of one robot's stream as a world would announce it."""
+    last = m.StreamEnd(
+        robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
+    )
+    return m.End(stamp_ns=head.stamp_ns, streams=(last,))
