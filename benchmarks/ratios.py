@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.baseline import concluded
+from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
-from teamslam.team.estimation.hybrid_slam.innovation import innovation
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.models import Increment, increment_of
 from teamslam.team.estimation.odometry import OdometryInterval

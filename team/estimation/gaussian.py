@@ -59,11 +59,6 @@ def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
 FAULTS = ("", "not finite", "not positive definite", "not symmetric")
 
 
-def whitened(L: Matrix, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """L⁻¹ e of a lower triangular L."""
-    return dense.forward(L, error)
-
-
 def deviation(variance: float) -> float:
     """The standard deviation of a variance; 0 of one that rounding has made negative.
 
@@ -78,36 +73,6 @@ def information(covariance: Matrix, what: str) -> Matrix:
     if not len(covariance):
         return np.zeros((0, 0))
     return dense.inverse_of_factored(cholesky_factor(covariance, what))
-
-
-def carried_along(
-    mean: Vector,
-    covariance: Matrix,
-    shared: Int64[np.ndarray, " k"],
-    new_mean: Float[np.ndarray, " m"],
-    new_covariance: Float[np.ndarray, "m m"],
-    in_new: Int64[np.ndarray, " k"],
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-    """The joint Gaussian of (own others o, everything new) after the shared part s was replaced.
-
-    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new Gaussian
-    N(m, C), which replaces their marginal. The conditional of o given s stays (Jeffrey's rule):
-    with the regression K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s),
-    P_oo − K P_so + K C_ss Kᵀ, and K C_s· with everything new. Nothing shared: both stay as they
-    are, independent.
-    """
-    others = np.setdiff1d(np.arange(len(mean)), shared)
-    own = information(covariance[np.ix_(shared, shared)], "the part to be replaced")
-    gain = dense.product(covariance[np.ix_(others, shared)], own)
-    cross = dense.product(gain, new_covariance[in_new])
-    spread = covariance[np.ix_(others, others)] - dense.product(
-        gain, covariance[np.ix_(shared, others)]
-    )
-    joint = np.block(
-        [[spread + dense.product(cross[:, in_new], gain.T), cross], [cross.T, new_covariance]]
-    )
-    moved = mean[others] + dense.product(gain, new_mean[in_new] - mean[shared])
-    return np.concatenate([moved, new_mean]), 0.5 * (joint + joint.T)
 
 
 def upper_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:

@@ -27,7 +27,6 @@ __all__ = [
     "noise",
     "predicted",
     "scanned",
-    "variances",
 ]
 
 
@@ -99,15 +98,6 @@ def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
     """Compute (σ_range² [m²], σ_bearing² [rad²]) at a range: σ_r² = range_sigma² + (per_m r)²."""
     slope = sensor.range_sigma_per_m * predicted_range
     return core.squared(sensor.range_sigma) + slope * slope, core.squared(sensor.bearing_sigma)
-
-
-def variances(sensor: Sensor) -> tuple[float, float, float]:
-    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), the kernels' form of a sensor."""
-    return (
-        core.squared(sensor.range_sigma),
-        core.squared(sensor.range_sigma_per_m),
-        core.squared(sensor.bearing_sigma),
-    )
 
 
 @lru_cache(maxsize=256)

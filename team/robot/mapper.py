@@ -17,9 +17,9 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.door import another_time
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.scans import Scan, sensible

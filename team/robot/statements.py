@@ -6,8 +6,8 @@ from typing import Literal
 from teamslam.team import translate
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.submap import Became
 from teamslam.team.robot.own_map import Cloud

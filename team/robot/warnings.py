@@ -4,7 +4,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Estimator
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.submap import Slipped
 
 UNEXPECTED = 3.0

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from teamslam.sim.studies.estimators.ekf_step import step
+from teamslam.sim.studies.estimators.innovation import joint_innovation, slots_of
+from teamslam.sim.studies.estimators.robot_step import variances
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation, joint_innovation, slots_of
-from teamslam.team.estimation.models import Increment, variances
+from teamslam.team.estimation.hybrid_slam.window import Innovation
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, UInt32

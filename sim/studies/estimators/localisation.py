@@ -10,16 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
+from teamslam.sim.studies.estimators.robot_step import variances
 from teamslam.sim.studies.estimators.sight import see
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.hybrid_slam import innovation as innovations
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
-from teamslam.team.estimation.models import Increment, variances
+from teamslam.team.estimation.hybrid_slam.window import Innovation
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float, UInt32
 

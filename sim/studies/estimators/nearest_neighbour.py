@@ -16,7 +16,7 @@ from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.gating import compute_mahalanobis, match_best_first
 from teamslam.team.estimation.association.scans import UNASSIGNED
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float, Int64, UInt32

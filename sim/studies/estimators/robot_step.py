@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import Matrix
@@ -53,3 +54,12 @@ def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
     G = tangent(pose[2])
     own = dense.product(dense.product(G.T, covariance), G)
     return Increment(np.zeros(3), 0.5 * (own + own.T))
+
+
+def variances(sensor: Sensor) -> tuple[float, float, float]:
+    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), the kernels' form of a sensor."""
+    return (
+        core.squared(sensor.range_sigma),
+        core.squared(sensor.range_sigma_per_m),
+        core.squared(sensor.bearing_sigma),
+    )

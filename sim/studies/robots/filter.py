@@ -9,7 +9,7 @@ from teamslam.sim.studies.robots.estimator import KnownMap
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.robot.own_map import InitialPose
 

@@ -16,6 +16,7 @@ from teamslam.sim.studies.estimators import (
     plain_fastslam,
 )
 from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
+from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
 from teamslam.sim.studies.estimators.robot_step import uncertain_start
@@ -33,7 +34,7 @@ from teamslam.team import translate
 from teamslam.team.config import Estimator, RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.robot.own_map import InitialPose
 
 

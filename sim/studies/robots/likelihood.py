@@ -11,7 +11,7 @@ from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 
 
 def with_association(plain: Filter) -> Filter:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.feedback import absorb_fused_map
 from teamslam.sim.studies.robots.estimator import (
     NOTHING_KNOWN,
     AbsorbsMaps,
@@ -20,9 +21,8 @@ from teamslam.sim.studies.robots.exchange import MapExchange
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from teamslam.team.estimation.hybrid_slam.innovation import Innovation
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
-from teamslam.team.estimation.map_joining.whole_map import absorb_fused_map
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import NEEDS_MAP

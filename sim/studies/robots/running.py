@@ -18,9 +18,9 @@ from teamslam.team.estimation.gaussian import (
     NotACovarianceError,
     PoseGaussian,
 )
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.odometry import OdometryInterval

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.feedback import carried_along
 from teamslam.sim.studies.estimators.svd_joining import columns_of
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -17,7 +18,6 @@ from teamslam.team.estimation.gaussian import (
     NO_LANDMARKS,
     LandmarkGaussian,
     NotACovarianceError,
-    carried_along,
     cholesky_factor,
     information,
 )

@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
-from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, Window
 from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 
 

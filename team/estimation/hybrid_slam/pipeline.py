@@ -17,11 +17,10 @@ from dataclasses import replace
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
-from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, Window
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan

@@ -7,6 +7,7 @@ and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
 import math
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,7 +17,6 @@ from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
@@ -24,6 +24,33 @@ from teamslam.team.estimation.submap import NO_NODES, LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
 STILL = np.zeros(4)
+
+
+class Innovation(NamedTuple):
+    """The innovations of measurements: Σ νᵀ S⁻¹ ν (NIS), χ² of `dof` degrees of freedom, two for
+    each measurement that was predicted.
+
+    Predictions are compared with later measurements, so this consistency check needs no ground
+    truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
+    Innovations of different keyframes are independent where the models are right, so both add up.
+    """
+
+    squared: float
+    dof: int
+
+    def plus(self, other: "Innovation") -> "Innovation":
+        """The sum of both."""
+        return Innovation(self.squared + other.squared, self.dof + other.dof)
+
+    @property
+    def per_dof(self) -> float | None:
+        """About 1 where the models are right, larger where the noise is larger; None without
+        measurements.
+        """
+        return self.squared / self.dof if self.dof else None
+
+
+NOTHING = Innovation(0.0, 0)
 
 
 class Window(msgspec.Struct, gc=False):

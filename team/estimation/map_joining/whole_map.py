@@ -11,10 +11,9 @@ import math
 import numpy as np
 
 from teamslam.team.core import WholeMap
-from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian, carried_along
-from teamslam.team.estimation.se2 import wrapped
+from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.shapes import Float, Int64, UInt32
+from teamslam.team.shapes import Float, Int64
 
 INDEFINITE, SINGULAR = 1, 2
 """Faults of the core: the covariance of the innovation of all known landmarks is not positive
@@ -73,52 +72,10 @@ def remove_landmark(local: LocalMap, place: int) -> LocalMap:
     return LocalMap(ids, local.mean[rows], covariance, local.node_stamps)
 
 
-def absorb_fused_map(
-    whole: WholeMap,
-    ids: UInt32[np.ndarray, " K"],
-    means: Float[np.ndarray, "K 2"],
-    covariance: Float[np.ndarray, "k k"],
-) -> WholeMap:
-    """Replace the marginal of the landmarks by the fused map; update pose and other landmarks by
-    regression (`carried_along`).
-
-    Unknown landmarks are added. The fused map contains this robot's own measurements: they are
-    counted twice if the result is sent for fusion.
-    """
-    _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
-    mean, joint = carried_along(
-        whole.mean,
-        whole.covariance,
-        3 + _points(in_whole),
-        means.ravel(),
-        covariance,
-        _points(in_new),
-    )
-    mean[2] = wrapped(mean[2])
-    own = whole.ids[np.setdiff1d(np.arange(len(whole.ids)), in_whole)]
-    return _by_id(np.concatenate([own, ids]), mean, joint)
-
-
 def _coordinates(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     """Indices of the coordinates of landmarks in a submap's mean, after its poses."""
     return len(local.mean) - 2 * len(local.ids) + _points(index)
 
 
-def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    return np.concatenate([np.arange(3), 3 + _points(index)])
-
-
 def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     return (2 * index[:, None] + np.arange(2)).ravel()
-
-
-def _by_id(
-    ids: UInt32[np.ndarray, " L"],
-    mean: Float[np.ndarray, " n"],
-    covariance: Float[np.ndarray, "n n"],
-) -> WholeMap:
-    if (ids[1:] < ids[:-1]).any():
-        order = np.argsort(ids)
-        place = _entries(order)
-        ids, mean, covariance = ids[order], mean[place], covariance[np.ix_(place, place)]
-    return WholeMap(ids, mean, 0.5 * (covariance + covariance.T))

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from teamslam.sim.studies.estimators.feedback import absorb_fused_map
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
@@ -16,7 +17,6 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.map_joining.marginals import prior_for
 from teamslam.team.estimation.map_joining.whole_map import (
-    absorb_fused_map,
     initial_map,
     join_end_pose,
     join_submap,

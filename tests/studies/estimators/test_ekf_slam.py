@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.sim.studies.estimators import ekf_slam
+from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
-from teamslam.team.estimation.hybrid_slam import innovation as innovations
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world

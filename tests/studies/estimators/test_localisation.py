@@ -6,11 +6,11 @@ import functools
 import numpy as np
 import pytest
 
+from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators import localisation
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.hybrid_slam import innovation as innovations
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.estimator_runs import keyframes_of, run, world

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.hybrid_slam.innovation import NOTHING, Innovation, innovation
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment, predicted
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.hybrid_slam.test_window import ACCURATE, drive, driven, wrap

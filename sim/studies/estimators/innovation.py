@@ -1,51 +1,22 @@
-"""The innovations of a window's measurements, and their normalised squares (NIS).
+"""The innovations of a keyframe's measurements, for estimators whose window does not compute them.
 
-A filter's predictions are compared with its later measurements, so this consistency check needs no
-ground truth. Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
+Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.gaussian import cholesky_factor, whitened
+from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import compose, tangent, wrapped
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
-
-Seen = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], Own]
-"""Ids, ranges [m], bearings [rad] and claimed noises of measurements."""
-
-
-class Innovation(NamedTuple):
-    """squared: Σ νᵀ S⁻¹ ν, χ² of `dof` degrees of freedom, two for each measurement that was
-    predicted.
-
-    Innovations of different keyframes are independent where the models are right, so both add up.
-    """
-
-    squared: float
-    dof: int
-
-    def plus(self, other: "Innovation") -> "Innovation":
-        """The sum of both."""
-        return Innovation(self.squared + other.squared, self.dof + other.dof)
-
-    @property
-    def per_dof(self) -> float | None:
-        """About 1 where the models are right, larger where the noise is larger; None without
-        measurements.
-        """
-        return self.squared / self.dof if self.dof else None
-
-
-NOTHING = Innovation(0.0, 0)
 
 
 def innovation(
@@ -72,16 +43,12 @@ def innovation(
     calibration, own are the noises that they claim. R is white, as in the particles' weights.
     Raises NotACovarianceError if S is not positive definite.
     """
+    noises = unclaimed(len(ids)) if own is None else own
     with CoreErrors():
         window = core.Window.of_particles(*particles.arrays, noise_of(sensor))
-    noises = unclaimed(len(ids)) if own is None else own
-    return innovation_of(window, increment, (ids, ranges, bearings, noises))
-
-
-def innovation_of(window: core.Window, increment: Increment, seen: Seen) -> Innovation:
-    """Compute `innovation` of a keyframe's measurements by the particles of a window."""
-    with CoreErrors():
-        squared, error, S = window.innovation(increment.mean, increment.covariance, *seen)
+        squared, error, S = window.innovation(
+            increment.mean, increment.covariance, ids, ranges, bearings, noises
+        )
     return _judged(squared, error, S) if len(error) else NOTHING
 
 
@@ -150,6 +117,6 @@ def _judged(
 ) -> Innovation:
     """The core's square, unless it found none: rank and finiteness are judged here."""
     if not math.isfinite(squared):
-        white = whitened(cholesky_factor(S, "the prediction of measurements"), error)
+        white = dense.forward(cholesky_factor(S, "the prediction of measurements"), error)
         squared = float(dense.product(white, white))
     return Innovation(squared, len(error))
