@@ -26,6 +26,8 @@ from teamslam.team.robot.node import RobotNode, robot_node
 from teamslam.team.wire import messages as m
 from tests.support import ROOT
 
+PRODUCT = ("team", "central", "sim")
+"""The folders of the product."""
 Node = TypeVar("Node", RobotNode, CentralNode)
 
 
@@ -70,9 +72,9 @@ class Walk:
     def _is_product(self, name: str) -> bool:
         known = self._product.get(name)
         if known is None:
-            path = Path(name)
+            path = Path(name).resolve()
             known = path.is_file() and path.is_relative_to(ROOT)
-            known = known and path.relative_to(ROOT).parts[0] in ("team", "central", "sim")
+            known = known and path.relative_to(ROOT).parts[0] in PRODUCT
             self._product[name] = known
         return known
 
@@ -106,12 +108,16 @@ def rows_of(walk: Walk) -> Iterator[Row]:
             ends = [end for _, end, _, _ in code.co_positions() if end is not None]
             entered.update(range(code.co_firstlineno, max(ends) + 1))
         yield Row(
-            str(Path(name).relative_to(ROOT)),
+            _relative(name),
             len(Path(name).read_text("utf-8").splitlines()),
             len(entered),
             sorted((code.co_qualname, walk.calls[code]) for code in codes),
-            sorted(str(Path(each).relative_to(ROOT)) for each in walk.callers[name]),
+            sorted(map(_relative, walk.callers[name])),
         )
+
+
+def _relative(name: str) -> str:
+    return str(Path(name).resolve().relative_to(ROOT))
 
 
 def walked(scenario_name: str, *, final: bool) -> Walk:
