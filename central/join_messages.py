@@ -117,8 +117,8 @@ def team_map(
         withdrawn=withdrawn,
         covariance_scale=covariance_scale,
         heard=arrived,
-        memberships=memberships_of(fold.landmarks, tail == "final"),
-        decisions=decisions_of(fold.landmarks),
+        memberships=memberships_of(fold.landmarks, tail == "final") if fold.has_unnamed else (),
+        decisions=decisions_of(fold.landmarks) if fold.has_unnamed else (),
         verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
         changes=changes,
     )
@@ -190,8 +190,8 @@ def reasons(
         *_apart(fold),
         *_worded(describe_refusals(fold)),
         *(words for words in fold.warnings if not words.startswith(RIVAL)),
-        *survey_warnings(fold),
-        *fix_warnings(fold),
+        *(survey_warnings(fold) if fold.has_maps else ()),
+        *(fix_warnings(fold) if fold.has_maps else ()),
         *_lost(shown),
         *_repeated(shown),
         *_left_out(fold, shown, landmark_submaps),
@@ -344,9 +344,7 @@ def _apart(fold: Fold) -> Iterator[str]:
             continue
         by_name = fold.reasons.get(frame, "")
         found = _best_attempt(fold, key)
-        if found is None and (
-            by_name and not (fold.landmarks.are_there and NONE_SHARED in by_name)
-        ):
+        if found is None and (by_name and not (fold.has_unnamed and NONE_SHARED in by_name)):
             yield by_name
             continue
         streams = sorted(fold.islands[key].graph.streams)

@@ -66,8 +66,7 @@ def in_saved_map(fold: Fold) -> Fold:
 def lone_newcomer(fold: Fold) -> Stream | None:
     """Return the robot that is the main island alone, without a start, beside a saved map."""
     there = [stream for stream, key in fold.home.items() if key == fold.main_key]
-    is_beside = any(is_map(stream) for stream in fold.home)
-    return there[0] if len(there) == 1 and is_beside and there[0] not in fold.starts else None
+    return there[0] if len(there) == 1 and there[0] not in fold.starts else None
 
 
 def saved_landmarks(fused: m.FusedMap, saved: m.SavedMap) -> m.FusedMap:

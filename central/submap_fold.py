@@ -231,7 +231,7 @@ class SubmapFold:
         self.diagnosis = diagnose(
             fold,
             biases,
-            cuts_of(fold),
+            cuts_of(fold) if fold.cuts else (),
             withdrawn,
             self.config.normal_scale,
             scale,
@@ -286,7 +286,7 @@ class SubmapFold:
         for robot, own in self._apart.items():
             ids = shown_landmarks(own, self.config, "closed").ids
             parts.append((own, ids, [each for each in streams if each[0] == robot]))
-        lone = lone_newcomer(fold)
+        lone = lone_newcomer(fold) if fold.has_maps else None
         if lone is not None and lone[0] not in self._apart:
             parts[0] = (fold, shown, [each for each in parts[0][2] if each != lone])
             of_map = in_saved_map(fold)

@@ -246,14 +246,15 @@ class TickFold:
     def _fold_tick(self, fold: Fold, tick: int) -> Fold:
         """Fold a tick, with the condensed submaps restored if it contradicts them."""
         members = self._inputs.tick(tick, self._gone)
-        if self._limits is None:
+        size = fold.size
+        if self._limits is None or size <= self._limits.begin:  # nothing is condensed yet
             return fold_tick(fold, members, self.settings)
-        size, begin = fold.size, self._limits.begin
+        begin = self._limits.begin
         if fold.condensed_count and is_due(size, size + len(members.contributions), begin):
             fold = self._inputs.restore_submaps(fold, tick - 1, self._gone)
         fold = self.checkpoints.condense(fold, self._limits)
         after = fold_tick(fold, members, self.settings)
-        if is_contradicted(fold, after):
+        if fold.condensed_count and is_contradicted(fold, after):
             raw = self._inputs.restore_submaps(fold, tick - 1, self._gone)
             after = after if raw.condensed_count else fold_tick(raw, members, self.settings)
         return after
@@ -288,7 +289,7 @@ class TickFold:
         self.undecided = ""
         if not self._tries and math.isfinite(at):
             return False
-        wrong = contradiction(fold.main) if fold.contributions else None
+        wrong = contradiction(fold.main) if fold.contributions and fold.has_maps else None
         if wrong is not None and self.convicts:
             (author, _), reason = wrong
             self._restart(self._conviction.withdraw(author, reason, at))
@@ -428,7 +429,7 @@ class TickFold:
         fold = self.fold
         if self._limits is None or fold.size <= self._limits.begin:
             return fold
-        if not fold.landmarks.are_there or fold.size > FULL_UNNAMED:
+        if not fold.has_unnamed or fold.size > FULL_UNNAMED:
             fold = self._inputs.restore_submaps(fold, math.inf, self._gone)
             if not fold.condensed_count:
                 return fold

@@ -8,10 +8,13 @@ import numpy as np
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.submap import Became
 from teamslam.team.wire import messages as m
 
 
-def classify_landmarks(closed: ClosedWindow, measurements: Sequence[m.Measurement]) -> ClosedWindow:
+def classify_landmarks(
+    closed: ClosedWindow, found: Became, measurements: Sequence[m.Measurement]
+) -> ClosedWindow:
     """Sum ln P(reported class | class) of each unnamed landmark's detections, at a window's close.
 
     Unchanged where no detection has a class. Detections of other numbers of classes are left out.
@@ -21,8 +24,7 @@ def classify_landmarks(closed: ClosedWindow, measurements: Sequence[m.Measuremen
         for each in measurements
         if isinstance(each, m.Detections) and each.classes
     }
-    found = closed.became
-    if not rows or found is None:
+    if not rows:
         return closed
     most = max(row.shape[1] for row in rows.values())
     classes = np.zeros((len(closed.local.unnamed.counts), most))

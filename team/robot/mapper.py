@@ -263,7 +263,8 @@ class Mapper:
         measurement: which closed the window; None: the stream ended.
         """
         writer = self.writer
-        closed = classify_landmarks(closed, self._window)
+        if closed.became is not None:
+            closed = classify_landmarks(closed, closed.became, self._window)
         if self._replaced is not None:
             prior = self.poses.prior_of(writer.incarnation)
             closed = self._replaced(closed, prior, self.submaps)

@@ -90,11 +90,6 @@ class Landmarks:
     opened: tuple[Opened, ...] = ()
     undone: tuple[Opened, ...] = ()
 
-    @property
-    def are_there(self) -> bool:
-        """Whether any submap has had an unnamed landmark."""
-        return bool(self.log.streams)
-
     @cached_property
     def sets(self) -> Mapping[int, tuple[LocalLandmark, ...]]:
         """All members of each identity, ascending; O(members of the run)."""

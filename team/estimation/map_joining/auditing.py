@@ -29,8 +29,10 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))
     while True:
-        parts = cut_tick(tick, fold.cuts)
+        parts = cut_tick(tick, fold.cuts) if fold.cuts else tick
         after = add_members(fold, parts, settings)
+        if not after.has_unnamed:
+            return after
         seam = _first_seam(after, parts)
         if seam is None:
             return _audit_closures(fold, after, tick, settings)
@@ -39,8 +41,6 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 def _first_seam(fold: Fold, tick: Tick) -> Seam | None:
     """Find the first seam that the submaps of a tick show."""
-    if not fold.landmarks.are_there:
-        return None
     for each in tick.contributions:
         if each.key not in fold.refused:
             island = fold.islands[fold.home[each.stream]]

@@ -73,7 +73,7 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
         return fold
-    unnamed = fold.landmarks.are_there
+    unnamed = fold.has_unnamed
     island = fold.islands[key]
     if unnamed:
         lag = max(lag, island.settings.association.recent)

@@ -23,8 +23,6 @@ Member = TypeVar("Member", Contribution, InterRobotFactor)
 
 def cut_tick(tick: Tick, cuts: Sequence[Seam]) -> Tick:
     """Assign the members of a tick to the parts of cut streams, and refuse spoilt submaps."""
-    if not cuts:
-        return tick
     submaps = cut_members(tick.contributions, cuts)
     spoilt = {each.key: SPOILT for each in submaps if _is_spoilt(each, cuts)}
     return replace(

@@ -47,9 +47,7 @@ AMBIGUITY_GROWTH = 1.25
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
-    """Associate the landmarks of a tick's submaps; the fold is unchanged where none is unnamed."""
-    if not fold.landmarks.are_there:
-        return fold
+    """Associate the landmarks of a tick's submaps, in a fold that has unnamed ones."""
     fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
     arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:

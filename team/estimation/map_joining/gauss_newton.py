@@ -25,8 +25,10 @@ from teamslam.team import core
 from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import NotACovarianceError
-from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph
+from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph, encounter_of
 from teamslam.team.shapes import Float, Int64
 
 Values = Float[np.ndarray, " _"]
@@ -77,6 +79,14 @@ LANDMARK_GATE = 13.8
 """χ² of two numbers that a sound landmark exceeds with probability 10⁻³."""
 PLAIN = 1e9
 """Widening of gates beyond every χ²."""
+LIKELY = 0.999
+"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a minimum
+unlikely.
+"""
+SUSPICIOUS = 1.3
+"""Factor by which a suspicious cost also exceeds its degrees of freedom: submaps are only nearly
+Gaussian.
+"""
 FULL_AGE = 1_000_000
 """Number of iterations after which every robust scale has reached its final value."""
 
@@ -273,6 +283,41 @@ def final_cost(island: Island) -> float:
     """Evaluate the cost with final robust scales, for comparison of islands."""
     is_final = (island.age >= FULL_AGE).all() and (island.sighting_age >= FULL_AGE).all()
     return island.cost if is_final else age_factors(island, FULL_AGE).cost
+
+
+def add_sightings(
+    island: Island, waiting: Sequence[InterRobotFactor]
+) -> tuple[Island, tuple[InterRobotFactor, ...]]:
+    """Add the inter-robot measurements within an island; return the remaining ones."""
+    candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
+    found = [between for _, between in candidates if between is not None]
+    if not found:
+        return island, tuple(waiting)
+    graph = replace(island.graph, sightings=(*island.graph.sightings, *found))
+    age = np.concatenate([island.sighting_age, ages(len(found))])
+    left = tuple(each for each, between in candidates if between is None)
+    return replace(island, graph=graph, sighting_age=age), left
+
+
+def degrees_of_freedom(island: Island) -> int:
+    """Number of measured quantities less the number of unknowns."""
+    graph = island.graph
+    priors = sum(len(prior.mean) for prior in graph.priors)
+    measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
+    old = graph.condensed
+    return measured - graph.unknowns + (0 if old is None else old.redundancy)
+
+
+def is_suspicious(island: Island, cost: float) -> bool:
+    """Whether the cost is far above its degrees of freedom."""
+    dof = degrees_of_freedom(island)
+    return dof > 0 and cost > max(SUSPICIOUS * dof, likely_limit(dof))
+
+
+@lru_cache(maxsize=4096)
+def likely_limit(dof: int) -> float:
+    """Quantile of χ² above which a cost is suspicious."""
+    return chi2_limit(dof, 1.0 - LIKELY)
 
 
 def is_solvable(island: Island) -> bool:

@@ -5,6 +5,11 @@ all robots, and over the inter-robot measurements between their pose nodes. The 
 submaps by ticks, each with the inter-robot measurements from it; it is a pure function of their
 order and of the ticks' boundaries. A stream with an unknown initial pose is an island of its own
 until shared landmarks and inter-robot measurements tie it to the main island.
+
+A tick of a fold with one island and named landmarks adds nodes and factors and iterates. The other
+steps run under a condition on the fold's contents: tests of saved maps (`Fold.has_maps`),
+association, cuts and audits (`Fold.has_unnamed`), condensed submaps (`Fold.condensed_count`),
+merging (several islands), and the search for another minimum (a suspicious cost).
 """
 
 import math
@@ -16,6 +21,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     Landmarks,
@@ -41,17 +47,18 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     JoinSettings,
+    add_sightings,
     ages,
     final_cost,
     is_solvable,
+    is_suspicious,
     iterate_tick,
 )
 from teamslam.team.estimation.map_joining.markers import add_markers, warn_of_unmarked
-from teamslam.team.estimation.map_joining.merging import Merge, add_sightings, merge
+from teamslam.team.estimation.map_joining.merging import Merge, merge
 from teamslam.team.estimation.map_joining.minima import (
     Minimum,
     Search,
-    is_suspicious,
     rival_distance,
     search_minima,
     warnings,
@@ -209,6 +216,16 @@ class Fold:
         """Number of submaps in the fold, condensed ones included."""
         return sum(island.graph.size for island in self.islands.values())
 
+    @property
+    def has_maps(self) -> bool:
+        """Whether it has a saved map, a survey or the station of fixes."""
+        return any(is_map(stream) for stream in self.home)
+
+    @property
+    def has_unnamed(self) -> bool:
+        """Whether any submap has had an unnamed landmark."""
+        return bool(self.landmarks.log.streams)
+
     @cached_property
     def main_key(self) -> Stream | None:
         """Key of the island with a known initial pose and a robot, else of one with a saved map and
@@ -291,12 +308,13 @@ def fold_submaps(
             home[stream] = common[0] if common and stream in fold.starts else stream
         arrived.setdefault(home[stream], []).append(contribution)
     waiting = tuple(sorted((*fold.waiting, *sightings), key=lambda each: each.key))
-    landmarks, numbers = add_landmarks(fold.landmarks, contributions)
-    seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
-    islands = {
-        key: wake_landmarks(replace(island, settings=settings), seen)
-        for key, island in fold.islands.items()
-    }
+    landmarks, numbers = fold.landmarks, dict[Key, list[int]]()
+    if any((each.local.ids[-1:] >= UNNAMED).any() for each in contributions):
+        landmarks, numbers = add_landmarks(fold.landmarks, contributions)
+    islands = {key: replace(island, settings=settings) for key, island in fold.islands.items()}
+    if fold.condensed_count:
+        seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
+        islands = {key: wake_landmarks(island, seen) for key, island in islands.items()}
     for key, taken in arrived.items():
         island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
         graph, state = add_submaps(
@@ -319,7 +337,8 @@ def fold_submaps(
         waiting=waiting,
         landmarks=landmarks,
     )
-    return _separate_moved(_merge_all(_search_suspicious(grown)), SEQUENTIAL, contributions)
+    merged = _merge_all(_search_suspicious(grown))
+    return _separate_moved(merged, SEQUENTIAL, contributions) if merged.has_maps else merged
 
 
 def compact_fold(fold: Fold) -> Fold:
@@ -360,7 +379,9 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
         iterations=main.best.iterations,
         change=main.best.change,
     )
-    merged = _test_saved_places(_merge_all(solved, at_last=True))
+    merged = _merge_all(solved, at_last=True)
+    if merged.has_maps:
+        merged = _test_saved_places(merged)
     last = main if merged.main is main.best.island else _search_island(merged.main)
     wider = None
     with suppress(*UNSOLVABLE):

@@ -28,6 +28,7 @@ from teamslam.team.estimation.map_joining.alignment import Alignment, SharedPoin
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
+    add_sightings,
     ages,
     is_solvable,
     joint_marginal,
@@ -47,7 +48,6 @@ from teamslam.team.estimation.map_joining.saved_maps import (
 )
 from teamslam.team.estimation.map_joining.submap_graph import (
     Graph,
-    encounter_of,
     merge_graphs,
     observer_of,
     teammate_of,
@@ -206,20 +206,6 @@ class Waits(NamedTuple):
 
     why: str
     after_search: bool
-
-
-def add_sightings(
-    island: Island, waiting: Sequence[InterRobotFactor]
-) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Add the inter-robot measurements within an island; return the remaining ones."""
-    candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
-    found = [between for _, between in candidates if between is not None]
-    if not found:
-        return island, tuple(waiting)
-    graph = replace(island.graph, sightings=(*island.graph.sightings, *found))
-    age = np.concatenate([island.sighting_age, ages(len(found))])
-    left = tuple(each for each, between in candidates if between is None)
-    return replace(island, graph=graph, sighting_age=age), left
 
 
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:

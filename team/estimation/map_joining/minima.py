@@ -9,19 +9,20 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.map_joining.gauss_newton import (
     UNSOLVABLE,
     Island,
     NotDeterminedError,
+    degrees_of_freedom,
     final_cost,
+    is_suspicious,
+    likely_limit,
     solve_island,
 )
 from teamslam.team.estimation.map_joining.nonlinearity import (
@@ -36,14 +37,6 @@ from teamslam.team.shapes import Float
 
 Values = Float[np.ndarray, " _"]
 
-LIKELY = 0.999
-"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a minimum
-unlikely.
-"""
-SUSPICIOUS = 1.3
-"""Factor by which a suspicious cost also exceeds its degrees of freedom: submaps are only nearly
-Gaussian.
-"""
 SETTLED_M = 1e-3
 """Length of the last step [m, rad] above which a solution is not yet a minimum."""
 MORE_SOLUTIONS = 4
@@ -86,29 +79,9 @@ def solve_minimum(island: Island) -> Minimum:
     return Minimum(solved, iterations, change, final_cost(solved))
 
 
-def degrees_of_freedom(island: Island) -> int:
-    """Number of measured quantities less the number of unknowns."""
-    graph = island.graph
-    priors = sum(len(prior.mean) for prior in graph.priors)
-    measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
-    old = graph.condensed
-    return measured - graph.unknowns + (0 if old is None else old.redundancy)
-
-
-def is_suspicious(island: Island, cost: float) -> bool:
-    """Whether the cost is far above its degrees of freedom."""
-    dof = degrees_of_freedom(island)
-    return dof > 0 and cost > max(SUSPICIOUS * dof, _quantile(dof))
-
-
-@lru_cache(maxsize=4096)
-def _quantile(dof: int) -> float:
-    return chi2_limit(dof, 1.0 - LIKELY)
-
-
 def likely_rise() -> float:
     """Rise of the cost above which another place in the plane is unlikely: quantile of χ² of 3."""
-    return _quantile(3)
+    return likely_limit(3)
 
 
 def search_minima(starts: Sequence[Island]) -> Search:

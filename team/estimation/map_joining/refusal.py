@@ -96,7 +96,9 @@ def _attempt(
         fold = add_start(fold, start)
     try:
         with np.errstate(all="ignore"):
-            after = associate_tick(fold_submaps(fold, members, settings, sightings), members)
+            after = fold_submaps(fold, members, settings, sightings)
+            if after.has_unnamed:
+                after = associate_tick(after, members)
     except UNSOLVABLE:
         return None
     changed = (

@@ -19,13 +19,13 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     UNSOLVABLE,
     Island,
+    add_sightings,
     ages,
     is_solvable,
     iterate_tick,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
-from teamslam.team.estimation.map_joining.merging import add_sightings
 from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, add_submaps
 from teamslam.team.estimation.se2 import compose, transformed
@@ -57,11 +57,8 @@ def is_contradicted(before: Fold, after: Fold) -> bool:
     That is a closure of unnamed landmarks, the first unnamed landmarks (which may be landmarks of
     condensed submaps), and a new main island, into whose frame the former one will be transformed.
     """
-    key, unnamed = before.main_key, after.landmarks
-    if key is None or before.condensed_count == 0:
-        return False
-    begins = unnamed.are_there and not before.landmarks.are_there
-    return bool(unnamed.opened) or begins or key != after.main_key
+    begins = after.has_unnamed and not before.has_unnamed
+    return bool(after.landmarks.opened) or begins or before.main_key != after.main_key
 
 
 def restore_submaps(
@@ -102,7 +99,7 @@ def _restore_island(
         and each.key not in fold.left_out
         and (*each.stream, each.sequence) not in refused
     ]
-    if landmarks.are_there:
+    if fold.has_unnamed:
         landmarks, numbers = landmarks.restore(submaps)
     try:
         with np.errstate(all="ignore"):

@@ -10,7 +10,12 @@ from teamslam.team.estimation.map_joining import condensing, gauss_newton, margi
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import age_factors, final_cost, take_step
+from teamslam.team.estimation.map_joining.gauss_newton import (
+    age_factors,
+    degrees_of_freedom,
+    final_cost,
+    take_step,
+)
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -20,7 +25,6 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
 )
 from teamslam.team.estimation.map_joining.memory import MOST, Memory, Observed
-from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
 from teamslam.team.estimation.map_joining.relinearising import is_due, restore_submaps
 from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from tests.estimation.association.unnamed_worlds import (

@@ -11,6 +11,7 @@ from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
+    add_sightings,
     age_factors,
     ages,
     final_cost,
@@ -25,7 +26,6 @@ from teamslam.team.estimation.map_joining.marginals import (
     landmark_map,
     prior_for,
 )
-from teamslam.team.estimation.map_joining.merging import add_sightings
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.map_joining import gauss_newton, minima
-from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, is_suspicious
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     add_start,
@@ -18,7 +18,6 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.map_joining.minima import (
     Search,
-    is_suspicious,
     search_minima,
     solve_minimum,
     warnings,

@@ -141,4 +141,3 @@ def test_members_of_a_tick_go_to_the_parts_and_a_spoilt_submap_is_refused():
     assert found.outside == {submap(4).key: SPOILT}
     ((one, two, _),) = found.verdicts
     assert (one[:2], two[:2]) == (R1, PART)
-    assert cut_tick(tick, ()) is tick

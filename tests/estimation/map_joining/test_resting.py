@@ -8,14 +8,13 @@ import pytest
 
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import final_cost
+from teamslam.team.estimation.map_joining.gauss_newton import degrees_of_freedom, final_cost
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     JoinSettings,
     add_start,
     fold_submaps,
 )
-from teamslam.team.estimation.map_joining.minima import degrees_of_freedom
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
 
