@@ -1,6 +1,6 @@
 """Commands `teamslam log`: inspect, check, repair, cut, merge and export."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,9 +28,7 @@ from teamslam.team.wire.text import one_line
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from teamslam.team.recording.reader import Log
     from teamslam.team.recording.summary import KeySummary
-    from teamslam.team.recording.tables import Exported
     from teamslam.team.wire.channels import Channel
 
 NewLog = Annotated[Path, output_option("The new log.", metavar="FILE")]
@@ -217,22 +215,16 @@ def export(
         for number, robot in enumerate(export_utias(opened, output), 1):
             typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
         return
-    exported = _exporter(form)(opened, output, chosen)
+    from teamslam.team.recording.tables import CsvTable, ParquetTable, export_tables
+
+    if form is Format.PARQUET and find_spec("pyarrow") is None:
+        fail(f"--format parquet needs pyarrow: {install_command('parquet')}", WRONG_USE)
+    table = ParquetTable if form is Format.PARQUET else CsvTable
+    exported = export_tables(opened, output, chosen, table)
     for path, rows in exported.rows.items():
         typer.echo(f"{path}: {count_noun(rows, 'row')}")
     if exported.unsound:
         typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
-
-
-def _exporter(form: Format) -> "Callable[[Log, Path, list[Channel] | None], Exported]":
-    """Table exporter; exits if it is not installed."""
-    from teamslam.team.recording.tables import export_csv, export_parquet
-
-    if form is Format.CSV:
-        return export_csv
-    if find_spec("pyarrow") is None:
-        fail(f"--format parquet needs pyarrow: {install_command('parquet')}", WRONG_USE)
-    return export_parquet
 
 
 def _channels(names: str | None) -> "list[Channel] | None":

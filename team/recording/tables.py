@@ -8,13 +8,14 @@ of parts JSON. Parquet needs pyarrow (extra `parquet`), which is imported on cal
 
 import csv
 import json
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from numpy.typing import NDArray
 
 from teamslam.team.recording.reader import Log
@@ -25,6 +26,8 @@ from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.messages import Digest, Message, tag_of
 
 HEAD = ("key", "counter", "wall_ns")
+LATEST_NS = 2**63 - 1
+"""Largest wall clock [ns] of a table; larger ones are from damaged or hostile logs."""
 _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     "ids": ids,
     "stamps": stamps,
@@ -80,45 +83,31 @@ def type_of_numbers(name: str) -> str:
     return str(numbers_of(name, b"").dtype)
 
 
-def export_csv(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Write `<channel>.csv` for each non-empty channel (None: all) into `folder`.
+class CsvTable:
+    """One channel's CSV file."""
 
-    Raises `LogError` for a damaged log, OSError for an unwritable folder.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    exported = Exported()
-    with ExitStack() as files:
-        writers: dict[str, tuple[Path, Any]] = {}  # csv does not export its writer's type
-        for sample, channel, message in exported.messages(log, channels):
-            name = table_of(channel, message)
-            if name not in writers:
-                path = folder / f"{name}.csv"
-                file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
-                writers[name] = (path, csv.writer(file, lineterminator="\n"))
-                writers[name][1].writerow((*HEAD, *message.__struct_fields__))
-            path, writer = writers[name]
-            writer.writerow((sample.key, sample.counter, sample.wall_ns, *_cells(message)))
-            exported.rows[path] = exported.rows.get(path, 0) + 1
-    return exported
+    def __init__(self, path: Path, kind: type[Message]) -> None:
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow((*HEAD, *kind.__struct_fields__))
+
+    def add(self, row: Sequence[object], size: int) -> None:
+        """Write a row."""
+        self._writer.writerow(map(_text, row))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
-def _cells(message: Message) -> list[str]:
-    return [
-        _cell(field.name, field.type, getattr(message, field.name))
-        for field in msgspec.structs.fields(message)
-    ]
-
-
-def _cell(name: str, kind: object, value: object) -> str:
+def _text(value: object) -> str:
     match value:
-        case bytes() if kind == Digest:
-            return value.hex()
-        case bytes():
-            return " ".join(map(repr, numbers_of(name, value).tolist()))
+        case np.ndarray():
+            return " ".join(map(repr, value.tolist()))
         case str():
             return value
-        case bool() | tuple() | dict() | msgspec.Struct():
-            return json.dumps(msgspec.to_builtins(value))
+        case bool():
+            return json.dumps(value)
         case _:
             return repr(value)
 
@@ -128,67 +117,71 @@ GROUP_BYTES = 32 * 2**20
 """Payload bytes per row group."""
 
 
-class _Table:
-    """One channel's file, collected by column and written by row group."""
+class ParquetTable:
+    """One channel's Parquet file, collected by column and written by row group: memory is bounded.
+
+    Raises ImportError without pyarrow.
+    """
 
     def __init__(self, path: Path, kind: type[Message]) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        self._fields = msgspec.structs.fields(kind)
         types = {"key": pa.string(), "counter": pa.int64(), "wall_ns": pa.int64()}
-        for each in self._fields:
+        for each in msgspec.structs.fields(kind):
             types[each.name] = _arrow_type(pa, each.name, each.type)
         self._schema = pa.schema(list(types.items()))
         self._pa = pa
         self._writer = pq.ParquetWriter(path, self._schema, compression="zstd")
-        self._columns: list[list[Any]] = [[] for _ in types]
+        self._rows: list[Sequence[object]] = []
         self._bytes = 0
 
-    def __enter__(self) -> "_Table":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._flush()
-        self._writer.close()
-
-    def add(self, head: tuple[str, int, int], message: Message, size: int) -> None:
-        values = [_value(f.name, f.type, getattr(message, f.name)) for f in self._fields]
-        for column, value in zip(self._columns, (*head, *values), strict=True):
-            column.append(value)
+    def add(self, row: Sequence[object], size: int) -> None:
+        """Add a row of a payload of this size."""
+        self._rows.append(row)
         self._bytes += size
-        if len(self._columns[0]) >= GROUP_ROWS or self._bytes >= GROUP_BYTES:
+        if len(self._rows) >= GROUP_ROWS or self._bytes >= GROUP_BYTES:
             self._flush()
 
     def _flush(self) -> None:
-        if self._columns[0]:
+        if self._rows:
             arrays = [
                 self._pa.array(column, type=each.type)
-                for column, each in zip(self._columns, self._schema, strict=True)
+                for column, each in zip(zip(*self._rows, strict=True), self._schema, strict=True)
             ]
             self._writer.write_table(self._pa.Table.from_arrays(arrays, schema=self._schema))
-        self._columns = [[] for _ in self._columns]
-        self._bytes = 0
+        self._rows, self._bytes = [], 0
+
+    def close(self) -> None:
+        """Write the remaining rows."""
+        self._flush()
+        self._writer.close()
 
 
-def export_parquet(log: Log, folder: Path, channels: Collection[Channel] | None = None) -> Exported:
-    """Write `<channel>.parquet` for each non-empty channel (None: all) into `folder`.
+def export_tables(
+    log: Log,
+    folder: Path,
+    channels: Collection[Channel] | None = None,
+    form: type[CsvTable] | type[ParquetTable] = CsvTable,
+) -> Exported:
+    """Write a table for each non-empty channel (None: all) into `folder`.
 
-    Memory is bounded by a row group per channel. Raises `LogError` for a damaged log, OSError for
-    an unwritable folder, ImportError without pyarrow.
+    Raises `LogError` for a damaged log, OSError for an unwritable folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    exported = Exported()
+    exported, ending = Exported(), "csv" if form is CsvTable else "parquet"
     with ExitStack() as files:
-        tables: dict[str, tuple[Path, _Table]] = {}
+        tables: dict[Path, CsvTable | ParquetTable] = {}
         for sample, channel, message in exported.messages(log, channels):
-            name, kind = table_of(channel, message), type(message)
-            if name not in tables:
-                path = folder / f"{name}.parquet"
-                tables[name] = (path, files.enter_context(_Table(path, kind)))
-            path, table = tables[name]
-            head = (sample.key, sample.counter, min(sample.wall_ns, 2**63 - 1))
-            table.add(head, message, len(sample.payload))
+            path = folder / f"{table_of(channel, message)}.{ending}"
+            if path not in tables:
+                tables[path] = files.enter_context(closing(form(path, type(message))))
+            values = [
+                _value(each.name, each.type, getattr(message, each.name))
+                for each in msgspec.structs.fields(message)
+            ]
+            head = (sample.key, sample.counter, min(sample.wall_ns, LATEST_NS))
+            tables[path].add((*head, *values), len(sample.payload))
             exported.rows[path] = exported.rows.get(path, 0) + 1
     return exported
 

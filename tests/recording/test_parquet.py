@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from teamslam.sim.cli import log as cli_log
 from teamslam.sim.cli.main import app
 from teamslam.team.recording import tables
-from teamslam.team.recording.tables import export_parquet, numbers_of, table_of
+from teamslam.team.recording.tables import ParquetTable, export_tables, numbers_of, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
@@ -25,7 +25,9 @@ def test_every_field_of_every_message_reads_back(tmp_path):
     kept = recorded_examples()
     samples = [sample for _, _, sample in kept]
     samples.append(Sample(samples[0].key, b"\x90", 0, 0, 99))
-    exported = export_parquet(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
+    exported = export_tables(
+        recorded(tmp_path / "log.mcap", samples), tmp_path / "out", form=ParquetTable
+    )
     assert exported.unsound == 1
     assert len(exported.rows) == len({table_of(of, x) for of, x, _ in kept})
     for i, (channel, message, sample) in enumerate(kept):
@@ -50,14 +52,14 @@ def test_a_long_table_is_written_in_groups(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "GROUP_ROWS", 10)
     samples = [sampled(c.ODOMETRY, "alpha", odometry(k), k) for k in range(35)]
     log = recorded(tmp_path / "log.mcap", samples)
-    assert export_parquet(log, tmp_path / "out", [c.ODOMETRY]).rows == {
+    assert export_tables(log, tmp_path / "out", [c.ODOMETRY], ParquetTable).rows == {
         tmp_path / "out" / "odometry.parquet": 35
     }
     file = pq.ParquetFile(tmp_path / "out" / "odometry.parquet")
     assert file.num_row_groups == 4
     assert file.read().column("number").to_pylist() == list(range(35))
     monkeypatch.setattr(tables, "GROUP_BYTES", 1)
-    export_parquet(log, tmp_path / "fine")
+    export_tables(log, tmp_path / "fine", form=ParquetTable)
     assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35
 
 

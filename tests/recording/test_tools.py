@@ -22,7 +22,7 @@ from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.schemas import schema_of
 from teamslam.team.recording.summary import summarise_log
-from teamslam.team.recording.tables import export_csv, table_of
+from teamslam.team.recording.tables import export_tables, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
@@ -497,7 +497,7 @@ def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
         bearings=from_floats(bearings),
     )
     log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
-    export_csv(log, folder / "out")
+    export_tables(log, folder / "out")
     (row,) = rows_of(folder / "out" / "observations.csv")
     assert (row["key"], row["counter"], row["number"]) == ("source/alpha/observations", "3", "9")
     assert from_ids([int(word) for word in row["ids"].split()]) == message.ids
@@ -511,7 +511,7 @@ def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):
     samples = [sample for _, _, sample in kept]
     samples.append(msgspec.structs.replace(samples[0], payload=b"\x90"))
     samples.append(Sample("view/scene", b"?", 0, 0, 0))
-    exported = export_csv(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
+    exported = export_tables(recorded(tmp_path / "log.mcap", samples), tmp_path / "out")
     assert exported.unsound == 1
     assert {path.stem for path in exported.rows} == {table_of(of, x) for of, x, _ in kept}
     for path, count in exported.rows.items():
