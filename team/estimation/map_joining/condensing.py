@@ -8,14 +8,10 @@ its ticks.
 
 No submap is condensed before the fold has `begin` submaps, nor before its own robust scale is
 final, nor in an unmerged island, whose frame will still be transformed.
-
-A run of a stream's old poses is connected with the landmarks seen along it and the poses at its
-ends only. Each run is eliminated from a dense quadratic over its neighbours, and the rest is a
-factor of the next run (George 1973, SIAM J. Numer. Anal. 10(2), by blocks).
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
@@ -34,13 +30,16 @@ from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, UNSOLVABLE,
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
+from teamslam.team.estimation.map_joining.path_elimination import (
+    MarkedFactors,
+    eliminate_paths,
+    nodes_of,
+)
 from teamslam.team.estimation.map_joining.resting import FIRST, eliminate, find_idle, put_to_rest
 from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
-from teamslam.team.shapes import Bool, Float, Int64
+from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
-Values = Float[np.ndarray, " _"]
-Matrix = Float[np.ndarray, "n n"]
 T = TypeVar("T")
 
 ALL_AWAKE = 2**62
@@ -284,99 +283,3 @@ def _sums(
 
 def _select(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
     return (items[k] for k in np.flatnonzero(which).tolist())
-
-
-RUN = 16
-"""Number of submaps whose poses are eliminated together."""
-
-
-class MarkedFactors(NamedTuple):
-    """Marks of submaps, inter-robot measurements and priors, in the graph's order."""
-
-    submaps: Bool[np.ndarray, " F"]
-    sightings: Bool[np.ndarray, " S"]
-    priors: Bool[np.ndarray, " priors"]
-
-
-class Left(NamedTuple):
-    """A quadratic over some nodes, ascending, left by the elimination of others."""
-
-    nodes: Indices
-    information: Matrix
-    slope: Values
-
-
-def eliminate_paths(
-    island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
-) -> tuple[Indices, Matrix, Values, float]:
-    """Eliminate poses from the factors' quadratic; return its nodes, A, half the gradient and the
-    cost, lowered by the elimination. The graph must have no condensed factor.
-
-    union: the factors' nodes, but for constants. eliminated: marks of nodes; landmarks stay.
-    """
-    graph = island.graph
-    sizes, total = np.diff(graph.offset), 0.0
-    left: list[Left] = []
-    rest = MarkedFactors(*(each.copy() for each in factors))
-    for run in _list_runs(island, factors.submaps):
-        path = np.zeros(len(graph.fixed), np.bool_)
-        for f in run:
-            contribution, nodes, *_ = graph.submaps[f]
-            path[nodes[0]] = True
-            path[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
-        path &= ~graph.fixed
-        taken = _mark_factors(island, run, path, rest)
-        for each, marks in zip(rest, taken, strict=True):
-            each[marks] = False
-        beside = [each for each in left if path[each.nodes].any()]
-        left = [each for each in left if not path[each.nodes].any()]
-        nodes = nodes_of(island, taken, (each.nodes for each in beside))
-        H, g, cost = island.estimate.quadratic(nodes, *taken)
-        _add(H, g, sizes, nodes, beside)
-        parts = eliminate(H, g, np.repeat(path[nodes], sizes[nodes]))
-        left.append(Left(nodes[~path[nodes]], parts.information, parts.slope))
-        total += cost - parts.lowered
-    union = union[~eliminated[union] | (sizes[union] == 2)]
-    H, g, cost = island.estimate.quadratic(union, *rest)
-    _add(H, g, sizes, union, left)
-    return union, H, g, total + cost
-
-
-def _list_runs(island: Island, leaving: Bool[np.ndarray, " F"]) -> Iterator[list[int]]:
-    streams: dict[Stream, list[int]] = defaultdict(list)
-    for f in np.flatnonzero(leaving).tolist():
-        streams[island.graph.submaps[f].contribution.stream].append(f)
-    for stream in sorted(streams):
-        own = streams[stream]
-        yield from (own[k : k + RUN] for k in range(0, len(own), RUN))
-
-
-def _mark_factors(
-    island: Island, run: list[int], path: Bool[np.ndarray, " _"], among: MarkedFactors
-) -> MarkedFactors:
-    graph = island.graph
-    submaps = np.zeros(len(graph.submaps), np.bool_)
-    submaps[run] = True
-    seen = np.array([path[a] or path[b] for _, a, b in graph.sightings], np.bool_)
-    priors = path[np.array([each.node for each in graph.priors], np.int64)]
-    return MarkedFactors(submaps, among.sightings & seen, among.priors & priors)
-
-
-def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) -> Indices:
-    """List the nodes of factors, and `others`, ascending, but for constants."""
-    graph = island.graph
-    touched = [*others]
-    touched += [graph.submaps[f].nodes for f in np.flatnonzero(factors.submaps)]
-    touched += [np.array(graph.sightings[s][1:]) for s in np.flatnonzero(factors.sightings)]
-    touched += [np.array([graph.priors[k].node]) for k in np.flatnonzero(factors.priors)]
-    union = np.unique(np.concatenate(touched))
-    found: Indices = union[~graph.fixed[union]]
-    return found
-
-
-def _add(H: Matrix, g: Values, sizes: Indices, nodes: Indices, left: list[Left]) -> None:
-    first = np.concatenate([[0], np.cumsum(sizes[nodes])])
-    for each in left:
-        within = places(first, np.searchsorted(nodes, each.nodes))
-        H[np.ix_(within, within)] += each.information
-        g[within] += each.slope

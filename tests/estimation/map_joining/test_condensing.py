@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from teamslam.team.association import AssociationProfile
-from teamslam.team.estimation.map_joining import condensing, gauss_newton, marginals
+from teamslam.team.estimation.map_joining import (
+    condensing,
+    gauss_newton,
+    marginals,
+    path_elimination,
+)
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
@@ -175,7 +180,7 @@ def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monke
     world = meeting(3, robots=3, submaps=9)
     fold = joined_with(world.submaps, world.starts, world.sightings, ROBUST)
     fold = replace(fold, islands={fold.main_key: age_factors(fold.main, 100)})
-    monkeypatch.setattr(condensing, "RUN", 3)
+    monkeypatch.setattr(path_elimination, "RUN", 3)
     by_runs = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
     monkeypatch.setattr(
         condensing,

@@ -1,0 +1,1 @@
+"""Order and check a robot's measurements before estimation."""
