@@ -44,6 +44,20 @@ class NotACovarianceError(ValueError):
         self.why = why
 
 
+class CoreErrors:
+    """A context that raises the core's errors as NotACovarianceError."""
+
+    def __enter__(self) -> None:
+        """Do nothing."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Convert MotionError and NotFiniteError."""
+        if isinstance(error, core.MotionError):
+            raise NotACovarianceError("the motion", str(error)) from error
+        if isinstance(error, core.NotFiniteError):
+            raise NotACovarianceError("the window", f"not finite: {error}") from error
+
+
 def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
     """Lower L with L Lᵀ = covariance; `what` names the matrix in the error if there is none.
 

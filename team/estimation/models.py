@@ -6,7 +6,7 @@ in the tangent space of the motion's end, so that motions compose.
 
 import math
 from functools import lru_cache
-from typing import Self
+from typing import NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -20,11 +20,13 @@ from teamslam.team.shapes import Bool, Float
 __all__ = [
     "NEAREST_M",
     "Increment",
+    "Noise",
     "acceptable",
     "corrected",
     "increment_of",
     "located",
     "noise",
+    "noise_of",
     "predicted",
     "scanned",
 ]
@@ -144,3 +146,24 @@ def acceptable(
     are not.
     """
     return scanned(sensor, ranges, bearings)[0]
+
+
+class Noise(NamedTuple):
+    """Variances of a measurement, and the share of each that is white: the rest is constant."""
+
+    range_variance: float
+    range_per_m2: float
+    range_white: float
+    bearing_variance: float
+    bearing_white: float
+
+
+def noise_of(sensor: Sensor) -> Noise:
+    """The variances of a sensor and their white shares, as the kernels take them."""
+    return Noise(
+        core.squared(sensor.range_sigma),
+        core.squared(sensor.range_sigma_per_m),
+        sensor.range_white,
+        core.squared(sensor.bearing_sigma),
+        sensor.bearing_white,
+    )

@@ -6,8 +6,7 @@ import pytest
 from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
 from teamslam.team.core import landmarks_along_paths
-from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
-from teamslam.team.estimation.models import predicted
+from teamslam.team.estimation.models import noise_of, predicted
 from teamslam.team.estimation.scans import (
     POINT,
     POLAR,

@@ -10,10 +10,10 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.gaussian import cholesky_factor
-from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
+from teamslam.team.estimation.gaussian import CoreErrors, cholesky_factor
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.models import Increment, noise
+from teamslam.team.estimation.models import Increment, noise, noise_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import compose, tangent, wrapped
 from teamslam.team.shapes import Bool, Float, Int64, UInt32

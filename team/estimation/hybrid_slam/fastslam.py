@@ -5,7 +5,7 @@ particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -13,21 +13,18 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.core import effective_sample_size, normalise, systematic_parents
-from teamslam.team.estimation.gaussian import NotACovarianceError
-from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.gaussian import CoreErrors
+from teamslam.team.estimation.models import Increment, noise_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.shapes import Float, Int64, UInt32
 
 __all__ = [
-    "CoreErrors",
-    "Noise",
     "Particles",
     "Proposal",
     "StepInfo",
     "at_poses",
     "effective_sample_size",
     "filter_step",
-    "noise_of",
     "normalise",
     "propagated",
     "propagated_and_updated",
@@ -44,41 +41,6 @@ Arrays = tuple[
     Float[np.ndarray, "M L 3"],
 ]
 """The fields of `Particles`, in their order."""
-
-
-class Noise(NamedTuple):
-    """Variances of a measurement, and the share of each that is white: the rest is constant."""
-
-    range_variance: float
-    range_per_m2: float
-    range_white: float
-    bearing_variance: float
-    bearing_white: float
-
-
-def noise_of(sensor: Sensor) -> Noise:
-    """The variances of a sensor and their white shares, as the kernels take them."""
-    return Noise(
-        core.squared(sensor.range_sigma),
-        core.squared(sensor.range_sigma_per_m),
-        sensor.range_white,
-        core.squared(sensor.bearing_sigma),
-        sensor.bearing_white,
-    )
-
-
-class CoreErrors:
-    """A context that raises the core's errors as NotACovarianceError."""
-
-    def __enter__(self) -> None:
-        """Do nothing."""
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Convert MotionError and NotFiniteError."""
-        if isinstance(error, core.MotionError):
-            raise NotACovarianceError("the motion", str(error)) from error
-        if isinstance(error, core.NotFiniteError):
-            raise NotACovarianceError("the window", f"not finite: {error}") from error
 
 
 @dataclass(frozen=True)

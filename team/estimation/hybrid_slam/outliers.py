@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
-from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, noise_of
+from teamslam.team.estimation.gaussian import CoreErrors
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.models import noise_of
 
 OUTLIER_SHARE = 0.01
 """Probability of an outlier before the window's measurements are compared. A landmark measurement

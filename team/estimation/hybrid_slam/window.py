@@ -15,9 +15,9 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.gaussian import FAULTS, NotACovarianceError
-from teamslam.team.estimation.hybrid_slam.fastslam import CoreErrors, Particles, noise_of
-from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.gaussian import FAULTS, CoreErrors, NotACovarianceError
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.models import Increment, noise_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
 from teamslam.team.estimation.submap import NO_NODES, LocalMap

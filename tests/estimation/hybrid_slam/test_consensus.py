@@ -15,8 +15,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
-from teamslam.team.estimation.models import Increment, increment_of, predicted
+from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted
 from teamslam.team.estimation.scans import point_scan, polar_scan, unclaimed
 from teamslam.team.estimation.se2 import compose
 

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from teamslam.team import core, translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.models import Increment, increment_of, predicted
+from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted
 from teamslam.team.estimation.mount import of_base, of_sensor
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import polar_scan

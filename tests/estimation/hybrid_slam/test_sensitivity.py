@@ -16,7 +16,6 @@ from teamslam.team.estimation import se2
 from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam import window as windows
-from teamslam.team.estimation.hybrid_slam.fastslam import noise_of
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
@@ -24,7 +23,7 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
     solve_fold,
 )
-from teamslam.team.estimation.models import increment_of, model_of
+from teamslam.team.estimation.models import increment_of, model_of, noise_of
 from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
