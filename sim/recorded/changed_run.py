@@ -27,8 +27,7 @@ from teamslam.team.config import (
 )
 from teamslam.team.core import WholeMap, check_packed_covariance
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.map_joining.conditioning import RobotPrior
-from teamslam.team.estimation.map_joining.whole_map import initial_map, join_submap
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior, initial_map, join_submap
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.robot.node import RobotNode, robot_node

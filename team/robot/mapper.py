@@ -27,7 +27,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import UNMEASURED, Rejection
 from teamslam.team.robot.landmark_classes import classify_landmarks
 from teamslam.team.robot.ledger import Ledger, OnDisposition
-from teamslam.team.robot.own_map import AT_ORIGIN, InitialPose, OwnMap, thin_out
+from teamslam.team.robot.maps import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps

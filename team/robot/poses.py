@@ -18,10 +18,9 @@ from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
 from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.robot.own_map import OwnMap
+from teamslam.team.robot.maps import OwnMap, TeamMap
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps
-from teamslam.team.robot.team_map import TeamMap
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing

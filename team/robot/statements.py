@@ -10,7 +10,7 @@ from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.submap import Became
-from teamslam.team.robot.own_map import Cloud
+from teamslam.team.robot.maps import Cloud
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

@@ -9,7 +9,7 @@ from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.rejection import Rejection
-from teamslam.team.robot.own_map import InitialPose
+from teamslam.team.robot.maps import InitialPose
 
 
 class Standing:

@@ -7,9 +7,9 @@ import numpy as np
 
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.robot.maps import CONDENSED
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.robot.submaps import Submaps
-from teamslam.team.robot.team_map import CONDENSED
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded

@@ -10,7 +10,7 @@ from teamslam.team.estimation.gaussian import PoseGaussian, curved
 from teamslam.team.estimation.map_joining.conditioning import join_pending
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.plausibility import prior_beyond
-from teamslam.team.robot.team_map import CONDENSED, TeamMap
+from teamslam.team.robot.maps import CONDENSED, TeamMap
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from tests import build
@@ -54,7 +54,7 @@ def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch):
         solved_at_once.append(len(pending))
         return join_pending(whole, pending)
 
-    monkeypatch.setattr("teamslam.team.robot.team_map.join_pending", counted)
+    monkeypatch.setattr("teamslam.team.robot.maps.join_pending", counted)
     often, seldom = TeamMap(), TeamMap()
     for known in range(1, len(submaps) + 1):
         last = often.join(told, submaps[:known]).whole
@@ -92,7 +92,7 @@ def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(mon
         tried.append(1)
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("teamslam.team.robot.team_map.join_pending", unsolvable)
+    monkeypatch.setattr("teamslam.team.robot.maps.join_pending", unsolvable)
     kept, told = TeamMap(), prior(1)
     for _ in range(5):
         with pytest.raises(UNSOLVABLE):

@@ -15,7 +15,7 @@ from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import ESTIMATORS
 from teamslam.team.registry import loaded
 from teamslam.team.rejection import Rejection
-from teamslam.team.robot.own_map import AT_ORIGIN, Cloud, InitialPose
+from teamslam.team.robot.maps import AT_ORIGIN, Cloud, InitialPose
 from teamslam.team.shapes import Float, UInt32
 
 

@@ -11,7 +11,7 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaus
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.models import Increment
-from teamslam.team.robot.own_map import InitialPose
+from teamslam.team.robot.maps import InitialPose
 
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"

@@ -35,7 +35,7 @@ from teamslam.team.config import Estimator, RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.robot.own_map import InitialPose
+from teamslam.team.robot.maps import InitialPose
 
 
 def _random(filter_step: Callable[..., Any]) -> FilterStep:

@@ -28,7 +28,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import NEEDS_MAP
 from teamslam.team.rejection import UNMEASURED, Rejection
 from teamslam.team.robot.mapper import Mapper
-from teamslam.team.robot.own_map import InitialPose
+from teamslam.team.robot.maps import InitialPose
 from teamslam.team.wire import messages as m
 
 

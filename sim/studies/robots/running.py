@@ -30,7 +30,7 @@ from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.rejection import Rejection
-from teamslam.team.robot.own_map import Cloud, InitialPose, thin_out
+from teamslam.team.robot.maps import Cloud, InitialPose, thin_out
 
 
 class RunningEstimator:

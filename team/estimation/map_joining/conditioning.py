@@ -1,10 +1,17 @@
-"""Estimate a robot's pose in the team's map: the broadcast prior times the robot's later submaps.
+"""The Gaussian back end of one robot: its own map, and its pose in the team's map.
 
-The prior (the joint marginal of the robot's last joined end pose and the landmarks) and the submaps
-after it are independent, so their product is exact, once the centre's estimates have corrected the
-errors that all submaps of a robot share. It is the centre's least-squares problem, with the prior
-in place of all earlier submaps, solved at once: joined one by one, the first submap would be
-linearised at the pose of a poor prior (decision 21).
+The own map joins the submaps one by one into one Gaussian: Hybrid-SLAM's map joining (Brooks &
+Bailey 2008, "HybridSLAM"), with the constraints of Williams' constrained local submap filter
+(2001). The whole map and the local map are independent Gaussians, and the identity of two landmarks
+is an observation without noise. Earlier submaps are not linearised again, so the map is
+overconfident after many joins.
+
+The pose in the team's map is the broadcast prior times the robot's later submaps. The prior (the
+joint marginal of the robot's last joined end pose and the landmarks) and the submaps after it are
+independent, so their product is exact, once the centre's estimates have corrected the errors that
+all submaps of a robot share. It is the centre's least-squares problem, with the prior in place of
+all earlier submaps, solved at once: joined one by one, the first submap would be linearised at the
+pose of a poor prior (decision 21).
 
 A landmark observation that everything else contradicts (a misread barcode) is left out, for this
 solution only. The result is for display and control; it never enters a message that is fused.
@@ -31,9 +38,74 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     solve_island,
 )
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
-from teamslam.team.estimation.map_joining.whole_map import join_end_pose, remove_landmark
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.shapes import Bool, Float, UInt32
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
+
+INDEFINITE, SINGULAR = 1, 2
+"""Faults of the core: the covariance of the innovation of all known landmarks is not positive
+definite, or that of one landmark is singular.
+"""
+
+
+def initial_map(
+    pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None
+) -> WholeMap:
+    """Make a map with a pose only; covariance None: the pose is exactly known."""
+    spread = np.zeros((3, 3)) if covariance is None else covariance
+    return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
+
+
+def join_submap(whole: WholeMap, local: LocalMap) -> WholeMap:
+    """Compose the local map onto the current pose: known landmarks fused, new ones added.
+
+    Raises NotACovarianceError where the known landmarks contradict the map numerically.
+    """
+    local = local.without_nodes
+    after, fault = whole.joined(local.ids, local.mean, local.covariance)
+    _raise_fault(fault)
+    return after
+
+
+def join_end_pose(
+    whole: WholeMap, local: LocalMap, gate: float = math.inf
+) -> tuple[PoseGaussian, int, int]:
+    """Compute the pose of `join_submap` alone, with the numbers of common and of refused landmarks.
+
+    gate: known landmarks whose constraints the others contradict by more are left out of the local
+    map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the
+    multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed with
+    two degrees of freedom.
+    """
+    pose, covariance, known, refused, fault = whole.end_pose(
+        local.ids, local.mean, local.covariance, gate
+    )
+    _raise_fault(fault)
+    return PoseGaussian(pose, covariance), known, refused
+
+
+def _raise_fault(fault: int) -> None:
+    if fault == INDEFINITE:
+        raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
+    if fault == SINGULAR:
+        raise NotACovarianceError("a known landmark's innovation", "singular")
+
+
+def remove_landmark(local: LocalMap, place: int) -> LocalMap:
+    """Remove the landmark at this index from the local map."""
+    rows = np.delete(np.arange(len(local.mean)), _coordinates(local, np.array([place])))
+    ids = np.delete(local.ids, place)
+    covariance = local.covariance[np.ix_(rows, rows)]
+    return LocalMap(ids, local.mean[rows], covariance, local.node_stamps)
+
+
+def _coordinates(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    """Indices of the coordinates of landmarks in a submap's mean, after its poses."""
+    return len(local.mean) - 2 * len(local.ids) + _points(index)
+
+
+def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
+    return (2 * index[:, None] + np.arange(2)).ravel()
+
 
 GATE = 18.420680744107813
 """99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`.

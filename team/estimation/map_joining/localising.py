@@ -20,9 +20,13 @@ from teamslam.team.estimation.map_joining.alignment import (
     disagreement,
     refusal,
 )
-from teamslam.team.estimation.map_joining.conditioning import TRUSTING, Posed, join_pending
+from teamslam.team.estimation.map_joining.conditioning import (
+    TRUSTING,
+    Posed,
+    join_pending,
+    join_submap,
+)
 from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
-from teamslam.team.estimation.map_joining.whole_map import join_submap
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 

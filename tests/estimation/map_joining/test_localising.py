@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from teamslam.team.estimation.gaussian import LandmarkGaussian
-from teamslam.team.estimation.map_joining.conditioning import Posed
+from teamslam.team.estimation.map_joining.conditioning import Posed, initial_map
 from teamslam.team.estimation.map_joining.localising import locate_robot
-from teamslam.team.estimation.map_joining.whole_map import initial_map
 from teamslam.team.estimation.se2 import compose, inverse, transformed, wrapped
 from teamslam.team.estimation.submap import LocalMap
 

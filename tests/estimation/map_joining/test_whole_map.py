@@ -8,6 +8,12 @@ import pytest
 from teamslam.sim.studies.estimators.feedback import absorb_fused_map
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.map_joining.conditioning import (
+    initial_map,
+    join_end_pose,
+    join_submap,
+    remove_landmark,
+)
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -16,12 +22,6 @@ from teamslam.team.estimation.map_joining.joining import (
     solve_fold,
 )
 from teamslam.team.estimation.map_joining.marginals import prior_for
-from teamslam.team.estimation.map_joining.whole_map import (
-    initial_map,
-    join_end_pose,
-    join_submap,
-    remove_landmark,
-)
 from tests.estimation.submap_world import correlated, team
 
 LINEAR = (0.1, 1e-5, 0.2)
