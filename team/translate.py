@@ -13,7 +13,7 @@ from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotF
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
-from teamslam.team.estimation.submap import NO_COLUMNS, Became, LocalMap, Unnamed
+from teamslam.team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import (
@@ -203,42 +203,6 @@ def _curvature_of(message: m.Submap) -> Float[np.ndarray, "B n"]:
         return np.zeros((len(message.biases), len(message.mean) // 8))
     row = derivatives(message.curvature, len(message.mean) // 8, "curvature")
     return np.array([row * (bias == "clock_offset") for bias in message.biases])
-
-
-def association_message(
-    robot: str, incarnation: int, sequence: int, stamp_ns: int, became: Became
-) -> m.Association:
-    """Make the message with the outcomes of all detections of a submap's window."""
-    landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
-    return m.Association(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        sequence=sequence,
-        stamps=from_stamps(became.stamps),
-        counts=from_ids(became.counts),
-        rows=from_ids(became.rows),
-        landmarks=from_ids(np.where(became.landmarks >= UNNAMED, became.landmarks, landmarks)),
-    )
-
-
-def sighting_message(
-    sighting: InterRobotFactor, config: bytes, measurements: tuple[int, ...]
-) -> m.SightingFactor:
-    """Make the message of an inter-robot factor, with the names of its inputs."""
-    return m.SightingFactor(
-        stamp_ns=sighting.stamp_ns,
-        robot=sighting.robot,
-        incarnation=sighting.incarnation,
-        sequence=sighting.sequence,
-        config=config,
-        teammate=sighting.teammate,
-        range=float(sighting.measurement[0]),
-        bearing=float(sighting.measurement[1]),
-        covariance=from_floats(packed(sighting.covariance)),
-        measurements=measurements,
-        point=from_floats(sighting.point) if sighting.point.any() else b"",
-    )
 
 
 def sighting_of(message: m.SightingFactor) -> InterRobotFactor:

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.digest import NO_MAP, configured, digest_of
@@ -76,13 +77,13 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
     assert found.node_stamps.tolist() == [1_200, 1_700]
     assert found.nodes.tobytes() == local.mean[3:9].tobytes()
     assert found.landmarks.tobytes() == local.mean[9:].tobytes()
-    seen = InterRobotFactor(
-        "r1", 2, 5, 1_200, "r2", np.array([2.0, -1.0]), correlated(np.ones(2), rng)
-    )
-    again = translate.sighting_of(
-        over_the_wire(translate.sighting_message(seen, b"settings", (3, 4)))
-    )
-    assert (again.key, again.sequence) == (seen.key, 5)
+    seen = NodeSighting(1_200, "r2", np.array([2.0, -1.0]), correlated(np.ones(2), rng), (3, 4))
+    writer = MessageWriter("r1", 2, b"settings", started=True)
+    message = over_the_wire(writer.sighting(5, seen))
+    assert message.measurements == (3, 4)
+    again = translate.sighting_of(message)
+    assert (again.stream, again.sequence, again.stamp_ns) == (("r1", 2), 5, 1_200)
+    assert again.teammate == "r2"
     assert again.measurement.tobytes() == seen.measurement.tobytes()
     assert again.covariance.tobytes() == seen.covariance.tobytes()
 

@@ -268,7 +268,7 @@ class Mapper:
         if self._replaced is not None:
             prior = self.poses.prior_of(writer.incarnation)
             closed = self._replaced(closed, prior, self.submaps)
-        factors = [writer.sighting(closed, each) for each in closed.sightings]
+        factors = [writer.sighting(closed.sequence, each) for each in closed.sightings]
         submap = writer.submap(closed)
         if measurement is not None:
             self.account(measurement, rejected)

@@ -3,17 +3,19 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from teamslam.team import translate
-from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian, packed
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.submap import Became
 from teamslam.team.robot.maps import Cloud
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.digest import NO_MAP
 
@@ -46,24 +48,36 @@ class MessageWriter:
 
     def association(self, sequence: int, stamp_ns: int, became: Became) -> Outgoing:
         """The outcomes of the window's detections without identities."""
-        message = translate.association_message(
-            self.robot, self.incarnation, sequence, stamp_ns, became
+        landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
+        message = m.Association(
+            stamp_ns=stamp_ns,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            stamps=from_stamps(became.stamps),
+            counts=from_ids(became.counts),
+            rows=from_ids(became.rows),
+            landmarks=from_ids(np.where(became.landmarks >= UNNAMED, became.landmarks, landmarks)),
         )
         return Outgoing(ch.ASSOCIATION, self.robot, message)
 
-    def sighting(self, closed: ClosedWindow, each: NodeSighting) -> m.SightingFactor:
-        """The inter-robot measurement from a pose node of the window."""
-        sighting = InterRobotFactor(
-            self.robot,
-            self.incarnation,
-            closed.sequence,
-            each.stamp_ns,
-            each.teammate,
-            each.measurement,
-            each.covariance,
-            each.point,
+    def sighting(self, sequence: int, each: NodeSighting) -> m.SightingFactor:
+        """The inter-robot measurement from a pose node of a window, with the names of its
+        inputs.
+        """
+        return m.SightingFactor(
+            stamp_ns=each.stamp_ns,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            config=self.config,
+            teammate=each.teammate,
+            range=float(each.measurement[0]),
+            bearing=float(each.measurement[1]),
+            covariance=from_floats(packed(each.covariance)),
+            measurements=each.measurements,
+            point=from_floats(each.point) if each.point.any() else b"",
         )
-        return translate.sighting_message(sighting, self.config, each.measurements)
 
     def cloud(self, stamp_ns: int, cloud: Cloud) -> Outgoing:
         """The thinned particles at this time."""
