@@ -3,7 +3,7 @@
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.estimation.hybrid_slam.fastslam import Noise
+from teamslam.team.estimation.models import Noise
 
 STILL = np.zeros(3), np.zeros((3, 3))
 NO_MAP = np.empty(0, np.uint32), np.empty((1, 0, 2)), np.empty((1, 0, 3))

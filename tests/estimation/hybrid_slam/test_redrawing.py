@@ -10,13 +10,12 @@ from teamslam.team import core, translate
 from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
 from teamslam.team.core import landmarks_along_paths
 from teamslam.team.estimation.hybrid_slam import open_window
-from teamslam.team.estimation.hybrid_slam.fastslam import Noise
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.hybrid_slam.window import gaussian
-from teamslam.team.estimation.models import Increment, predicted
+from teamslam.team.estimation.models import Increment, Noise, predicted
 from teamslam.team.estimation.scans import unclaimed
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
