@@ -22,9 +22,9 @@ from teamslam.sim.studies.experiments.experiment import Options, Outcome, Result
 from teamslam.sim.studies.experiments.output import write
 from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
 from teamslam.sim.studies.experiments.shards import Shard, tasks_of
+from teamslam.sim.studies.experiments.sources import sources_of
 from teamslam.sim.studies.experiments.task import ROOTS, Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
-from teamslam.team.sources import sources_of
 
 WORK = "json:loads"
 """A function that a process imports at once."""

@@ -10,8 +10,8 @@ from importlib import metadata
 from platform import python_version
 from typing import Any
 
+from teamslam.sim.studies.experiments.sources import sources_of
 from teamslam.team import core
-from teamslam.team.sources import sources_of
 
 ROOTS = ("teamslam",)
 LIBRARIES = ("numpy", "scipy", "gtsam")
