@@ -3,7 +3,7 @@
     PeerShell, CentreShell            process: bus, clock, file of the set    main.py
       │ handle_sample, tick, answer          ▲ messages to publish
       ▼                                      │
-    PeerRobot, PeerCentre             router: no state of the map             robot.py, centre.py
+    PeerRobot, PeerCentre             router: no state of the map             robot.py, main.py
       │ on Peer                                                               peer.py
       ├──> RobotNode                  the estimator; a centre has none        team/robot
       ├──> PeerNode                   the set, and requests between peers     team/peers

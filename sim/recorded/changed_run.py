@@ -1,13 +1,11 @@
 """Run the recorded team's nodes in memory, on the same measurements with changes."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
 import msgspec
-import numpy as np
 
 from teamslam.sim.in_memory.links import Conditions, Partition
 from teamslam.sim.in_memory.team import run_nodes
@@ -15,25 +13,22 @@ from teamslam.sim.recorded.changes import Changes, Span
 from teamslam.sim.recorded.world import RecordedWorld, Samples
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, with_options
-from teamslam.team import translate
 from teamslam.team.config import (
     MAP,
     Alphas,
-    Exchange,
     MotionModel,
     MotionNoise,
     RobotConfig,
     Sensor,
 )
-from teamslam.team.core import WholeMap, check_packed_covariance
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.map_joining.conditioning import RobotPrior, initial_map, join_submap
-from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.robot.node import RobotNode, robot_node
+from teamslam.team.registry import absence, loaded
+from teamslam.team.robot.node import robot_node
 from teamslam.team.saved_map import read_map
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
+
+UNSAFE_ROBOT = "teamslam.sim.studies.robots.unsafe:unsafe_robot"
+"""Makes a robot that sends the team's map as its own information, which breaks law 1."""
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
@@ -47,7 +42,7 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     world.announce(scenario)
     world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
-    node = unsafe_robot if changes.unsafe_feedback else robot_node
+    node = loaded(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else robot_node
     return list(run_nodes(scenario, world, conditions, node))
 
 
@@ -84,6 +79,9 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
             f"the rule {changed.fusion} {why}: loss, delay, partition, a missing centre "
             "and unsafe feedback are for the rule join"
         )
+    absent = absence(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else None
+    if absent is not None:
+        raise ScenarioError(absent)
     return changed
 
 
@@ -142,68 +140,3 @@ def _motion(motion: MotionModel, factor: float) -> MotionModel:
         left_wheel=motion.left_wheel * factor,
         right_wheel=motion.right_wheel * factor,
     )
-
-
-def unsafe_robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
-    """A robot whose submaps begin with the team's map instead of with zero information.
-
-    The map contains everyone's earlier measurements; each exchange counts them again. The mean
-    hardly moves; the covariance loses its meaning. No scenario can choose it.
-    """
-    return RobotNode(config, exchange, replaced=_with_the_map)
-
-
-def _with_the_map(
-    closed: ClosedWindow, prior: m.Prior | None, submaps: Sequence[LocalMap]
-) -> ClosedWindow:
-    if prior is None:
-        return closed
-    pending = submaps[max(prior.sequence + 1, 0) :]
-    fed = _feed(translate.prior_of(prior), pending, closed.local)
-    return replace(closed, local=fed, sightings=())  # its pose nodes are gone
-
-
-def _feed(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
-    """As `with_prior`; the window alone once the covariance has become singular."""
-    try:
-        fed = with_prior(prior, pending, local)
-        check_packed_covariance(translate.joint_bytes(fed.covariance), len(fed.mean), "covariance")
-    except ValueError:
-        return local.without_nodes
-    return fed
-
-
-def with_prior(prior: RobotPrior, pending: Sequence[LocalMap], local: LocalMap) -> LocalMap:
-    """The window's Gaussian times the team's marginal of its landmarks, both in its start frame.
-
-    `pending` leads from the prior's pose to the start of the window.
-    """
-    whole = prior.whole
-    for each in pending:
-        whole = join_submap(whole, each)
-    fed = join_submap(_express_in_its_pose(whole, local.ids), local)
-    return LocalMap(fed.ids, fed.mean, fed.covariance)
-
-
-def _express_in_its_pose(whole: WholeMap, ids: np.ndarray) -> WholeMap:
-    """The landmarks `ids` of a map in the frame of its pose, which is then zero and certain.
-
-    l' = R(θ)ᵀ (l − p), with its Jacobian.
-    """
-    chosen = np.flatnonzero(np.isin(whole.ids, ids))
-    if not len(chosen):
-        return initial_map(np.zeros(3), None)
-    x, y, heading = whole.mean[:3]
-    c, s = np.cos(heading), np.sin(heading)
-    turn = np.array([[c, s], [-s, c]])
-    J = np.zeros((3 + 2 * len(chosen), len(whole.mean)))
-    mean = np.zeros(len(J))
-    for row, k in enumerate(chosen):
-        rows, columns = slice(3 + 2 * row, 5 + 2 * row), slice(3 + 2 * k, 5 + 2 * k)
-        offset = whole.mean[columns] - (x, y)
-        mean[rows] = turn @ offset
-        J[rows, :2] = -turn
-        J[rows, 2] = np.array([[-s, c], [-c, -s]]) @ offset
-        J[rows, columns] = turn
-    covariance = J @ whole.covariance @ J.T
-    return WholeMap(whole.ids[chosen], mean, 0.5 * (covariance + covariance.T))
