@@ -10,12 +10,15 @@ from teamslam.central.desk.verification.recorded import Identity, Recorded, iden
 from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.pairs import FEEDBACK
+from teamslam.team.registry import loaded
 from teamslam.team.robot.node import robot_node
 from teamslam.team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
+LOCKSTEP = "teamslam.sim.studies.robots.lockstep:in_lockstep"
+"""Recomputes a robot under a rule with feedback."""
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
 """Priors named by the recorded poses, by (incarnation, stamp); None: a pose without prior."""
 WithdrawnAt = Collection[tuple[int, int]]
@@ -88,7 +91,9 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
         robot.take_known_map(log)
         return robot
 
-    lives = _in_lockstep if config.fusion in FEEDBACK else _alone
+    lives = _alone
+    if config.fusion in FEEDBACK:
+        lives = loaded(LOCKSTEP, f"the fusion rule {config.fusion}")
     found: dict[Identity, m.Message] = {}
     for out in lives(log, robot, new):
         found.setdefault(identity(out.key, out.message), out.message)
@@ -181,38 +186,6 @@ def _life(
         if counter >= last or following is None:
             return
         first = following
-
-
-def _in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Messages under a feedback rule, where a robot waits for each round's map: the recorded one.
-
-    Without a recorded map the robot continued without a centre.
-    """
-    fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
-    node = new()
-    incarnations = log.incarnations(robot)
-    inputs: list[m.Message] = [
-        log.measurements[(robot, incarnation)][counter]
-        for incarnation in incarnations
-        for counter in sorted(log.measurements[(robot, incarnation)])
-    ]
-    if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
-        end = m.StreamEnd(
-            robot=robot,
-            incarnation=incarnations[-1],
-            measurements=len(log.measurements[(robot, incarnations[-1])]),
-        )
-        inputs.append(m.End(stamp_ns=0, streams=(end,)))
-    inputs.reverse()
-    while inputs:
-        out = node.given(inputs.pop())
-        yield from out
-        for each in out:
-            if isinstance(each.message, m.MapEstimate):
-                centre = m.Liveliness(
-                    stamp_ns=0, node="central", alive=each.message.exchange in fused
-                )
-                inputs += [fused[each.message.exchange], centre] if centre.alive else [centre]
 
 
 def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
