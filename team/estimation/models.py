@@ -21,7 +21,6 @@ __all__ = [
     "NEAREST_M",
     "Increment",
     "Noise",
-    "acceptable",
     "corrected",
     "increment_of",
     "located",
@@ -123,7 +122,11 @@ Scanned = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarra
 def scanned(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Scanned:
-    """Compute `acceptable` and `corrected` of the same measurements, in one call."""
+    """Mark raw measurements in [min_range, max_range] and in the field of view, and correct them.
+
+    Not finite measurements, those whose corrected range is not positive, and depths beyond OFF_AXIS
+    are not marked.
+    """
     return calibration_of(sensor).correct(ranges, bearings)
 
 
@@ -135,17 +138,6 @@ def corrected(
     A depth is divided by cos(b − optical_axis) too; where that is below OFF_AXIS it is NaN.
     """
     return scanned(sensor, ranges, bearings)[1:]
-
-
-def acceptable(
-    sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
-    """Mark raw measurements in [min_range, max_range] and in the field of view.
-
-    Not finite measurements, those whose corrected range is not positive, and depths beyond OFF_AXIS
-    are not.
-    """
-    return scanned(sensor, ranges, bearings)[0]
 
 
 class Noise(NamedTuple):

@@ -277,7 +277,7 @@ def test_a_depth_along_the_optical_axis_becomes_the_distance():
     np.testing.assert_allclose(ranges, distances)
     np.testing.assert_allclose(bearings, raw - 0.01)
     beside = 0.1 + np.radians([79.0, 81.0, -81.0, 100.0, 180.0])
-    seen = models.acceptable(sensor, np.ones(5), beside)
+    seen = models.scanned(sensor, np.ones(5), beside)[0]
     np.testing.assert_array_equal(seen, [True, False, False, False, False])
 
 
@@ -292,12 +292,12 @@ def test_readings_outside_the_sensors_reach_and_broken_ones_are_not_acceptable()
     sensor = Sensor(min_range=0.5, max_range=10.0, field_of_view=np.pi, range_offset=0.6)
     ranges = np.array([1.0, 0.55, 0.2, 11.0, 1.0, 1.0, np.nan, 1.0])
     bearings = np.array([1.5, 0.0, 0.0, 0.0, 1.7, -2.0, 0.0, np.nan])
-    np.testing.assert_array_equal(models.acceptable(sensor, ranges, bearings), [True] + [False] * 7)
+    np.testing.assert_array_equal(models.scanned(sensor, ranges, bearings)[0], [True] + [False] * 7)
 
 
 def test_an_axis_measurement_of_a_whole_turn_is_in_the_narrowest_view():
     sensor = Sensor(field_of_view=0.1)
-    seen = models.acceptable(sensor, np.ones(3), np.array([2.0 * np.pi, -2.0 * np.pi, np.pi]))
+    seen = models.scanned(sensor, np.ones(3), np.array([2.0 * np.pi, -2.0 * np.pi, np.pi]))[0]
     np.testing.assert_array_equal(seen, [True, True, False])
 
 
