@@ -5,7 +5,10 @@ another name of this machine (DNS rebinding), are refused.
 """
 
 import asyncio
+import errno
 import logging
+import os
+import socket
 import threading
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, contextmanager, nullcontext
@@ -261,13 +264,17 @@ def serving(
     except OSError as error:
         stop.set()  # close a server that already listens
         run()
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            raise ServerError(
+                f"--host {host}: {_reason(error)}; give an address of this machine"
+            ) from error
         what, number, option = (
             ("Foxglove", foxglove_port, "--foxglove-port")
             if servers
             else ("the page", port, "--port")
         )
         raise ServerError(
-            f"can not serve {what} at {host}:{number}: {error.strerror}; choose another {option}, "
+            f"can not serve {what} at {host}:{number}: {_reason(error)}; choose another {option}, "
             "0 for any free one"
         ) from error
     loop = runner.get_loop()
@@ -277,6 +284,12 @@ def serving(
     finally:
         loop.call_soon_threadsafe(stop.set)
         thread.join(5.0)
+
+
+def _reason(error: OSError) -> str:
+    """The system's words for an error; those of asyncio repeat the address."""
+    number = error.errno or 0
+    return os.strerror(number) if number > 0 else error.strerror or str(error)
 
 
 def _port_of(server: Server) -> int:

@@ -315,10 +315,21 @@ def test_a_port_that_is_taken_is_told_with_a_remedy(log):
         port = other.getsockname()[1]
         for ports in ((port, 0), (0, port)):
             with (
-                pytest.raises(ServerError, match=rf":{port}: .*choose another --"),
+                pytest.raises(
+                    ServerError, match=rf":{port}: Address already in use; choose another --"
+                ),
                 session(log, "127.0.0.1", *ports, growing=False),
             ):
                 pass
+
+
+@pytest.mark.parametrize("host", ["nowhere.invalid", "192.0.2.1"])
+def test_an_address_that_is_not_of_this_machine_is_told_by_its_option(log, host):
+    with (
+        pytest.raises(ServerError, match=rf"--host {host}: .*; give an address of this machine"),
+        session(log, host, 0, None, growing=False),
+    ):
+        pass
 
 
 def test_a_log_that_comes_later_is_shown_when_it_is_there(log, tmp_path):
