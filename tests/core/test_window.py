@@ -84,6 +84,24 @@ def test_a_number_that_is_not_finite_is_refused(place, error, bad):
     assert bytes_of(window) == kept
 
 
+@pytest.mark.parametrize("is_redrawn", [False, True])
+def test_landmarks_solved_at_earlier_keyframes_are_those_that_are_solved_at_the_end(is_redrawn):
+    rng = np.random.default_rng(3)
+    asked, unasked = core.Window(M, CONSTANT), core.Window(M, CONSTANT)
+    for k in range(12):
+        ids = np.flatnonzero(rng.random(5) < 0.5).astype(np.uint32)
+        n = len(ids)
+        seen = ids, rng.uniform(2.0, 9.0, n), rng.uniform(-1.0, 1.0, n), np.empty((n, 0))
+        uniform = float(rng.random()) if k % 3 == 2 else None
+        for window in (asked, unasked):
+            window.advance(MOTION, COVARIANCE, *seen, uniform, NORMALS)
+        asked.run()
+    for window in (asked, unasked) if is_redrawn else ():
+        _, logs, _, means, covariances = window.particles()
+        window.replace(np.ascontiguousarray(window.paths()[:, ::-1]), logs, means, covariances)
+    assert bytes_of(asked) == bytes_of(unasked)
+
+
 def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one():
     window, indefinite = opened(), np.diag([1.0, -1.0, 1.0])
     kept = bytes_of(window)
