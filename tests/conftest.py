@@ -30,7 +30,7 @@ settings.load_profile("repeatable")
 DEFECTS = Path(__file__).with_name("open_defects.txt")
 """Names of the tests that fail because of known defects."""
 
-install_import_hook(["teamslam"], f"{tests.shapes.__name__}.checked")
+install_import_hook(tests.shapes.modules_with_shapes(), f"{tests.shapes.__name__}.checked")
 
 
 @pytest.hookimpl(tryfirst=True)

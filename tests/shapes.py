@@ -1,13 +1,17 @@
-"""The checker of types and shapes that tests/conftest.py puts around every function of ours.
+"""The checker of types and shapes that tests/conftest.py puts around functions on arrays.
+
+Modules without arrays are left to mypy: to wrap their functions takes a sixth of a worker's start.
 
 An int is taken where a float is announced, as mypy does. `Self` is not looked at: beartype knows it
 in decorated classes only, and the import hook decorates their methods one by one.
 """
 
 import inspect
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from beartype import BeartypeConf, FrozenDict, beartype
@@ -21,8 +25,21 @@ A check takes longer than most functions, and a test that calls one half a milli
 same shapes, learns nothing from the others.
 """
 _CONFIGURATION = BeartypeConf(is_pep484_tower=True, hint_overrides=FrozenDict({Self: Any}))
+ROOT = Path(__file__).parents[1]
+SHAPES = re.compile(r"\bshapes import\b|\bPose\b")
+"""How a module names shapes: those of `team/shapes.py`, or the pose's."""
 _calls: Counter[tuple[str, str]] = Counter()
 _through: list[Any] = []
+
+
+def modules_with_shapes() -> list[str]:
+    """Names of the modules whose functions state shapes of arrays."""
+    return [
+        ".".join(("teamslam", *path.relative_to(ROOT).with_suffix("").parts))
+        for package in ("team", "central", "sim")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if SHAPES.search(path.read_text("utf-8"))
+    ]
 
 
 def begin_test() -> None:
