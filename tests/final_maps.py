@@ -10,7 +10,7 @@ NEVER_S = 1e6
 
 
 def final_only(scenario: Scenario) -> Scenario:
-    """The scenario without running maps and poses, which take more than half of a run.
+    """The scenario without running maps but the first, and without poses: half of a run's time.
 
     The final map is that of the set of submaps, whatever was published before (law 2).
     """

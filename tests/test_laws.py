@@ -34,6 +34,7 @@ from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import NO_MAP, digest_of
 from tests import build
+from tests.final_maps import final_only
 from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
@@ -259,6 +260,18 @@ def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_ma
         out += node.handle(message, 0)
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == expected_final()
+
+
+def test_the_final_map_does_not_depend_on_running_maps_and_poses():
+    """Tests that read the final map alone publish neither."""
+    maps, running = [], []
+    for scenario in (thesis(), final_only(thesis())):
+        samples = list(run_team(scenario, streams_of(scenario)))
+        fused = final_map(samples)
+        maps.append((fused.ids, fused.means, fused.covariance))
+        running.append(sum(each.key == ch.FUSED_MAP.key() for each in samples))
+    assert maps[0] == maps[1]
+    assert running[0] > 1 >= running[1]
 
 
 # Law 3.
