@@ -22,7 +22,9 @@ from teamslam.team import translate
 from teamslam.team.config import GNSS
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
+    NO_OWN,
     Contribution,
+    OwnBiases,
     Stream,
     is_map,
     named,
@@ -64,11 +66,21 @@ class Members:
         self._order: list[int] = []
         self._sightings: dict[Key, tuple[InterRobotFactor, ...]] = {}
         self._digests: dict[Key, bytes] = {}
+        self._own: dict[Key, OwnBiases] = {}
         self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
 
-    def add(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
-        """File a submap, named by `digest`, with the `sightings` from it; return its tick."""
+    def add(
+        self,
+        submap: Submap,
+        digest: bytes,
+        sightings: Sequence[SightingFactor],
+        own: OwnBiases = NO_OWN,
+    ) -> int:
+        """File a submap, named by `digest`, with the `sightings` from it; return its tick.
+
+        own: the errors of single robots in a saved map.
+        """
         key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
         tick = self.tick_of(submap.stamp_ns)
         if tick not in self._ticks:
@@ -78,6 +90,8 @@ class Members:
         self._digests[key] = digest
         if sightings:
             self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
+        if own.errors:
+            self._own[key] = own
         self._made.pop(key, None)
         self._raised.discard(key)
         self._named = {at: each for at, each in self._named.items() if each[0] < tick}
@@ -112,6 +126,10 @@ class Members:
             found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
             local = found.local
             if is_map(found.stream):
+                own = self._own.get(key, NO_OWN)
+                if own.errors:
+                    local, by_own = own.given(local)
+                    found = replace(found, own=own, by_own=by_own)
                 local = replace(local, covariance=local.covariance / self._factor)
             else:
                 local = with_least_spread(local, self._least_sigma)
@@ -186,13 +204,19 @@ class FoldInputs:
         """Add a stream's initial pose, before its first submap."""
         self._starts[(start.robot, start.incarnation)] = start
 
-    def add_submap(self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor]) -> int:
+    def add_submap(
+        self,
+        submap: Submap,
+        digest: bytes,
+        sightings: Sequence[SightingFactor],
+        own: OwnBiases = NO_OWN,
+    ) -> int:
         """Add a submap with the inter-robot measurements from it, all named by `digest`; return the
-        first tick that this changes.
+        first tick that this changes. own: the errors of single robots in a saved map.
 
         The first fix adds the station, before all of the team's time.
         """
-        tick = self._members.add(submap, digest, sightings)
+        tick = self._members.add(submap, digest, sightings, own)
         self.robots.add(submap.robot)
         self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
         if not self._has_station and any(each.teammate == GNSS for each in sightings):

@@ -11,6 +11,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.fixes import fix_warnings
 from teamslam.central.fused_map import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
+from teamslam.central.saved_maps import sensor_warnings
 from teamslam.central.sent_priors import in_main_island
 from teamslam.central.survey import survey_warnings
 from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
@@ -192,6 +193,7 @@ def reasons(
         *(words for words in fold.warnings if not words.startswith(RIVAL)),
         *(survey_warnings(fold) if fold.has_maps else ()),
         *(fix_warnings(fold) if fold.has_maps else ()),
+        *(sensor_warnings(fold) if fold.has_maps else ()),
         *_lost(shown),
         *_repeated(shown),
         *_left_out(fold, shown, landmark_submaps),

@@ -1,7 +1,7 @@
 """Saved maps and the fold: save its final map, and list what has changed since earlier days."""
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib import metadata
 
 import numpy as np
@@ -10,7 +10,7 @@ from teamslam.team import core, translate
 from teamslam.team.config import BIASES, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.contribution import is_absolute, is_map
+from teamslam.team.estimation.contribution import RobotBias, is_absolute, is_map, named, whole_of
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import Island
@@ -21,14 +21,21 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     SEQUENTIAL,
     displacements,
     maps_of,
+    replaced_sensors,
 )
+from teamslam.team.estimation.map_joining.submap_graph import DRIFT
 from teamslam.team.geodesy import Datum
 from teamslam.team.saved_map import datum_bytes
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
 
 LEAST_SUBMAPS = 2
 """Submaps that place a landmark elsewhere, for it to have moved while its former place is empty."""
+
+
+REMAINDER = 1e-3
+"""Part of a prior that stays in the evidence about an error, which some map may not determine."""
 
 
 class NothingToSaveError(ValueError):
@@ -47,9 +54,13 @@ def save_map(
     firsts: digest of the first submap of each robot's stream in the map, by which maps with
     measurements in common are recognised. datum: of the map's frame.
 
-    With the biases c that all sensors share, the landmarks x are N(x̄ + S (c − c̄), P − S C Sᵀ) given
-    c, with S = Cov(x, c) C⁻¹. Landmarks that are gone are left out. One that moved by e, which
-    chance explains at SEQUENTIAL, may be an error of today: its covariance is P_ii + e eᵀ.
+    With the biases c that all sensors share, landmarks and errors of single robots, y = (o, x), are
+    N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. What the measurements tell of
+    (c, o) is saved beside it without the priors, which the later day's settings give again: each
+    counts once, and Student's t, which the joint Gaussian only approximates, keeps its tails.
+
+    Landmarks that are gone are left out. One that moved by e, which chance explains at SEQUENTIAL,
+    may be an error of today: its covariance is P_ii + e eᵀ.
     """
     gone = {each.landmark for each in fused.changes if each.state == "gone"}
     chosen = [id_ for id_ in ids(fused.ids, "ids").tolist() if id_ not in gone]
@@ -59,11 +70,16 @@ def save_map(
         )
     island = fold.main
     biases = tuple(bias for bias in sorted(BIASES) if bias in island.graph.common)
-    mean, P = joint(island, [island.graph.common[bias] for bias in biases], chosen)
-    k = len(biases)
+    own = _own_errors(island)
+    nodes = [*(island.graph.common[bias] for bias in biases), *own.values()]
+    likeliest, evidence = _evidence(island, nodes if own else ())
+    mean, P = joint(island, nodes, chosen)
+    k, K = len(biases), len(own)
     rows = dense.product(information(P[:k, :k], "the common biases"), P[:k, k:])
     means = mean[k:] - dense.product(mean[:k], rows)
-    given = P[k:, k:] - dense.product(P[k:, :k], rows)
+    among = P[k:, k:] - dense.product(P[k:, :k], rows)
+    among = 0.5 * (among + among.T)
+    given = among[K:, K:]
     for each in fused.changes:
         if each.state == "moved" and each.chi2 < chi2_limit(2, SEQUENTIAL):
             at, e = 2 * chosen.index(each.landmark), np.array([each.dx, each.dy])
@@ -77,17 +93,68 @@ def save_map(
         stamp_ns=max([fused.stamp_ns, *(each.stamp_ns for each in earlier)]),
         name=name,
         ids=from_ids([*numbers, *range(UNNAMED, UNNAMED + len(unnamed))]),
-        means=from_floats(means),
-        covariance=translate.joint_bytes(0.5 * (given + given.T)),
+        means=from_floats(means[K:]),
+        covariance=translate.joint_bytes(given),
         biases=biases,
-        sensitivity=from_floats(rows),
+        sensitivity=from_floats(rows[:, K:]),
         counts=from_ids(_counts(island, chosen, before)),
         frame="" if frame is None else translate.frame_name(*frame),
         sets=tuple(sorted({*firsts, *(one for each in earlier for one in each.sets)})),
         software=metadata.version("teamslam"),
         core=core.digest[:16],
         datum=datum_bytes(datum),
+        own=tuple(m.RobotBias(robot=robot, bias=bias) for robot, bias in own),
+        own_means=from_floats(means[:K]),
+        own_covariance=translate.joint_bytes(among[:K, :K]),
+        own_cross=from_floats(among[:K, K:]),
+        own_sensitivity=from_floats(rows[:, :K]),
+        likeliest=from_floats(likeliest),
+        evidence=translate.joint_bytes(evidence),
     )
+
+
+def _own_errors(island: Island) -> dict[RobotBias, int]:
+    """Return the nodes of the errors of today's robots that last, each of the robot's last stream.
+
+    Those of robots of earlier days alone stay part of the landmarks' covariance.
+    """
+    found: dict[RobotBias, int] = {}
+    for (stream, bias), node in sorted(
+        island.graph.biases.items(), key=lambda each: (whole_of(each[0][0]), each[0])
+    ):
+        if bias in DRIFT and not is_map(stream):
+            found[RobotBias(stream[0], bias)] = node
+    return dict(sorted(found.items())[: m.MOST_OWN])
+
+
+def _evidence(
+    island: Island, nodes: Sequence[int]
+) -> tuple[Float[np.ndarray, " E"], Float[np.ndarray, "E E"]]:
+    """Compute the likelihood N(mean, J⁻¹) of some biases by the island's measurements: (mean, J).
+
+    J = Σ⁻¹ − D with their posterior covariance Σ and the information D of their priors, which are
+    about 0. The error of an earlier day that a bias drifted from is eliminated from J without its
+    prior, too. A part REMAINDER of D stays, so that J is positive definite.
+    """
+    if not nodes:
+        return np.zeros(0), np.zeros((0, 0))
+    graph, weights = island.graph, island.estimate.prior_weights
+    ties = [each.nodes for each in graph.priors if each.is_of_robot and len(each.nodes) > 1]
+    both = [*nodes, *(before for own, before in ties if own in nodes)]
+    place = {node: k for k, node in enumerate(both)}
+    mean, covariance = joint(island, both, [])
+    J = information(covariance, "the errors of the sensors")
+    slope = dense.product(J, mean)
+    for prior, weight in zip(graph.priors, weights.tolist(), strict=True):
+        k = place.get(prior.nodes[0])
+        if k is not None and len(prior.nodes) == 1:
+            J[k, k] -= (1.0 - REMAINDER) * weight * prior.information[0, 0]
+    E, what = len(nodes), "the evidence about the errors of the sensors"
+    gain = dense.product(information(J[E:, E:], what), J[E:, :E])
+    evidence = J[:E, :E] - dense.product(J[:E, E:], gain)
+    evidence = 0.5 * (evidence + evidence.T)
+    slope = slope[:E] - dense.product(slope[E:], gain)
+    return dense.product(information(evidence, what), slope), evidence
 
 
 def _counts(
@@ -100,6 +167,19 @@ def _counts(
         count[submap.landmarks] += 1 if saved is None else ids(saved.counts, "counts")
     node_of = island.graph.landmarks
     return [max(1, int(count[node_of[id_]])) if id_ in node_of else 1 for id_ in chosen]
+
+
+def sensor_warnings(fold: Fold) -> Iterator[str]:
+    """Warn of robots whose own errors are not those that a saved map has of them."""
+    if fold.main_key is None:
+        return
+    for each in replaced_sensors(fold.main):
+        robot, bias = each.error
+        yield (
+            f"{robot}: its {bias} is {each.value:.3g} and was {each.before:.3g} in "
+            f"{named(each.saved)} (chi² {each.chi2:.0f}): a sensor, wheel or robot was exchanged; "
+            "the saved value has no weight"
+        )
 
 
 def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange, ...]:

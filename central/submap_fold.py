@@ -35,7 +35,8 @@ from teamslam.central.survey import datum_of
 from teamslam.central.tick_fold import TickFold
 from teamslam.central.unnamed_landmarks import verdict_of
 from teamslam.team import translate
-from teamslam.team.estimation.contribution import is_map, whole_of
+from teamslam.team.config import MAP
+from teamslam.team.estimation.contribution import NO_OWN, is_map, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.store import Stream, SubmapStore
@@ -159,14 +160,18 @@ class SubmapFold:
             s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
         ):
             filed, localises = self._filed.get(stream, 0), self.config.localise
-            start = translate.start_of(store.start(stream))
+            start, own = translate.start_of(store.start(stream)), NO_OWN
+            saved = store.maps.get(stream[0].removeprefix(MAP)) if is_map(stream) else None
+            if saved is not None:
+                own = translate.own_biases_of(saved)
             if start is not None and not filed and not localises:
                 ticks.add_start(start)
             for submap in chains[stream][filed:]:
                 sightings = store.sightings(submap)
-                digest = digest_of(*map(encoded, (submap, *sightings)))
+                named = (submap, saved) if own.errors and saved else (submap, *sightings)
+                digest = digest_of(*map(encoded, named))
                 taken = restricted(submap, store.maps.values()) if localises else submap
-                ticks.add_submap(taken, digest, sightings)
+                ticks.add_submap(taken, digest, sightings, own)
                 self._filed[stream] = submap.sequence + 1
 
     @property

@@ -42,7 +42,14 @@ from teamslam.central.withdrawal import (
 )
 from teamslam.team.config import BIASES
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import Contribution, Stream, is_absolute, whole_of
+from teamslam.team.estimation.contribution import (
+    NO_OWN,
+    Contribution,
+    OwnBiases,
+    Stream,
+    is_absolute,
+    whole_of,
+)
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
@@ -127,13 +134,19 @@ class TickFold:
         self._inputs.add_start(start)
 
     def add_submap(
-        self, submap: Submap, digest: bytes, sightings: Sequence[SightingFactor] = ()
+        self,
+        submap: Submap,
+        digest: bytes,
+        sightings: Sequence[SightingFactor] = (),
+        own: OwnBiases = NO_OWN,
     ) -> None:
         """Add a submap with the inter-robot measurements from it, all named by `digest`.
 
+        own: the errors of single robots in a saved map.
+
         The fold is rolled back to before the submap's tick.
         """
-        tick = self._inputs.add_submap(submap, digest, sightings)
+        tick = self._inputs.add_submap(submap, digest, sightings, own)
         if submap.robot not in self._gone or tick <= self._conviction.at:
             self.roll_back(tick)
         else:

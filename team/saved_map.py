@@ -4,6 +4,7 @@ The file is one message (`teamslam.team.wire.messages.SavedMap`), checked when i
 wire.
 """
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,8 @@ def map_name(text: str) -> str:
 
 
 def map_figures(saved: m.SavedMap) -> dict[str, Any]:
-    """Figures of a saved map for people and JSON: provenance, and each landmark with its own
-    standard deviations, the shared errors taken as zero.
+    """Figures of a saved map for people and JSON: provenance, the robots' own errors, and each
+    landmark with its own standard deviations, the shared errors taken as zero.
     """
     numbers = ids(saved.ids, "ids").tolist()
     points = floats(saved.means, "means").reshape(-1, 2).tolist()
@@ -149,6 +150,7 @@ def map_figures(saved: m.SavedMap) -> dict[str, Any]:
         "stamp_s": saved.stamp_ns * 1e-9,
         "sets": [each.hex() for each in saved.sets],
         "biases": list(saved.biases),
+        "own": _own_figures(saved),
         **({} if datum is None else {"datum": msgspec.to_builtins(datum)}),
         "software": saved.software,
         "core": saved.core,
@@ -167,3 +169,13 @@ def map_figures(saved: m.SavedMap) -> dict[str, Any]:
             )
         ],
     }
+
+
+def _own_figures(saved: m.SavedMap) -> list[dict[str, Any]]:
+    K = len(saved.own)
+    means = floats(saved.own_means, "own_means").tolist()
+    variances = np.diag(unpacked(floats(saved.own_covariance, "own_covariance"), K)).tolist()
+    return [
+        {"robot": each.robot, "bias": each.bias, "value": value, "sigma": math.sqrt(variance)}
+        for each, value, variance in zip(saved.own, means, variances, strict=True)
+    ]

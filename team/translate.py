@@ -7,7 +7,14 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream
+from teamslam.team.estimation.contribution import (
+    NO_OWN,
+    Contribution,
+    InitialPoseFactor,
+    OwnBiases,
+    RobotBias,
+    Stream,
+)
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
@@ -234,6 +241,22 @@ def contribution_of(message: m.Submap) -> Contribution:
         message.sequence,
         message.stamp_ns,
         local_map_of(message),
+    )
+
+
+def own_biases_of(saved: m.SavedMap) -> OwnBiases:
+    """Read the errors of single robots in a saved map."""
+    K = len(saved.own)
+    if not K:
+        return NO_OWN
+    return OwnBiases(
+        tuple(RobotBias(each.robot, each.bias) for each in saved.own),
+        floats(saved.own_means, "own_means").astype(np.float64),
+        unpacked(floats(saved.own_covariance, "own_covariance"), K),
+        floats(saved.own_cross, "own_cross").astype(np.float64).reshape(K, -1),
+        floats(saved.own_sensitivity, "own_sensitivity").astype(np.float64).reshape(-1, K),
+        floats(saved.likeliest, "likeliest").astype(np.float64),
+        unpacked(floats(saved.evidence, "evidence"), K + len(saved.biases)),
     )
 
 

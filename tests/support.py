@@ -451,6 +451,16 @@ def examples() -> Iterator[m.Message]:
         software="1.2.3",
         core="0123456789abcdef",
         datum=from_floats([48.5, 9.25, 512.0]),
+        own=(
+            m.RobotBias(robot="alpha", bias="range_offset"),
+            m.RobotBias(robot="beta", bias="forward_scale"),
+        ),
+        own_means=from_floats([0.5, -0.25]),
+        own_covariance=from_floats([2.0, 0.5, 1.0]),
+        own_cross=from_floats([0.125, 0.0, -0.125, 0.25, 0.0, 0.125, 0.0, -0.25]),
+        own_sensitivity=from_floats([1.0, -2.0]),
+        likeliest=from_floats([0.25, 0.5, -0.25]),
+        evidence=packed(spd(3)),
     )
     yield build.prior(
         stamp_ns=9_000,

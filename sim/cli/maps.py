@@ -113,11 +113,14 @@ def show(
     saved = saved_maps([file])[0]
     figures = map_figures(saved)
     write_json(json_file, figures)
-    landmarks = figures.pop("landmarks")
+    landmarks, own = figures.pop("landmarks"), figures.pop("own")
     for key, value in figures.items():
         if value or not isinstance(value, list | tuple):
             is_list = isinstance(value, list | tuple)
             typer.echo(f"# {key}: {', '.join(map(str, value)) if is_list else value}")
+    for each in own:
+        value, sigma = (f"{each[key]:.4g}" for key in ("value", "sigma"))
+        typer.echo(f"# {each['bias']} of {each['robot']}: {value} ± {sigma}")
     placed = "latitude_deg" in landmarks[0]
     typer.echo("landmark,x,y,sigma_x,sigma_y,submaps" + ",latitude,longitude" * placed)
     for each in landmarks:

@@ -353,11 +353,11 @@ class SubmapGraph:
 
     offset: of each node's first number in the state, and the state's length. fixed: nodes that are
     constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,
-    measurement, information). priors: (node, mean, information, whether it is of one robot's bias).
+    measurement, information). priors: (nodes, mean, information, whether it is of one robot's bias).
     Raises ValueError where a factor does not fit its nodes.
     """
 
-    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[int, NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
+    def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[NDArray[numpy.int64], NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
 
     @property
     def pattern(self) -> Pattern:

@@ -1,7 +1,7 @@
 """The contents of the team's map: submaps with their place in the set, and initial poses."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
@@ -10,8 +10,9 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import GNSS, MAP, SURVEY, Bias
+from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import information
-from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from teamslam.team.shapes import Bool, Float, UInt32
 
 Stream: TypeAlias = tuple[str, int]
@@ -108,11 +109,68 @@ class Observation(NamedTuple):
     distinct: Bool[np.ndarray, "L L"]
 
 
+class RobotBias(NamedTuple):
+    """An error of one robot, by its name, on the days of a saved map."""
+
+    robot: str
+    bias: Bias
+
+
+@dataclass(frozen=True, eq=False)
+class OwnBiases:
+    """Errors o of single robots in a saved map: jointly with its landmarks x, given the errors b
+    that all robots share,
+
+        o ~ N(mean + Gᵀ b, covariance),   cov(o, x) = cross.
+
+    errors: ascending. by_common: G, a row for each of the map's `biases`. The map's measurements
+    alone, without the priors of (b, o), have the likelihood N(likeliest, evidence⁻¹) of (b, o).
+    """
+
+    errors: tuple[RobotBias, ...] = ()
+    mean: Float[np.ndarray, " K"] = field(default_factory=lambda: np.empty(0))
+    covariance: Float[np.ndarray, "K K"] = field(default_factory=lambda: np.empty((0, 0)))
+    cross: Float[np.ndarray, "K n"] = field(default_factory=lambda: np.empty((0, 0)))
+    by_common: Float[np.ndarray, "B K"] = field(default_factory=lambda: np.empty((0, 0)))
+    likeliest: Float[np.ndarray, " E"] = field(default_factory=lambda: np.empty(0))
+    evidence: Float[np.ndarray, "E E"] = field(default_factory=lambda: np.empty((0, 0)))
+
+    @cached_property
+    def information(self) -> Float[np.ndarray, "K K"]:
+        """covariance⁻¹. Raises NotACovarianceError."""
+        return information(self.covariance, "the robots' own errors in a saved map")
+
+    def given(self, local: LocalMap) -> tuple[LocalMap, Float[np.ndarray, "K m"]]:
+        """Condition the saved map's submap on the errors: x | o, b ~ N(x̄ + Sᵀ o + …, P − crossᵀ S)
+        with S = covariance⁻¹ cross; return it at o = 0, and S over its mean.
+        """
+        poses = len(local.mean) - self.cross.shape[1]
+        rows = np.hstack(
+            [np.zeros((len(self.errors), poses)), dense.product(self.information, self.cross)]
+        )
+        covariance = local.covariance.copy()
+        covariance[poses:, poses:] -= dense.product(self.cross.T, rows[:, poses:])
+        sensitivity = local.sensitivity
+        if len(local.biases):
+            sensitivity = sensitivity - dense.product(self.by_common, rows)
+        given = replace(
+            local,
+            mean=local.mean - dense.product(self.mean, rows),
+            covariance=0.5 * (covariance + covariance.T),
+            sensitivity=sensitivity,
+        )
+        return given, rows
+
+
+NO_OWN = OwnBiases()
+
+
 @dataclass(frozen=True, eq=False)
 class Contribution:
     """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0.
 
-    A saved map is a submap, too, with landmarks only: its end pose is at its start.
+    A saved map is a submap, too, with landmarks only: its end pose is at its start. own, by_own:
+    the errors of single robots in it, and ∂mean/∂o of `local`, which is given at o = 0.
     """
 
     robot: str
@@ -120,6 +178,8 @@ class Contribution:
     sequence: int
     end_ns: int
     local: LocalMap
+    own: OwnBiases = NO_OWN
+    by_own: Float[np.ndarray, "K m"] = field(default_factory=NO_COLUMNS.copy)
 
     @property
     def stream(self) -> Stream:

@@ -108,7 +108,7 @@ EXAMPLES = {
     "fixed": lambda: np.array([True, False, False, False, False]),
     "submaps": lambda: [(made("SubmapFactor"), np.arange(5))],
     "sightings": lambda: [(0, 1, np.array([1.0, 0.1]), covariance(2), POINT)],
-    "priors": lambda: [(4, np.zeros(1), np.ones((1, 1)), True)],
+    "priors": lambda: [(np.array([4]), np.zeros(1), np.ones((1, 1)), True)],
     **{
         f"Estimate.quadratic.{each}": lambda: np.array([True])
         for each in ("submaps", "sightings", "priors")

@@ -255,11 +255,10 @@ def _sightings(graph: Graph) -> Iterator[_Sightings]:
 
 
 def _priors(graph: Graph) -> Iterator[_Priors]:
-    for node, mean, information in graph.priors:
-        whitening = np.linalg.cholesky(information).T
-        yield _Priors(
-            whitening[None], mean[None], (graph.offset[node] + np.arange(len(mean)))[None]
-        )
+    for each in graph.priors:
+        whitening = np.linalg.cholesky(each.information).T
+        at = graph.offset[each.nodes[0]] + np.arange(len(each.mean))
+        yield _Priors(whitening[None], each.mean[None], at[None])
 
 
 def _whiten(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:

@@ -15,7 +15,7 @@ namespace {
 using Changed = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using SubmapFactor = std::tuple<std::shared_ptr<Submap>, std::vector<Index>>;
 using Sighting = std::tuple<Index, Index, Values, Table, Values>;
-using Prior = std::tuple<Index, graph::Numbers, Matrix, bool>;
+using Prior = std::tuple<std::vector<Index>, graph::Numbers, Matrix, bool>;
 using Rows = std::optional<Matrix>;
 using Marks = std::vector<bool>;
 
@@ -70,9 +70,9 @@ graph::Sighting made_sighting(const Sighting& from) {
 }
 
 graph::Prior made_prior(const Prior& from) {
-  const auto& [node, mean, information, is_of_bias] = from;
+  const auto& [nodes, mean, information, is_of_bias] = from;
   check(is_square(information, mean.size()), "a prior's matrix has its mean's size");
-  return {node, mean, information, is_of_bias};
+  return {nodes, mean, information, is_of_bias};
 }
 
 std::shared_ptr<Graph> made_graph(const std::vector<Index>& offset, const Marks& fixed, const std::vector<SubmapFactor>& submaps,
@@ -193,7 +193,7 @@ void bind_graph(nb::module_& m) {
                     "The factor graph of one frame, independent of the state.\n\n"
                     "offset: of each node's first number in the state, and the state's length. fixed: nodes that are\n"
                     "constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,\n"
-                    "measurement, information). priors: (node, mean, information, whether it is of one robot's bias).\n"
+                    "measurement, information). priors: (nodes, mean, information, whether it is of one robot's bias).\n"
                     "Raises ValueError where a factor does not fit its nodes.")
       .def(nb::new_(&made_graph), "offset"_a, "fixed"_a, "submaps"_a, "sightings"_a, "priors"_a, "condensed"_a.none())
       .def_prop_ro("pattern", [](const Graph& self) { return std::const_pointer_cast<sparse::Pattern>(self.pattern()); },

@@ -165,7 +165,7 @@ Numbers Estimate::sighting_weights() const {
 const std::vector<Prior::Terms>& Estimate::prior_terms() const {
   return once(prior_terms_, [&] {
     std::vector<Prior::Terms> found;
-    for (const Prior& each : graph_->priors) found.push_back(each.terms(&state_[graph_->offset[each.node]]));
+    for (const Prior& each : graph_->priors) found.push_back(each.terms(state_, graph_->offset));
     return found;
   });
 }
@@ -274,11 +274,11 @@ const std::pair<Numbers, Numbers>& Estimate::normal_equations() const {
     const Numbers weights = prior_weights();
     for (std::size_t k = 0; k < weights.size(); k++) {
       const Prior& each = graph.priors[k];
-      const std::size_t size = each.mean.size(), at = graph.diagonal_of(each.node);
-      for (std::size_t i = 0; i < size; i++) {
-        gradient[graph.offset[each.node] + i] += weights[k] * prior_terms()[k].slope[i];
-        for (std::size_t j = 0; j < size; j++) values[at + i * size + j] += weights[k] * each.information[i][j];
-      }
+      std::size_t row = 0;
+      for (const Index node : each.nodes)
+        for (std::size_t p = 0, size = graph.size_of(node); p < size; p++, row++)
+          if (!graph.fixed[node]) gradient[graph.offset[node] + p] += weights[k] * prior_terms()[k].slope[row];
+      graph.add(graph.of_prior(k), each.nodes, each.information, weights[k], values);
     }
     return made;
   });
@@ -363,11 +363,13 @@ Numbers Estimate::explained_by_sightings() const {
 
 Numbers Estimate::explained_by_priors() const {
   Numbers found;
-  for (const Prior& each : graph_->priors) {
-    const std::size_t size = each.mean.size(), at = graph_->diagonal_of(each.node);
+  for (std::size_t k = 0; k < graph_->priors.size(); k++) {
+    const Prior& each = graph_->priors[k];
+    const std::size_t size = each.mean.size();
+    const dense::Matrix spread = graph_->among(graph_->of_prior(k), each.nodes, size, selected_covariance());
     Numbers terms(size * size);
     for (std::size_t i = 0; i < size * size; i++)
-      terms[i] = graph_->fixed[each.node] ? 0.0 : each.information[i / size][i % size] * selected_covariance()[at + i];
+      terms[i] = each.information[i / size][i % size] * spread[i / size][i % size];
     found.push_back(pairwise_sum(terms));
   }
   return found;
@@ -429,9 +431,8 @@ Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
   for (std::size_t k = 0; k < graph.priors.size(); k++) {
     if (!marked.priors[k]) continue;
     const Prior& each = graph.priors[k];
-    const Index of[] = {each.node};
-    each_number(of, [&](std::size_t i, std::size_t row) { g[i] += prior_weights[k] * prior_terms()[k].slope[row]; });
-    add_matrix(of, prior_weights[k], each.information);
+    each_number(each.nodes, [&](std::size_t i, std::size_t row) { g[i] += prior_weights[k] * prior_terms()[k].slope[row]; });
+    add_matrix(each.nodes, prior_weights[k], each.information);
   }
   return sum;
 }

@@ -77,12 +77,13 @@ dense::Matrix Sighting::hessian(const Linear& at) const {
   return H;
 }
 
-Prior::Terms Prior::terms(const double* value) const {
-  Terms found;
-  double r[3] = {};
+Prior::Terms Prior::terms(Values state, Indices offset) const {
   const std::size_t size = mean.size();
-  for (std::size_t i = 0; i < size; i++) r[i] = value[i] - mean[i];
-  if (size == 3) r[2] = se2::wrapped(r[2]);
+  Terms found{Numbers(size), 0.0};
+  Numbers r(size);
+  for (std::size_t i = 0; i < size; i++)
+    r[i] = state[nodes.size() == 1 ? offset[nodes[0]] + i : offset[nodes[i]]] - mean[i];
+  if (nodes.size() == 1 && size == 3) r[2] = se2::wrapped(r[2]);
   for (std::size_t i = 0; i < size; i++) {
     for (std::size_t j = 0; j < size; j++) found.slope[i] += information[i][j] * r[j];
     found.chi2 += r[i] * found.slope[i];
@@ -116,7 +117,12 @@ Graph::Graph(std::vector<Index> offsets, std::vector<bool> constants, std::vecto
   };
   for (const Sighting& each : sightings)
     require(has(each.observer, 3) && has(each.teammate, 3), "an inter-robot measurement is between two poses");
-  for (const Prior& each : priors) require(has(each.node, each.mean.size()), "a prior has its node's size");
+  for (const Prior& each : priors) {
+    const std::size_t count = each.nodes.size();
+    require(count > 0 && (count == 1 || count == each.mean.size()), "a prior of several nodes is of biases");
+    for (const Index node : each.nodes)
+      require(has(node, count == 1 ? each.mean.size() : 1), "a prior has the size of its nodes");
+  }
   if (!condensed) return;
   for (const Index node : condensed->nodes) {
     require(node >= 0 && std::size_t(node) < nodes(), "a condensed factor's member is no node of the graph");
@@ -149,6 +155,7 @@ Graph::Blocks Graph::make_blocks() const {
   for (const Joined& each : submaps) add_pairs(each.nodes);
   for (const Sighting& each : sightings) add_pairs(std::array{each.observer, each.teammate});
   if (condensed) add_pairs(condensed->nodes);
+  for (const Prior& each : priors) add_pairs(each.nodes);
   std::vector<std::size_t> of_column(nodes() + 1);
   for (const Index j : pair_column)
     if (j >= 0) of_column[j + 1]++;
@@ -215,16 +222,19 @@ double Graph::trace(std::size_t factor, Indices members, dense::Const hessian, V
   return total;
 }
 
-dense::Matrix Graph::among_boundary(Values values) const {
-  dense::Matrix found(boundary_.size(), boundary_.size());
-  if (condensed)
-    each_block(of_condensed(), condensed->nodes,
-               [&](std::size_t at, std::size_t row, std::size_t column, std::size_t height, std::size_t width, bool) {
-                 for (std::size_t p = 0; p < height; p++)
-                   for (std::size_t q = 0; q < width; q++)
-                     found[row + p][column + q] = found[column + q][row + p] = values[at + p * width + q];
-               });
+dense::Matrix Graph::among(std::size_t factor, Indices members, std::size_t size, Values values) const {
+  dense::Matrix found(size, size);
+  each_block(factor, members,
+             [&](std::size_t at, std::size_t row, std::size_t column, std::size_t height, std::size_t width, bool) {
+               for (std::size_t p = 0; p < height; p++)
+                 for (std::size_t q = 0; q < width; q++)
+                   found[row + p][column + q] = found[column + q][row + p] = values[at + p * width + q];
+             });
   return found;
+}
+
+dense::Matrix Graph::among_boundary(Values values) const {
+  return condensed ? among(of_condensed(), condensed->nodes, boundary_.size(), values) : dense::Matrix();
 }
 
 std::size_t Graph::diagonal_of(Index node) const {

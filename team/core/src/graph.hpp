@@ -41,17 +41,18 @@ struct Sighting {
   dense::Matrix hessian(const Linear& at) const;
 };
 
-// A node, a pose or a bias, ~ N(mean, information⁻¹).
+// A pose, or biases jointly, ~ N(mean, information⁻¹). The information may be singular, as of a difference.
 struct Prior {
-  Index node;
+  std::vector<Index> nodes;  // one, or several of one number each
   Numbers mean;
   dense::Matrix information;
   bool is_of_bias;  // of one robot, so that a robust loss weighs it
 
   struct Terms {
-    double slope[3] = {}, chi2 = 0.0;  // P⁻¹r and rᵀP⁻¹r
+    Numbers slope;  // P⁻¹r
+    double chi2;    // rᵀP⁻¹r
   };
-  Terms terms(const double* value) const;
+  Terms terms(Values state, Indices offset) const;
 };
 
 // Old factors, linearised: cost(x) = cost + 2 slopeᵀ d + dᵀ information d, d = x − at with headings
@@ -91,13 +92,15 @@ class Graph {
   void add(std::size_t factor, Indices nodes, dense::Const hessian, double weight, Numbers& values) const;
   // tr(JᵀP⁻¹J Σ), given the numbers of Σ on the pattern.
   double trace(std::size_t factor, Indices nodes, dense::Const hessian, Values covariance) const;
-  // The symmetric matrix over the condensed factor's nodes of one on the pattern.
-  dense::Matrix among_boundary(Values values) const;
+  // The symmetric matrix over a factor's nodes, `size` numbers, of one on the pattern; zero of fixed nodes.
+  dense::Matrix among(std::size_t factor, Indices nodes, std::size_t size, Values values) const;
+  dense::Matrix among_boundary(Values values) const;  // over those of the condensed factor
   // Where the diagonal block of a node begins.
   std::size_t diagonal_of(Index node) const;
-  // The factors' numbers: submaps, then inter-robot measurements, then the condensed factor.
+  // The factors' numbers: submaps, then inter-robot measurements, the condensed factor, priors.
   std::size_t of_sighting(std::size_t s) const { return submaps.size() + s; }
   std::size_t of_condensed() const { return submaps.size() + sightings.size(); }
+  std::size_t of_prior(std::size_t k) const { return of_condensed() + (condensed ? 1 : 0) + k; }
 
   // χ² of each landmark of each submap, as measured.
   Numbers landmark_chi2(Values state, double covariance_factor) const;

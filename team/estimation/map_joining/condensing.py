@@ -175,7 +175,7 @@ def _condense_island(
         [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
         np.bool_,
     )
-    prior = np.array([eliminated[each.node] for each in graph.priors], np.bool_)
+    prior = np.array([eliminated[[*each.nodes]].any() for each in graph.priors], np.bool_)
     factors = MarkedFactors(leaving, seen, prior)
     union = nodes_of(island, factors, [] if before is None else [before.nodes])
     sizes = np.diff(graph.offset)
@@ -189,7 +189,7 @@ def _condense_island(
     remaining = union[~eliminated[union]]
     numbers = places(graph.offset, remaining)
     measured = int(graph.dimensions[leaving].sum()) + 2 * int(seen.sum())
-    measured += sum(len(graph.priors[k].mean) for k in np.flatnonzero(prior))
+    measured += sum(graph.priors[k].rank for k in np.flatnonzero(prior))
     made = Condensed(
         nodes=node_of[remaining],
         at=island.state[numbers],

@@ -302,7 +302,7 @@ def add_sightings(
 def degrees_of_freedom(island: Island) -> int:
     """Number of measured quantities less the number of unknowns."""
     graph = island.graph
-    priors = sum(len(prior.mean) for prior in graph.priors)
+    priors = sum(prior.rank for prior in graph.priors)
     measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
     old = graph.condensed
     return measured - graph.unknowns + (0 if old is None else old.redundancy)

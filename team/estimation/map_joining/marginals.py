@@ -491,10 +491,11 @@ def _priors(island: Island) -> list[tuple[str, float, float]]:
     graph = island.graph
     robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
     robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}
+    robots |= {node: stream[0] for (stream, _), node in graph.remembered.items()}
     robots |= dict.fromkeys(graph.common.values(), min(graph.streams)[0])
     now = island.estimate
-    sizes = np.array([len(each.mean) for each in graph.priors], np.int64)
+    sizes = np.array([each.rank for each in graph.priors], np.int64)
     weight = now.prior_weights
     chi2, dof = weight * now.prior_chi2, sizes - weight * now.explained_by_priors
-    of = [robots[each.node] for each in graph.priors]
+    of = [robots[each.nodes[0]] for each in graph.priors]
     return list(zip(of, chi2.tolist(), dof.tolist(), strict=True))

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island
@@ -35,7 +34,6 @@ def add_markers(island: Island) -> Island:
     errors = dict.fromkeys(error for each in marked for error in each)
     graph, state, new = append_nodes(graph, island.state, [np.zeros(1) for _ in errors])
     nodes: dict[CommonError, int] = dict(zip(errors, new, strict=True))
-    certainty = np.array([[1.0 / core.squared(sigma)]])
     graph = replace(
         graph,
         common={**graph.common, **nodes},
@@ -43,7 +41,7 @@ def add_markers(island: Island) -> Island:
             _add_rows(each, own, nodes, number)
             for each, own in zip(graph.submaps, marked, strict=True)
         ),
-        priors=(*graph.priors, *(Prior(node, np.zeros(1), certainty) for node in nodes.values())),
+        priors=(*graph.priors, *(Prior.of_bias(node, sigma) for node in nodes.values())),
     )
     return replace(island, graph=graph, state=state)
 

@@ -93,7 +93,7 @@ def _mark_factors(
     submaps = np.zeros(len(graph.submaps), np.bool_)
     submaps[run] = True
     seen = np.array([path[a] or path[b] for _, a, b in graph.sightings], np.bool_)
-    priors = path[np.array([each.node for each in graph.priors], np.int64)]
+    priors = np.array([path[[*each.nodes]].any() for each in graph.priors], np.bool_)
     return MarkedFactors(submaps, among.sightings & seen, among.priors & priors)
 
 
@@ -103,7 +103,7 @@ def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) 
     touched = [*others]
     touched += [graph.submaps[f].nodes for f in np.flatnonzero(factors.submaps)]
     touched += [np.array(graph.sightings[s][1:]) for s in np.flatnonzero(factors.sightings)]
-    touched += [np.array([graph.priors[k].node]) for k in np.flatnonzero(factors.priors)]
+    touched += [np.array(graph.priors[k].nodes) for k in np.flatnonzero(factors.priors)]
     union = np.unique(np.concatenate(touched))
     found: Indices = union[~graph.fixed[union]]
     return found

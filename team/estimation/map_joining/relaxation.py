@@ -115,12 +115,12 @@ def _list_equations(graph: Graph, at: Indices) -> Iterator[_Rows]:
         point = distance * np.array([[core.cos(bearing), core.sin(bearing)]])
         weight = np.array([1.0 / math.sqrt(spread)])
         yield _points(int(at[observer]), at[[teammate]], point, weight)
-    for node, mean, information in graph.priors:
-        if len(mean) == 1:
+    for prior in graph.priors:
+        if not prior.is_of_pose:
             continue
-        numbers = at[node] + np.arange(4)
-        weights = np.sqrt(np.diag(information))[[0, 1, 2, 2]]
-        yield _Rows(numbers[:, None], np.ones((4, 1)), _lifted(mean), weights)
+        numbers = at[prior.nodes[0]] + np.arange(4)
+        weights = np.sqrt(np.diag(prior.information))[[0, 1, 2, 2]]
+        yield _Rows(numbers[:, None], np.ones((4, 1)), _lifted(prior.mean), weights)
 
 
 def _points(

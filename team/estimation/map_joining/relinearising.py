@@ -168,6 +168,7 @@ def _raw(
         put(full.landmarks[id_], point)
     pairs = [(full.biases[of], node) for of, node in graph.biases.items()]
     pairs += [(full.common[bias], node) for bias, node in graph.common.items()]
+    pairs += [(full.remembered[of], node) for of, node in graph.remembered.items()]
     for node, own in pairs:
         put(node, value(own))
     age = np.full(len(full.submaps), FULL_AGE)

@@ -21,7 +21,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.contribution import Stream, is_map, named
+from teamslam.team.estimation.contribution import RobotBias, Stream, is_map, named
 from teamslam.team.estimation.gaussian import deviation, information
 from teamslam.team.estimation.map_joining.alignment import align
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
@@ -233,6 +233,35 @@ def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
         for each in displacements(island, saved)
         if each.is_apart and each.chi2 <= limit
     ]
+
+
+class Replaced(NamedTuple):
+    """An error of a robot that contradicts the one in a saved map: both, and χ² of one degree of
+    freedom that they are equal.
+    """
+
+    error: RobotBias
+    saved: Stream
+    value: float
+    before: float
+    chi2: float
+
+
+def replaced_sensors(island: Island) -> list[Replaced]:
+    """List the robots' errors that differ from those in a saved map beyond chance."""
+    graph, limit = island.graph, chi2_limit(1, FALSE_ALARM)
+    saved_at = {node: of for of, node in graph.remembered.items()}
+    found = []
+    for prior in graph.priors if saved_at else ():
+        if not prior.is_of_robot or len(prior.nodes) == 1:
+            continue
+        (value, before), P = joint_marginal(island, prior.nodes)
+        by = float(value - before)
+        chi2 = by * by / float(P[0, 0] + P[1, 1] - 2.0 * P[0, 1])
+        if chi2 > limit:
+            stream, error = saved_at[prior.nodes[1]]
+            found.append(Replaced(error, stream, float(value), float(before), chi2))
+    return found
 
 
 def contradiction(island: Island) -> tuple[Stream, str] | None:

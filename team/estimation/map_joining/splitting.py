@@ -65,7 +65,7 @@ def without(island: Island, places: Collection[int]) -> Island:
         measured[each.nodes] = True
     for seen in graph.sightings:
         measured[[seen.observer, seen.teammate]] = True
-    measured[[each.node for each in graph.priors]] = True
+    measured[[node for each in graph.priors for node in each.nodes]] = True
     if graph.condensed is not None:
         measured[graph.condensed.nodes] = True
     less = replace(graph, submaps=left, fixed=graph.fixed | ~measured)

@@ -22,6 +22,7 @@ from teamslam.team.estimation.contribution import (
     Contribution,
     InitialPoseFactor,
     Key,
+    RobotBias,
     Stream,
     first_of,
     is_map,
@@ -44,20 +45,47 @@ CommonError = Bias | int
 """A common error: a bias of all sensors, or, by a landmark's number, the share of the range by
 which all robots measure that landmark too far.
 """
+SharedError = CommonError | RobotBias
+"""An error of a submap: a bias of its robot's or of all sensors, a marker's, or, in a saved map,
+one of a robot of then.
+"""
+DRIFT: Mapping[Bias, float] = MappingProxyType(
+    {"forward_scale": 0.2, "range_offset": 0.1, "range_scale": 0.1}
+)
+"""Scale of a robot's bias on another day about that of a saved map, in scales of its prior.
+
+Ranges err by the optics or electronics of a sensor, which age over months; the way driven by tyres,
+load and floor. Others are not remembered: a clock is set anew with each start of its computer, and
+a sensor that was taken off and mounted again is off by up to 0.3°, more than the prior's scale. The
+loss is that of Student's t, so a sensor that was replaced loses the tie.
+"""
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 
 
 class Prior(NamedTuple):
-    """A node, a pose (x, y, theta) or a bias, ~ N(mean, information⁻¹).
+    """A pose (x, y, theta), or biases jointly, ~ N(mean, information⁻¹).
 
-    A robust join weighs the prior of a sensor's bias, like a submap, by its distance from the
-    state.
+    rank: of the information, which may be singular, as of a difference of biases. is_of_robot:
+    whether it is of one robot's bias, so that its loss is that of Student's t.
     """
 
-    node: int
+    nodes: tuple[int, ...]
     mean: Float[np.ndarray, " k"]
     information: Float[np.ndarray, "k k"]
+    rank: int
+    is_of_robot: bool = False
+
+    @property
+    def is_of_pose(self) -> bool:
+        """Whether it is of a pose."""
+        return len(self.mean) > len(self.nodes)
+
+    @classmethod
+    def of_bias(cls, node: int, sigma: float, *, is_of_robot: bool = False) -> "Prior":
+        """Make the prior of a bias about 0."""
+        certainty = np.array([[1.0 / core.squared(sigma)]])
+        return cls((node,), np.zeros(1), certainty, 1, is_of_robot)
 
 
 class Joined(NamedTuple):
@@ -71,7 +99,7 @@ class Joined(NamedTuple):
 
     contribution: Contribution
     nodes: Indices
-    biases: tuple[CommonError, ...]
+    biases: tuple[SharedError, ...]
     sensitivity: Float[np.ndarray, "B _"]
 
     @classmethod
@@ -82,9 +110,14 @@ class Joined(NamedTuple):
         own: tuple[Bias, ...],
         common: tuple[CommonError, ...],
     ) -> "Joined":
-        """Make a submap whose `common` errors have a node of the whole team."""
+        """Make a submap whose `common` errors have a node of the whole team. Those of single robots
+        in a saved map stand first.
+        """
         biases = (*own, *common)
-        return cls(contribution, nodes, biases, _sensitivity(contribution.local, biases))
+        rows = _sensitivity(contribution.local, biases)
+        if contribution.own.errors:
+            rows = np.vstack([contribution.by_own, rows]) if biases else contribution.by_own
+        return cls(contribution, nodes, (*contribution.own.errors, *biases), rows)
 
     @property
     def factor(self) -> core.SubmapFactor:
@@ -106,7 +139,7 @@ class Joined(NamedTuple):
         """∂²mean/∂b² of each bias; zero of errors that the team has in common."""
         local, rows = self.contribution.local, np.zeros_like(self.sensitivity)
         for at, error in enumerate(self.biases):
-            if error in local.biases and self.biases.count(error) == 1:
+            if isinstance(error, str) and self.biases.count(error) == 1:
                 rows[at] = local.curvature[local.biases.index(error)]
         return rows
 
@@ -130,7 +163,9 @@ def _sensitivity(local: LocalMap, biases: Sequence[CommonError]) -> Float[np.nda
     return rows
 
 
-def _scaling(error: CommonError) -> Bias:
+def _scaling(error: SharedError) -> Bias:
+    if isinstance(error, RobotBias):
+        return error.bias
     return "range_scale" if isinstance(error, int) else error
 
 
@@ -149,8 +184,9 @@ class Graph:
     streams: nodes of each stream: its start, then the end pose of submap 0, 1, … landmarks: node of
     each landmark id. poses: node of each further pose, by (stream, stamp). biases: node of each
     error that the submaps of a stream share. common: node of each error that all streams share;
-    these and `biases` have one number. offset: index in the state of each node's first number; the
-    last entry is the state's length. fixed: nodes that are constants (exactly known initial poses,
+    these and `biases` have one number. remembered: node of each error of a robot on the days of a
+    saved map, by the map. offset: index in the state of each node's first number; the last entry is
+    the state's length. fixed: nodes that are constants (exactly known initial poses,
     the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
     replaces older submaps, if any (`condensing`). gone: sequence behind a stream's submaps in
     `condensed`; `streams` begins after them. former: the node of a moved landmark's old place, by
@@ -168,6 +204,7 @@ class Graph:
     sightings: tuple[Encounter, ...]
     priors: tuple[Prior, ...]
     common: Mapping[CommonError, int] = field(default_factory=dict)
+    remembered: Mapping[tuple[Stream, RobotBias], int] = field(default_factory=dict)
     condensed: Condensed | None = None
     gone: Mapping[Stream, int] = field(default_factory=dict)
     former: Mapping[tuple[Stream, int], int] = field(default_factory=dict)
@@ -185,13 +222,12 @@ class Graph:
     @cached_property
     def factors(self) -> core.SubmapGraph:
         """The factors, to compute with. Raises NotACovarianceError that names a submap."""
-        of_bias = self.of_bias.tolist()
         return core.SubmapGraph(
             self.offset,
             self.fixed,
             [(each.factor, each.nodes) for each in self.submaps],
             [(a, b, x.measurement, x.information, x.point) for x, a, b in self.sightings],
-            [(*each, own) for each, own in zip(self.priors, of_bias, strict=True)],
+            [(np.array(x.nodes), x.mean, x.information, x.is_of_robot) for x in self.priors],
             None if self.condensed is None else self.condensed.quadratic,
         )
 
@@ -220,14 +256,6 @@ class Graph:
     def dimensions(self) -> Indices:
         """Dimension of each submap."""
         return np.array([len(each.contribution.local.mean) for each in self.submaps], np.int64)
-
-    @cached_property
-    def of_bias(self) -> Bool[np.ndarray, " priors"]:
-        """Marks the priors of single robots' biases."""
-        common = set(self.common.values())
-        return np.array(
-            [len(each.mean) == 1 and each.node not in common for each in self.priors], np.bool_
-        )
 
     @cached_property
     def headings(self) -> Indices:
@@ -264,15 +292,24 @@ class Graph:
         for (stream, stamp_ns), at in self.poses.items():
             if node == at:
                 return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
-        for (stream, bias), at in self.biases.items():
-            if node == at:
-                return f"the bias {bias} of {named(stream)}"
-        for error, at in self.common.items():
-            if node == at:
-                return f"the {'marker' if isinstance(error, int) else 'bias'} {error} of the team"
         for (stream, id_), at in self.former.items():
             if node == at:
                 return f"the place of landmark {id_} in {named(stream)}"
+        return self._name_of_error(node) or self._name_of_landmark(node)
+
+    def _name_of_error(self, node: int) -> str:
+        for (stream, bias), at in self.biases.items():
+            if node == at:
+                return f"the bias {bias} of {named(stream)}"
+        for (stream, (robot, bias)), at in self.remembered.items():
+            if node == at:
+                return f"the bias {bias} of {robot} in {named(stream)}"
+        for error, at in self.common.items():
+            if node == at:
+                return f"the {'marker' if isinstance(error, int) else 'bias'} {error} of the team"
+        return ""
+
+    def _name_of_landmark(self, node: int) -> str:
         ids = [id_ for id_, at in self.landmarks.items() if at == node]
         return f"landmark {ids[0]}" if ids else "a split node"
 
@@ -304,6 +341,7 @@ class _Growth:
         self.poses = dict(graph.poses)
         self.biases = dict(graph.biases)
         self.common = dict(graph.common)
+        self.remembered = dict(graph.remembered)
         self.offset = graph.offset
         self.state = state
         self.count = len(graph.fixed)
@@ -350,7 +388,7 @@ def add_submaps(
             node = growth.add(start.pose, start.covariance is None)
             growth.streams[stream] = (node,)
             if start.information is not None:
-                priors.append(Prior(node, start.pose, start.information))
+                priors.append(Prior((node,), start.pose, start.information, 3))
         start_node = growth.streams[stream][-1]
         map_from_start = growth.value(start_node, 3)
         end_node = growth.add(compose(map_from_start, local.end_pose), fixed=False)
@@ -364,20 +402,15 @@ def add_submaps(
                 growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
         seen = [growth.landmarks[id_] for id_ in ids]
         common = _common_errors(contribution, common_bias_sigma)
-        own = local.biases  # the errors of single sensors are part of a saved map's covariance
+        own = local.biases
         if is_map(stream):
             own = tuple(bias for bias in own if bias not in common)
-        for bias in own:
-            if (stream, bias) not in growth.biases:
-                growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[1.0 / core.squared(bias_sigma[bias])]])
-                priors.append(Prior(growth.biases[stream, bias], np.zeros(1), certainty))
-        for error, sigma in common.items():
-            if error not in growth.common:
-                growth.common[error] = growth.add(np.zeros(1), fixed=False)
-                certainty = np.array([[1.0 / core.squared(sigma)]])
-                priors.append(Prior(growth.common[error], np.zeros(1), certainty))
-        errors = [growth.biases[stream, bias] for bias in own]
+        priors += _add_errors(growth, stream, own, bias_sigma, common)
+        errors: list[int] = []
+        if contribution.own.errors:
+            errors, known = _remember(growth, contribution, bias_sigma)
+            priors += known
+        errors += [growth.biases[stream, bias] for bias in own]
         errors += [growth.common[error] for error in common]
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
         submaps.append(Joined.of(contribution, nodes, own, tuple(common)))
@@ -391,15 +424,83 @@ def add_submaps(
         submaps=tuple(submaps),
         priors=tuple(priors),
         common=growth.common,
+        remembered=growth.remembered,
     )
-    return grown, state
+    return _tie_biases(grown), state
+
+
+def _add_errors(
+    growth: _Growth,
+    stream: Stream,
+    own: Sequence[Bias],
+    bias_sigma: Mapping[Bias, float],
+    common: Mapping[CommonError, float],
+) -> list[Prior]:
+    """Add the nodes that a submap's own and common errors lack; return their priors."""
+    priors = []
+    for bias in own:
+        if (stream, bias) not in growth.biases:
+            node = growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
+            priors.append(Prior.of_bias(node, bias_sigma[bias], is_of_robot=True))
+    for error, sigma in common.items():
+        if error not in growth.common:
+            node = growth.common[error] = growth.add(np.zeros(1), fixed=False)
+            priors.append(Prior.of_bias(node, sigma))
+    return priors
+
+
+def _remember(
+    growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
+) -> tuple[list[int], list[Prior]]:
+    """Add the nodes of the errors of single robots in a saved map; return also what is known of
+    them: their priors, and the likelihood by the map's measurements.
+    """
+    own, stream = contribution.own, contribution.stream
+    nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
+    growth.remembered |= {
+        (stream, error): node for error, node in zip(own.errors, nodes, strict=True)
+    }
+    biases = contribution.local.biases
+    shared = [growth.common[b] if b in growth.common else growth.biases[stream, b] for b in biases]
+    both = (*shared, *nodes)
+    priors = [
+        Prior.of_bias(node, bias_sigma[error.bias], is_of_robot=True)
+        for error, node in zip(own.errors, nodes, strict=True)
+    ]
+    return nodes, [*priors, Prior(both, own.likeliest, own.evidence, len(both))]
+
+
+def _tie_biases(graph: Graph) -> Graph:
+    """Tie each robot's biases to those of its name in a saved map.
+
+    b = b₁ + d with the drift d since then of scale DRIFT, Student's t like the prior, which it
+    replaces: b₁ has that prior. Of several saved maps the first by name counts.
+    """
+    if not graph.remembered:
+        return graph
+    before: dict[RobotBias, int] = {}
+    for (_, saved), node in sorted(graph.remembered.items()):
+        if saved.bias in DRIFT:
+            before.setdefault(saved, node)
+    error_of = {node: RobotBias(stream[0], bias) for (stream, bias), node in graph.biases.items()}
+    priors = []
+    for prior in graph.priors:
+        error = error_of.get(prior.nodes[0])
+        if error is None or len(prior.nodes) > 1 or error not in before:
+            priors.append(prior)
+            continue
+        certainty = prior.information[0, 0] / core.squared(DRIFT[error.bias])
+        W = certainty * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        nodes = *prior.nodes, before[error]
+        priors.append(Prior(nodes, np.zeros(2), W, 1, is_of_robot=True))
+    return replace(graph, priors=tuple(priors))
 
 
 def _drop_unscaled_biases(
     contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> Contribution:
     """Take a submap with a bias that has no scale without biases."""
-    if bias_sigma.keys() >= {*contribution.local.biases}:
+    if contribution.own.errors or bias_sigma.keys() >= {*contribution.local.biases}:
         return contribution
     return replace(contribution, local=contribution.local.without_biases)
 
@@ -470,6 +571,7 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
         former={key: int(node_of[node]) for key, node in graph.former.items()},
         biases={key: int(node_of[node]) for key, node in graph.biases.items()},
         common={bias: int(node_of[node]) for bias, node in graph.common.items()},
+        remembered={of: int(node_of[node]) for of, node in graph.remembered.items()},
         offset=_starts(np.diff(graph.offset)[stays].tolist()),
         fixed=graph.fixed[stays],
         submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
@@ -477,7 +579,9 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
             Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
             for seen, observer, teammate in graph.sightings
         ),
-        priors=tuple(each._replace(node=int(node_of[each.node])) for each in graph.priors),
+        priors=tuple(
+            each._replace(nodes=tuple(node_of[list(each.nodes)].tolist())) for each in graph.priors
+        ),
         memory=graph.memory.renumbered(node_of),
     )
 
@@ -580,7 +684,7 @@ def merge_graphs(
         values.append(_transform_value(main_from_other, value))
     moved = _renumber_nodes(other, node_of, np.ones(len(other.fixed), np.bool_))
     kept = [
-        len(prior.mean) == 1 and prior.node not in common  # of a bias, not of an initial pose
+        not prior.is_of_pose and (len(prior.nodes) > 1 or prior.nodes[0] not in common)
         for prior in other.priors
     ]
     grown, joint, _ = append_nodes(main, state, values)
@@ -594,10 +698,11 @@ def merge_graphs(
         sightings=(*main.sightings, *moved.sightings),
         priors=(*main.priors, *compress(moved.priors, kept)),
         common={**moved.common, **main.common},
+        remembered={**main.remembered, **moved.remembered},
         gone={**main.gone, **other.gone},
         former={**main.former, **moved.former},
     )
-    return graph, joint
+    return _tie_biases(graph), joint
 
 
 def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:

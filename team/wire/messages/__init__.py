@@ -30,6 +30,7 @@ from teamslam.team.wire.messages.estimates import MapEstimate as MapEstimate
 from teamslam.team.wire.messages.estimates import ParticleCloud as ParticleCloud
 from teamslam.team.wire.messages.estimates import PoseEstimate as PoseEstimate
 from teamslam.team.wire.messages.estimates import Rendezvous as Rendezvous
+from teamslam.team.wire.messages.maps import MOST_OWN as MOST_OWN
 from teamslam.team.wire.messages.maps import MOST_SAVED as MOST_SAVED
 from teamslam.team.wire.messages.maps import AssociationDecision as AssociationDecision
 from teamslam.team.wire.messages.maps import BiasEstimate as BiasEstimate
@@ -39,6 +40,7 @@ from teamslam.team.wire.messages.maps import FusedMap as FusedMap
 from teamslam.team.wire.messages.maps import LandmarkChange as LandmarkChange
 from teamslam.team.wire.messages.maps import Membership as Membership
 from teamslam.team.wire.messages.maps import Prior as Prior
+from teamslam.team.wire.messages.maps import RobotBias as RobotBias
 from teamslam.team.wire.messages.maps import SavedMap as SavedMap
 from teamslam.team.wire.messages.maps import Trajectory as Trajectory
 from teamslam.team.wire.messages.maps import VersionEntry as VersionEntry

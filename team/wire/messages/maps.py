@@ -4,6 +4,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from teamslam.team.config import MAP, SURVEY
@@ -31,6 +32,8 @@ from teamslam.team.wire.messages.orders import Judgement
 ChangeState = Literal["unchanged", "moved", "gone", "new"]
 MOST_SAVED = 2000
 """Most landmarks of a saved map, whose joint covariance has 64 MB."""
+MOST_OWN = 500
+"""Most errors of single robots in a saved map: five of a hundred robots."""
 MOST_SETS = 10_000
 """Most streams in a saved map: five a day for five years."""
 
@@ -284,6 +287,13 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
             check_pose_covariance(self.covariances[72 * i : 72 * (i + 1)], "covariances")
 
 
+class RobotBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, order=True):
+    """An error that all submaps of a robot share, by the robot's name."""
+
+    robot: Name
+    bias: Bias
+
+
 class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     """The final map of a team as one Gaussian, for a file and for the set of a later team.
 
@@ -297,7 +307,13 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     stream in it, on all days, ascending: two maps with a stream in common cannot be joined.
     software, core: version of the program, digest of the native core. datum: latitude [deg],
     longitude [deg] and height [m] of the frame's origin on WGS84, x east and y north; empty: not
-    stated.
+    stated. own: K errors of single robots in it, ascending; with the errors `biases` taken as zero,
+    own_means: their K means; own_covariance: packed upper triangle of their covariance; own_cross:
+    K × 2L floats: their covariance with the means of the landmarks, whose `covariance` contains
+    them. own_sensitivity: B × K floats: given the errors b their means are own_means + bᵀ
+    own_sensitivity. likeliest, evidence: B + K floats and the packed upper triangle of an
+    information matrix, positive definite: the likelihood N(likeliest, evidence⁻¹) of (biases, own)
+    by the measurements in the map, without any prior of these errors.
     """
 
     name: Name
@@ -312,6 +328,13 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     software: Text
     core: Text
     datum: Floats = b""
+    own: Annotated[tuple[RobotBias, ...], Meta(max_length=MOST_OWN)] = ()
+    own_means: Floats = b""
+    own_covariance: Floats = b""
+    own_cross: Floats = b""
+    own_sensitivity: Floats = b""
+    likeliest: Floats = b""
+    evidence: Floats = b""
 
     @property
     def author(self) -> str:
@@ -335,8 +358,31 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
             raise ValueError("not ascending: sets")
         if not self.sets:
             raise ValueError("out of bounds: a map of no set")
+        self._check_own(2 * n)
         if self.datum:
             check_finite(self.datum, "datum", 3)
             latitude, longitude, _ = floats(self.datum, "datum")
             if abs(latitude) > 89.0 or abs(longitude) > 180.0:
                 raise ValueError(f"out of bounds: datum at {latitude:g}°, {longitude:g}°")
+
+    def _check_own(self, n: int) -> None:
+        """Check the errors of single robots: with the landmarks they have a covariance."""
+        K = len(self.own)
+        if any(a >= b for a, b in pairwise(self.own)):
+            raise ValueError("not ascending: own")
+        check_finite(self.own_means, "own_means", K)
+        check_finite(self.own_cross, "own_cross", K * n)
+        check_finite(self.own_sensitivity, "own_sensitivity", K * len(self.biases))
+        check_finite(self.own_covariance, "own_covariance", K * (K + 1) // 2)
+        E = K + len(self.biases) if K else 0
+        check_finite(self.likeliest, "likeliest", E)
+        check_finite(self.evidence, "evidence", E * (E + 1) // 2)
+        if not K:
+            return
+        check_packed_covariance(self.evidence, E, "evidence")
+        joint = np.zeros((K + n, K + n))
+        joint[:K, :K][np.triu_indices(K)] = floats(self.own_covariance, "own_covariance")
+        joint[:K, K:] = floats(self.own_cross, "own_cross").reshape(K, n)
+        joint[K:, K:][np.triu_indices(n)] = floats(self.covariance, "covariance")
+        upper = joint[np.triu_indices(K + n)].astype("<f8").tobytes()
+        check_packed_covariance(upper, K + n, "own_covariance with covariance")

@@ -458,7 +458,7 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
     island = fold_of(world, submaps, options).main
     k = next(k for k, prior in enumerate(island.graph.priors) if len(prior.mean) == 1)
     prior = island.graph.priors[k]
-    at, sigma = island.graph.offset[prior.node], prior.information[0, 0] ** -0.5
+    at, sigma = island.graph.offset[prior.nodes[0]], prior.information[0, 0] ** -0.5
 
     def shifted(by):
         state = island.state.copy()
@@ -471,7 +471,7 @@ def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_i
     graph, h = island.graph, 1e-4 * sigma
     counts = len(graph.submaps), len(graph.sightings), len(graph.priors)
     marks = [np.full(count, k == 2) for k, count in enumerate(counts)]
-    nodes = np.unique([each.node for each in graph.priors])
+    nodes = np.unique([each.nodes[0] for each in graph.priors])
 
     def prior_cost(by):
         return shifted(by).estimate.quadratic(nodes, *marks)[2]

@@ -217,7 +217,9 @@ def test_a_map_says_that_landmarks_without_a_name_lack_the_error_of_their_marker
 
 def _only_own_biases_are_discounted(graph):
     common = set(graph.common.values())
-    assert [each.node not in common for each in graph.priors] == graph.of_bias.tolist()
+    assert [each.nodes[0] not in common for each in graph.priors] == [
+        each.is_of_robot for each in graph.priors
+    ]
 
 
 def test_what_a_robot_is_told_of_its_scale_is_its_own_error_and_the_teams():
