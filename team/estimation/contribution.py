@@ -205,7 +205,9 @@ class Contribution:
     @cached_property
     def with_errors(
         self,
-    ) -> dict[tuple[Bias | int, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]]:
+    ) -> dict[
+        tuple[Bias | int | RobotBias, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]
+    ]:
         """Sensitivity and factor by the errors of a graph, as the last graph with them has both
         (`submap_graph.Joined`).
         """
