@@ -113,6 +113,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         faults=len(faults),
         scale_by_robot=_by_robot(log, "covariance_scale."),
         arbitrary_frame=arbitrary,
+        truth_from_map=None if motion is None else motion[0],
         peers=peer_results(log),
         disagreement=log.disagreement,
         association=association,

@@ -116,7 +116,8 @@ class Evaluation:
     robot in the final map. data_set: folder or file name; empty for a simulated world.
     separate_times: of measurements that do not overlap, as text. mirrored, lateness: bearings of
     the wrong sign, and each robot's clock offset where it is determined, by the measurements alone.
-    recorded_ns: wall time of the first message.
+    recorded_ns: wall time of the first message. truth_from_map: rigid motion that aligns the map's
+    landmarks with the true ones, or where none is known the paths.
     """
 
     scenario: TeamConfig | None
@@ -130,6 +131,7 @@ class Evaluation:
     faults: int = 0
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
     arbitrary_frame: bool = False
+    truth_from_map: Float[np.ndarray, "3"] | None = None
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
     disagreement: tuple[str, ...] = ()
     association: AssociationResult | None = None

@@ -90,12 +90,9 @@ def map_picture(
 
 
 def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
-    """Move the truth into an arbitrary map frame by the map's alignment."""
-    fused = evaluation.map
-    if not evaluation.arbitrary_frame or fused is None or fused.errors is None:
-        return evaluation
-    motion = fused.errors.truth_from_map
-    if motion is None:
+    """Move the truth into an arbitrary map frame by the alignment of landmarks or paths."""
+    fused, motion = evaluation.map, evaluation.truth_from_map
+    if not evaluation.arbitrary_frame or fused is None or motion is None:
         return evaluation
     back = inverse(motion)
 

@@ -19,6 +19,7 @@ from teamslam.central.desk.evaluation.errors import (
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
+from teamslam.central.desk.pictures.run import in_the_maps_frame
 from teamslam.central.desk.report.tables import robot_sheet, team_rows, title_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.config import FolderWorld
@@ -499,6 +500,21 @@ def test_in_an_arbitrary_frame_the_paths_move_the_map_before_it_is_matched():
     assert run.arbitrary_frame
     assert run.map.matching.matched == 8
     assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_in_an_arbitrary_frame_the_true_paths_are_drawn_along_the_estimated_ones():
+    true = streams(scenario()).landmarks
+    log = unnamed_log(transform_points(ROTATED, true), initial_poses=False)
+    run = evaluate(s for s in log if ch.channel_of(s.key)[0] is not ch.TRUTH_LANDMARKS)
+    assert run.arbitrary_frame
+    assert run.map.errors is None
+    for name, robot in in_the_maps_frame(run).robots.items():
+        path = run.robots[name].smoothed_path
+        poses, known = interpolate_truth(robot.truth, path.stamps_ns)
+        assert known.any()
+        assert poses[known, :2] == pytest.approx(path.poses[known, :2], abs=1e-6)
+        before, _ = interpolate_truth(run.robots[name].truth, path.stamps_ns)
+        assert np.abs(before[known, :2] - path.poses[known, :2]).max() > 0.5
 
 
 def test_landmarks_with_identities_are_matched_by_nothing_else():
