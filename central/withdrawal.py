@@ -190,6 +190,9 @@ def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
     suspected = find_suspects(agreement, limit)
     if not suspected:
         return Trial()
+    team = {*found, *agreement.robots}
+    if _contradict_alone(suspected[:TRIED], team, limit, without) > 1:
+        return Trial()
     others = sorted({*found} - {*suspected}, key=lambda robot: (found[robot], robot))
     candidates = [*suspected[:TRIED], *others[:TRIED]]
     cleared: dict[str, dict[str, float]] = {}
@@ -198,7 +201,6 @@ def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
         left = {} if rest is None else disagreement(rest, ACCORD)
         if left and max(left.values()) <= AGREEING * limit:
             cleared[robot] = left
-    team = {*found, *agreement.robots}
     wrong = [
         robot
         for robot in cleared
@@ -213,6 +215,21 @@ def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
         f"its submaps contradict the rest: cost {_largest(found):.1f} per degree of freedom with "
         f"it; without it {_largest(cleared[robot]):.1f} or less",
     )
+
+
+def _contradict_alone(
+    robots: Collection[str], team: Collection[str], limit: float, without: Without
+) -> int:
+    """Count the robots whose submaps disagree when alone, by more than the rest may.
+
+    Of two such robots one is left whoever is left out, so that no robot is cleared. Noise that the
+    team states too small is found so by a fold of each suspect, not of the team without each robot.
+    """
+    if len(robots) < 2:
+        return 0
+    alone = (without({*team} - {robot}) for robot in robots)
+    found = (disagreement(each, ACCORD) for each in alone if each is not None)
+    return sum(max(each.values(), default=0.0) > AGREEING * limit for each in found)
 
 
 def cost_share(chi2: float, dof: float, chance: float) -> float:

@@ -1,6 +1,7 @@
 """After a withdrawal the map equals, bit for bit, that of a team without the robot."""
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
 
@@ -362,6 +363,18 @@ def agreement(**ratios: float) -> Agreement:
 
 def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
     return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
+
+
+def test_where_two_robots_contradict_themselves_the_team_is_not_folded_without_each():
+    """Whoever is left out, one of them is left: noise that the team states too small."""
+    asked = []
+
+    def without(robots: Collection[str]) -> Agreement:
+        asked.append(frozenset(robots))
+        return agreement(**dict.fromkeys({"a", "b", "c"} - {*robots}, 5.0))
+
+    assert hold_trial(without(()), 4.0, without).robot is None
+    assert {len(robots) for robots in asked[1:]} == {2}
 
 
 def test_who_is_wrong_is_whose_absence_makes_the_rest_agree():
