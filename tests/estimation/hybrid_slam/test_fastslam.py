@@ -10,7 +10,7 @@ from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.core import moments, semidefinite_factor
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.models import Increment, Noise, increment_of
 from teamslam.team.estimation.scans import unclaimed
 
 quick = settings(deadline=None, max_examples=60)
@@ -275,7 +275,7 @@ def test_a_particle_s_step_depends_neither_on_its_place_nor_on_the_others():
     means = np.array([[4.0, 1.0], [2.0, -3.0]]) + rng.normal(0.0, 0.1, (37, 2, 2))
     spread = np.tile([0.05, 0.01, 0.04], (37, 2, 1))
     seen = np.array([4, 9, 9], np.uint32), np.array([4.1, 3.5, 3.6]), np.array([0.2, -1.0, -0.9])
-    noise = fastslam.Noise(0.01, 0.0, 1.0, 1e-3, 1.0)
+    noise = Noise(0.01, 0.0, 1.0, 1e-3, 1.0)
 
     def stepped(order):
         known = np.array([4], np.uint32), means[order, :1], spread[order, :1]
