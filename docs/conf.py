@@ -1,7 +1,8 @@
 """Configuration of the documentation site; `make docs` builds it offline, warnings are errors.
 
 The pages are Markdown. The command reference is generated from the commands, the API reference from
-the docstrings, which are plain text with formulas and not reStructuredText.
+the docstrings of the modules that docs/api.md names; these are plain text with formulas and not
+reStructuredText.
 """
 
 import re
@@ -12,8 +13,6 @@ from pathlib import Path
 from typing import Annotated, get_origin
 
 HERE = Path(__file__).parent
-LEFT_OUT = ("sim/studies", "team/library.py")
-"""Left out of the API reference: the studies, and the library, which has its own page."""
 GENERATED = HERE / "generated"
 sys.path.insert(0, str(HERE.parent))
 
@@ -22,7 +21,6 @@ author = "The teamslam developers"
 copyright = f"{author}, Apache-2.0"  # noqa: A001 - Sphinx calls it so
 extensions = [
     "myst_parser",
-    "sphinx.ext.apidoc",
     "sphinx.ext.autodoc",
     "sphinxcontrib.svgbob",
 ]
@@ -40,18 +38,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
 myst_links_external_new_tab = False
 
-apidoc_modules = [
-    {
-        "path": HERE.parent / "teamslam",
-        "destination": "generated/api",
-        "separate_modules": False,
-        "module_first": True,
-        "max_depth": 2,
-        "follow_links": True,
-        "automodule_options": {"members"},
-        "exclude_patterns": [str(HERE.parent / "teamslam" / left_out) for left_out in LEFT_OUT],
-    }
-]
+autodoc_default_options = {"members": True}
 suppress_warnings = ["ref.python"]  # a type's short name may be that of two classes
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
