@@ -342,10 +342,9 @@ def _statement(found: m.Diagnosis) -> str:
             return f"another map, up to {value[0]:.1f} m away, fits about as well as this one"
         case "noise_underestimated" | "noise_overestimated":
             too, factor = ("small", value[0]) if value[0] > 1.0 else ("large", 1.0 / value[0])
-            widened = "" if found.robot or value[0] < 1.0 else ", which the final map's include"
             return (
                 f"{found.robot or 'team'}: the submaps' covariances are too {too} by a factor of "
-                f"{factor:.1f}{widened}, by the differences between submaps"
+                f"{factor:.1f}, by the differences between submaps"
             )
         case _:
             return _describe_shared_error(found)

@@ -414,9 +414,11 @@ def _widened(island: Island, factor: float) -> Island:
 
 def widen_covariances(fold: Fold, factor: float) -> Fold:
     """Solve the main island again with the submaps' covariances times a factor; return the fold as
-    it was where that has no solution.
+    it was where that has no solution, and where fixes may be what does not fit.
     """
     if factor == 1.0 or fold.main_key is None:
+        return fold
+    if any(each.sighting.is_fix for each in fold.main.graph.sightings):
         return fold
     try:
         with np.errstate(all="ignore"):
