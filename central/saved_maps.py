@@ -230,7 +230,10 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
     for id_, absence in zip(lost, absences(island, np.concatenate(places)), strict=True):
         if absence.chance < FALSE_ALARM:
-            found[id_] = m.LandmarkChange(landmark=id_, state="gone", expected=absence.expected)
+            dx, dy = (found[id_].dx, found[id_].dy) if id_ in former else (0.0, 0.0)
+            found[id_] = m.LandmarkChange(
+                landmark=id_, state="gone", dx=dx, dy=dy, expected=absence.expected
+            )
     for id_ in {*shown} - old:
         found[id_] = m.LandmarkChange(landmark=id_, state="new")
     return tuple(found[id_] for id_ in sorted(found))

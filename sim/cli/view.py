@@ -40,8 +40,8 @@ Port = Annotated[
 FoxglovePort = Annotated[
     int | None,
     rare(
-        help="Where Foxglove can connect; 0: any free port; default: 8765, if foxglove-sdk is "
-        "installed.",
+        help="Where Foxglove can connect; 0: any free port; default: 8765, or a free one if that "
+        "is taken, if foxglove-sdk is installed.",
         min=0,
         metavar="PORT",
     ),
@@ -149,17 +149,20 @@ def shown_on_page(
     growing: bool,
 ) -> Iterator["Shown"]:
     """Serve a log, print the addresses, and open the page on request or on a display."""
-    from teamslam.central.desk.view.server import session
+    from teamslam.central.desk.view.server import free_port, session
 
     has_sdk = find_spec("foxglove") is not None
     if foxglove_port is not None and not has_sdk:
         fail(f"--foxglove-port needs Foxglove's SDK: {install_command('foxglove')}", WRONG_USE)
+    note = ""
     if foxglove_port is None and has_sdk:
-        foxglove_port = FOXGLOVE_PORT
+        foxglove_port = free_port(host, FOXGLOVE_PORT)
+        if not foxglove_port:
+            note = f"   ({FOXGLOVE_PORT} is taken; --foxglove-port chooses another)"
     with session(log, host, port, foxglove_port, growing=growing) as shown:
         typer.echo(f"page      {shown.url}")
         if shown.foxglove:
-            typer.echo(f"foxglove  {shown.foxglove}")
+            typer.echo(f"foxglove  {shown.foxglove}{note}")
         if _has_display() if browser is None else browser:
             import webbrowser
 

@@ -89,6 +89,11 @@ def changed(fused: m.FusedMap):
     return {each.landmark: each for each in fused.changes if each.state != "unchanged"}
 
 
+def place_of(number: int, of: m.FusedMap | m.SavedMap):
+    at = ids(of.ids, "ids").tolist().index(number)
+    return floats(of.means, "means").reshape(-1, 2)[at]
+
+
 def numbers(fused: m.FusedMap):
     return fused.ids, fused.means, fused.covariance
 
@@ -137,19 +142,26 @@ def test_a_landmark_that_is_not_seen_again_is_gone_and_is_not_saved_again():
     assert 15 not in ids(saved.ids, "ids")
 
 
-def test_one_misread_number_does_not_move_a_landmark_that_is_gone():
+@pytest.mark.parametrize("detections", [1, 40])
+def test_one_misread_number_does_not_move_a_landmark_that_is_gone(detections):
+    """As an outlier in a submap, or as the place that this submap has; the old one can be told."""
     _, _, streams = second_day(moved=((15, (-900.0, -900.0)),))
     first, *rest = streams.streams
     seen = first.landmark_detections
     wrong = seen.ids.copy()
-    wrong[len(wrong) // 2] = 15
+    span = slice(287, 287 + detections)
+    wrong[span][wrong[span] == wrong[287]] = 15
     misread = dataclasses.replace(first, landmark_detections=dataclasses.replace(seen, ids=wrong))
     day_of = msgspec.structs.replace(load("thesis-b"), seed=1001)
     world = dataclasses.replace(streams, streams=(misread, *rest))
     samples, centre, _ = day(0, [first_day()[1]], scenario=day_of, streams=world)
     fused = final_map(samples)
     assert 15 in ids(fused.ids, "ids"), "the misread number is in the map"
-    assert {number: each.state for number, each in changed(fused).items()} == {15: "gone"}
+    gone = changed(fused)
+    assert {number: each.state for number, each in gone.items()} == {15: "gone"}
+    former, place = (place_of(15, each) for each in (first_day()[1], fused))
+    assert (np.abs(place - former).max() > 5.0) == (detections > 1)
+    assert np.abs(place - [gone[15].dx, gone[15].dy] - former).max() < 0.5
     saved = centre.maps.fold.save_map("later")
     assert 15 not in ids(saved.ids, "ids")
 

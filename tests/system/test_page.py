@@ -8,10 +8,15 @@ import re
 import signal
 from xml.etree import ElementTree
 
+import msgspec
 import pytest
 
 from teamslam.central.desk.view.server import session
 from teamslam.team.recording.recorder import Recorder
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import encoded
 from tests.browser import Page, browsing, chromium
 from tests.crowd import crowd
 from tests.support import wait_until
@@ -23,6 +28,7 @@ pytestmark = pytest.mark.skipif(
     PROGRAM is None, reason="no Chromium on this machine (Debian: apt install chromium)"
 )
 ROBOTS, LANDMARKS, SECONDS = 3, 40, 60
+MOVED_FRAME = (30.0, -10.0)
 READY = "window.teamslam !== undefined && teamslam.store.complete && teamslam.map.frames > 0"
 
 
@@ -185,6 +191,95 @@ def test_an_event_of_a_robot_is_where_the_robot_was(page):
     assert place == pytest.approx(at)
     seek(page, 30)
     page.wait("teamslam.map.marks.length > 0")
+
+
+@pytest.fixture(scope="module")
+def changed_url(tmp_path_factory):
+    """The address of a log whose final map has changed since a saved map, in an arbitrary frame."""
+    path = tmp_path_factory.mktemp("changed") / "log.mcap"
+    changes = (
+        m.LandmarkChange(landmark=1, state="unchanged"),
+        m.LandmarkChange(landmark=2, state="moved", dx=12.0, dy=-5.0, sigma=0.125, chi2=87.0),
+        m.LandmarkChange(landmark=5, state="gone", expected=9.0),
+        m.LandmarkChange(landmark=8, state="new"),
+    )
+    samples = []
+    for each in crowd(ROBOTS, LANDMARKS, SECONDS):
+        message = opened(each)[2]
+        if isinstance(message, m.InitialPose):
+            message = msgspec.structs.replace(message, pose=b"")
+        if isinstance(message, m.FusedMap):
+            means = floats(message.means, "means").reshape(-1, 2) + MOVED_FRAME
+            message = msgspec.structs.replace(
+                message, frame="r1/1", means=from_floats(means),
+                changes=changes if message.final else (),
+            )  # fmt: skip
+        samples.append(msgspec.structs.replace(each, payload=encoded(message)))
+    with Recorder(path, "crowd", {}) as recorder:
+        recorder.write(samples)
+    with session(path, "127.0.0.1", 0, None, growing=False) as shown:
+        yield shown.url
+
+
+@pytest.fixture
+def changed(browser, changed_url):
+    browser.errors.clear()
+    browser.size(1280, 800)
+    browser.open(changed_url)
+    browser.wait(READY)
+    browser.wait("document.querySelector('#count-moved').textContent === '1'")
+    return browser
+
+
+def test_changes_since_a_saved_map_are_counted_and_explained_where_the_pointer_is(changed):
+    counts = [changed.text(f"#count-{name}") for name in ("moved", "gone", "new", "unchanged")]
+    assert counts == ["1", "1", "1", "1"]
+    assert changed.text("#changes li") == "2moved by (+12.000, −5.000) ± 0.125 m"
+    for landmark, words in ((2, "± 0.125 m, χ² 87"), (5, "9 observations were due"), (8, "new")):
+        row = f"teamslam.map.store.mapAt(teamslam.state.time).changes.of.get({landmark})"
+        x, y = changed.ask(
+            f"(() => {{ const c = {row}, m = teamslam.map;"
+            "const b = m.canvas.getBoundingClientRect(), [u, v] = m.screen(c.x, c.y);"
+            "return [b.x + u / m.ratio, b.y + v / m.ratio]; })()"
+        )
+        changed.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        changed.wait(f"document.querySelector('#map').title.includes({words!r})")
+    painted = "document.querySelector('#map').toDataURL()"
+    changed.wait(f"window.before === (window.before = {painted})")
+    changed.click("[data-layer=changes]")
+    changed.wait(f"{painted} !== window.before")
+    seek(changed, 30)
+    changed.wait("document.querySelector('#count-moved').textContent === '–'")
+    assert changed.errors == []
+
+
+def test_a_log_without_a_saved_map_has_no_changes(page):
+    assert page.ask("document.querySelector('#changes-card').hidden")
+    assert page.ask("document.querySelector('[data-layer=changes]').hidden")
+
+
+def test_the_truth_is_shown_in_the_frame_of_the_map_and_not_before_there_is_one(changed):
+    found = changed.ask("teamslam.store.truthAt(teamslam.state.time)")
+    assert found[:2] == pytest.approx(MOVED_FRAME, abs=0.5)
+    assert found[2] == pytest.approx(0.0, abs=0.02)
+    assert changed.ask("teamslam.store.truthAt(1)") is None
+    changed.ask("teamslam.map.on.truth = false")
+    extent = changed.ask("teamslam.store.extent()")
+    assert extent == changed.ask("teamslam.store.box")
+
+
+def test_the_name_of_a_robot_covers_no_number_of_a_landmark(page):
+    covered = page.ask(
+        "(() => { const m = teamslam.map, sides = new Set(); let covered = 0, names = 0;"
+        f"for (let t = 20; t <= {SECONDS}; t += 0.5) {{"
+        "  m.draw(t); const numbers = m.landmarkBoxes(m.store.mapAt(t));"
+        "  for (const a of m.names) { names++;"
+        "    covered += numbers.some((b) => Math.min(a[2], b[2]) > Math.max(a[0], b[0])"
+        "      && Math.min(a[3], b[3]) > Math.max(a[1], b[1])); }"
+        "  for (const side of m.sides.values()) sides.add(side); }"
+        "return [covered, names, sides.size > 1]; })()"
+    )
+    assert covered == [0, ROBOTS * 81, True]
 
 
 def test_it_fits_a_phone(page):

@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 
 from teamslam.central.desk.drawing import colour_of
-from teamslam.central.desk.evaluation.errors import PoseErrors
+from teamslam.central.desk.evaluation.errors import PoseErrors, transform_points
 from teamslam.central.desk.evaluation.events import Event, EventDetector
-from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
+from teamslam.central.desk.evaluation.running import RunningErrors, TruthFrames
+from teamslam.central.desk.evaluation.truth_alignment import TruthAlignment
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.view import foxglove_scene as fox
 from teamslam.central.desk.view.drawn import (
@@ -24,6 +25,7 @@ from teamslam.central.desk.view.drawn import (
     landmarks_of,
     place_points,
 )
+from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -131,8 +133,7 @@ class ViewerNode:
         self._robots: dict[str, _Robot] = {}
         self._maps: deque[m.FusedMap] = deque()
         self._landmarks: Landmarks | None = None
-        self._truth = TrueLandmarks()
-        self._frames = TruthFrames()
+        self._truth = TruthAlignment()
         self._has_map = False
         self._fused: m.FusedMap | None = None
         self._map_is_new = False
@@ -177,16 +178,14 @@ class ViewerNode:
         return max(min(at_work, default=newest), newest - LAG_NS)
 
     def _take(self, channel: Channel, message: m.Message) -> None:
+        self._truth.take(message)
         match message:
-            case m.InitialPose():
-                self._frames.take(message)
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
                 self._of(message.robot).errors.take_truth(message)
             case m.TruthLandmarks():
-                self._truth = TrueLandmarks.of(message)
-                self._extend(self._truth.positions)
+                self._extend(self._truth.landmarks.positions)
                 self._map_is_new = True
             case m.FusedMap():
                 self._maps.append(message)
@@ -283,15 +282,16 @@ class ViewerNode:
             self._extend(self._landmarks.means)
             self._map_is_new = True
         for robot in self._robots.values():
-            robot.go_to(now_ns, self._frames)
+            robot.go_to(now_ns, self._truth.frames)
             if robot.estimate is not None:
                 self._extend(robot.pose()[np.newaxis, :2])
 
     def _of_map(self, now_ns: int, size_m: float) -> list[Shown]:
         out = []
         entities = []
-        if len(self._truth.ids):
-            true = self._truth.positions
+        motion = self._truth.map_from_truth(self._fused)
+        if len(self._truth.landmarks.ids) and motion is not None:
+            true = transform_points(motion, self._truth.landmarks.positions)
             entities.append(fox.true_landmarks_entity(now_ns, true, size_m))
         if self._landmarks is not None:
             entities.append(fox.landmarks_entity(now_ns, self._landmarks, size_m))
@@ -302,9 +302,11 @@ class ViewerNode:
 
     def _scene(self, now_ns: int, size_m: float) -> bytes:
         entities = []
+        motion = self._truth.map_from_truth(self._fused)
         for number, (name, robot) in enumerate(self._in_order()):
             true = robot.errors.truth_at(now_ns)
-            if true is not None:
+            if true is not None and motion is not None:
+                true = compose(motion, true)
                 entities.append(fox.true_robot_entity(now_ns, name, true, size_m))
             if robot.estimate is not None:
                 trail = robot.track.since(now_ns - TRAIL_NS)
@@ -318,10 +320,13 @@ class ViewerNode:
 
     def _paths(self, now_ns: int) -> bytes:
         entities = []
+        motion = self._truth.map_from_truth(self._fused)
         for number, (name, robot) in enumerate(self._in_order()):
             colour = colour_of(number)
+            true = np.array(robot.true_track.points).reshape(-1, 2)
+            true = true[:0] if motion is None else transform_points(motion, true)
             for what, points, shade, pixels in (
-                ("true path", robot.true_track.points, (fox.TRUTH[0], 0.5), 1.0),
+                ("true path", [(x, y) for x, y in true.tolist()], (fox.TRUTH[0], 0.5), 1.0),
                 ("path", robot.track.points, (colour, 0.5), 1.5),
                 ("smoothed path", robot.smoothed, (colour, 1.0), 2.5),
             ):
@@ -343,8 +348,8 @@ class ViewerNode:
 
     def _team(self, now_ns: int) -> views.TeamFigures:
         fused = self._fused
-        known = fused is not None and self._frames.has(fused.frame)
-        fit = None if fused is None or not known else self._truth.fit(fused)
+        known = fused is not None and self._truth.frames.has(fused.frame)
+        fit = None if fused is None or not known else self._truth.landmarks.fit(fused)
         return views.TeamFigures(
             now_ns * 1e-9,
             0 if self._landmarks is None else len(self._landmarks.ids),

@@ -7,10 +7,13 @@ hello: team, title, colours, live. now: team time of all active robots. pose: ro
 xx, xy, yy, heading variance. outside: whether the robot is outside the team's map from now on; its
 poses are then not sent. frame: the robot's pose frame changes. err: rows of three errors, three 3σ
 bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as
-named. sensor: range, field of view and mount. see: rows of a measurement: landmark, −1 without
-identity, or teammate; ahead [m], left [m]. link: a submap (to) or a prior (from) `central`. fig: a
-node's figures. wait: the start-up states of a node. bytes: [key, t, messages, bytes] of one second.
-ev: event. eof: end of the log.
+named; a map may have `changes` since the saved maps: of unchanged landmarks the number, of others
+landmark, state, place in the saved map, displacement, its sigma [m], χ², expected observations.
+align: x, y, theta of the truth's frame in a map frame that is not it, null while undetermined; map
+frame null: before the first map. sensor: range, field of view and mount. see: rows of a
+measurement: landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a submap (to) or
+a prior (from) `central`. fig: a node's figures. wait: the start-up states of a node. bytes: [key,
+t, messages, bytes] of one second. ev: event. eof: end of the log.
 """
 
 import base64
@@ -23,9 +26,15 @@ import numpy as np
 
 from teamslam.central.desk.drawing import ROBOT_COLOURS
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
-from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks, TruthFrames
+from teamslam.central.desk.evaluation.running import RunningErrors
+from teamslam.central.desk.evaluation.truth_alignment import TruthAlignment
 from teamslam.central.desk.names import data_set_name
-from teamslam.central.desk.view.drawn import centre_particles, landmarks_of, place_points
+from teamslam.central.desk.view.drawn import (
+    Landmarks,
+    centre_particles,
+    landmarks_of,
+    place_points,
+)
 from teamslam.central.desk.view.landmark_sets import sets_of
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
 from teamslam.team.wire import channels as ch
@@ -90,8 +99,9 @@ class PageFrames:
         self._streams: dict[str, _Stream] = defaultdict(_Stream)
         self._traffic: dict[tuple[str, int], list[int]] = {}
         self._detector = EventDetector()
-        self._truth = TrueLandmarks()
-        self._frames = TruthFrames()
+        self._truth = TruthAlignment()
+        self._aligned: dict[str | None, list[float] | None] = {}
+        self._map: m.FusedMap | None = None
         self._has_map = False
         self._map_ns: int | None = None
         self._figures_s: dict[str, tuple[int, float, float]] = {}
@@ -156,9 +166,10 @@ class PageFrames:
     def take(self, channel: ch.Channel, message: m.Message) -> None:
         """Convert a message of one of the CHANNELS."""
         self._add_events(message)
+        self._truth.take(message)
         match message:
             case m.InitialPose():
-                self._frames.take(message)
+                self._align()
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
@@ -172,9 +183,9 @@ class PageFrames:
             case m.Observations() | m.Points() | m.Detections() | m.Sightings():
                 self._take_measurements(message)
             case m.TruthLandmarks():
-                self._truth = TrueLandmarks.of(message)
-                places = self._truth.positions.ravel().tolist()
-                self._add_frame("truth_map", ids=self._truth.ids.tolist(), xy=places)
+                true = self._truth.landmarks
+                places = true.positions.ravel().tolist()
+                self._add_frame("truth_map", ids=true.ids.tolist(), xy=places)
             case m.ParticleCloud():
                 t, seen = self._t(message.stamp_ns), centre_particles(message)
                 self._add_frame("cloud", r=message.robot, t=t, v=_base64(seen.astype("<f4")))
@@ -182,6 +193,7 @@ class PageFrames:
                 times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]
                 poses = floats(message.poses, "poses").tolist()
                 self._add_frame("path", r=message.robot, t=times, v=poses)
+                self._align()
             case _:
                 pass
 
@@ -211,7 +223,7 @@ class PageFrames:
             self._add_frame("outside", r=message.robot, t=self._t(message.stamp_ns), v=outside)
         if outside:
             return
-        frame = "" if self._frames.has(message.frame) else message.frame
+        frame = "" if self._truth.frames.has(message.frame) else message.frame
         if stream.frame not in (None, frame):
             self._add_frame("frame", r=message.robot, t=self._t(message.stamp_ns))
         stream.frame = frame
@@ -220,7 +232,7 @@ class PageFrames:
         spread = [float(P[0, 0]), float(P[0, 1]), float(P[1, 1]), float(P[2, 2])]
         row = [_short(v) for v in (x, y, heading, *spread)]
         stream.add("pose", self._t(message.stamp_ns), row)
-        if self._frames.has(message.frame):
+        if self._truth.frames.has(message.frame):
             stream.errors.take_pose(message)
 
     def _take_truth(self, message: m.Truth) -> None:
@@ -282,15 +294,22 @@ class PageFrames:
         self._map_ns = message.stamp_ns
         landmarks = landmarks_of(message)
         self._has_map = len(landmarks.ids) > 0
-        fit = self._truth.fit(message) if self._frames.has(message.frame) else None
+        self._map = message if self._has_map else None
+        self._align()
+        is_true = self._truth.frames.has(message.frame)
+        fit = self._truth.landmarks.fit(message) if is_true else None
         sets = sets_of(message)
-        unnamed: dict[str, object] = {}
+        extra: dict[str, object] = {}
         if sets:
             support = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
-            unnamed = {"n": [count for count, _ in support], "why": [words for _, words in support]}
+            extra = {"n": [count for count, _ in support], "why": [words for _, words in support]}
+        changes = _changes_of(message, landmarks)
+        if changes is not None:
+            extra["changes"] = changes
         self._add_frame(
             "map",
             t=self._t(message.stamp_ns),
+            f=self._frame(),
             ids=_base64(landmarks.ids.astype("<u4")),
             xy=_base64(landmarks.means.astype("<f4")),
             c=_base64(landmarks.blocks.astype("<f4")),
@@ -298,8 +317,19 @@ class PageFrames:
             joint=message.joint,
             rmse=None if fit is None else _short(fit.rmse_m),
             nees=_short(fit.nees_per_dof) if fit and (message.joint or message.final) else None,
-            **unnamed,
+            **extra,
         )
+
+    def _frame(self) -> str | None:
+        return None if self._map is None else self._map.frame
+
+    def _align(self) -> None:
+        """Send the place of the truth in the newest map's frame where it is new."""
+        found = self._truth.map_from_truth(self._map)
+        motion = None if found is None else [_short(v) for v in found.tolist()]
+        if motion != self._aligned.get(self._frame(), [0.0, 0.0, 0.0]):
+            self._aligned[self._frame()] = motion
+            self._add_frame("align", f=self._frame(), v=motion)
 
     def _take_status(self, message: m.Status) -> None:
         awaited = [warning for warning in message.warnings if is_awaited(warning)]
@@ -314,6 +344,22 @@ class PageFrames:
             self._figures_s[message.node] = news
             figures = {name: _short(value) for name, value in message.figures.items()}
             self._add_frame("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
+
+
+def _changes_of(message: m.FusedMap, landmarks: Landmarks) -> dict[str, object] | None:
+    """Changes since the saved maps; None without saved maps."""
+    if not message.changes:
+        return None
+    places = dict(zip(landmarks.ids.tolist(), landmarks.means.tolist(), strict=True))
+    rows = []
+    for each in message.changes:
+        if each.state != "unchanged" and each.landmark in places:
+            x, y = places[each.landmark]
+            figures = each.dx, each.dy, each.sigma, each.chi2, each.expected
+            row = [_short(v) for v in (x - each.dx, y - each.dy, *figures)]
+            rows.append([each.landmark, each.state, *row])
+    unchanged = sum(each.state == "unchanged" for each in message.changes)
+    return {"unchanged": unchanged, "rows": rows}
 
 
 def _short(value: float) -> float:

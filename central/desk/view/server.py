@@ -286,6 +286,19 @@ def serving(
         thread.join(5.0)
 
 
+def free_port(host: str, port: int) -> int:
+    """Return `port`, or 0 (any free one) where another program listens there."""
+    try:
+        socket.create_server((host, port), family=_family(host)).close()
+    except OSError as error:
+        return 0 if error.errno == errno.EADDRINUSE else port
+    return port
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
+
+
 def _reason(error: OSError) -> str:
     """The system's words for an error; those of asyncio repeat the address."""
     number = error.errno or 0

@@ -105,9 +105,10 @@ class LandmarkChange(msgspec.Struct, frozen=True, kw_only=True, array_like=True)
     """The state of a landmark against the saved maps of earlier days.
 
     dx, dy [m]: its displacement since then, in the frame of the map; sigma [m]: standard deviation
-    of one coordinate of it; chi2: of two degrees of freedom that it has not moved; all 0 for a
-    landmark that is gone or new. expected: how often it should have been observed, of one that is
-    gone.
+    of one coordinate of it; chi2: of two degrees of freedom that it has not moved; sigma and chi2
+    are 0 for a landmark that is gone or new. dx, dy of one that is gone: of the map's place for it,
+    where a submap has its number elsewhere. expected: how often one that is gone should have been
+    observed.
     """
 
     landmark: Count

@@ -10,16 +10,20 @@ from http.client import HTTPConnection
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import msgspec
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.view.export import with_views
 from teamslam.central.desk.view.foxglove_proxy import VIEWERS, refusal
 from teamslam.central.desk.view.layout import layout
+from teamslam.central.desk.view.node import ViewerNode
 from teamslam.central.desk.view.page_frames import PageFrames
 from teamslam.central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
 from teamslam.sim.cli import view
@@ -28,12 +32,12 @@ from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.tail import Tail
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.crowd import crowd
-from tests.support import ROOT, wait_until
+from tests.support import ROOT, fused_map, wait_until
 
 ROBOTS, LANDMARKS, SECONDS = 3, 40, 60
 PAGE = ROOT / "central" / "desk" / "view" / "page"
@@ -202,6 +206,102 @@ def test_an_event_is_at_the_time_of_what_it_is_about(samples, tmp_path):
     assert times["r1 is in the team's map"] == 4.8
 
 
+def test_the_page_gets_the_changes_since_the_saved_map_with_the_old_places():
+    changes = (
+        m.LandmarkChange(landmark=3, state="unchanged", dx=0.01, sigma=0.02, chi2=0.3),
+        m.LandmarkChange(landmark=4, state="moved", dx=0.5, dy=-0.25, sigma=0.125, chi2=17.0),
+        m.LandmarkChange(landmark=7, state="gone", expected=9.5),
+        m.LandmarkChange(landmark=8, state="new"),
+    )
+    fused = fused_map(
+        final=True, changes=changes, ids=from_ids([3, 4, 7, 8]),
+        means=from_floats(np.arange(8.0)), covariance=from_floats([1.0, 0.0, 1.0] * 4),
+    )  # fmt: skip
+    plain = msgspec.structs.replace(fused, changes=())
+    shown, without = (
+        next(each for each in told_of((ch.FINAL_MAP, of)) if each["k"] == "map")
+        for of in (fused, plain)
+    )
+    assert shown["changes"] == {
+        "unchanged": 1,
+        "rows": [
+            [4, "moved", 1.5, 3.25, 0.5, -0.25, 0.125, 17.0, 0.0],
+            [7, "gone", 4.0, 5.0, 0.0, 0.0, 0.0, 0.0, 9.5],
+            [8, "new", 6.0, 7.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        ],
+    }
+    assert "changes" not in without
+
+
+MAP_FROM_TRUTH = np.array([3.0, -2.0, 0.7])
+TRUE = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 5.0]])
+
+
+def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Channel, m.Message]]:
+    """A map in the frame of a robot, whose start may be known; truth of it and of its landmarks."""
+    heading = np.zeros((3, 1))
+    true_path = np.hstack((TRUE + 1.0, heading))
+    path = np.hstack((transform_points(MAP_FROM_TRUTH, TRUE + 1.0), heading + MAP_FROM_TRUTH[2]))
+    at = from_stamps(np.arange(3) * 10**9)
+    fused = fused_map(
+        stamp_ns=2 * 10**9, final=True, frame="r1/1", ids=from_ids([1, 2, 3]),
+        means=from_floats(transform_points(MAP_FROM_TRUTH, TRUE)),
+        covariance=from_floats([1.0, 0.0, 1.0] * 3),
+    )  # fmt: skip
+    start = build.initial_pose(
+        robot="r1", incarnation=1, pose=from_floats(np.zeros(3)) if known else b""
+    )
+    truth = m.TruthLandmarks(stamp_ns=0, ids=from_ids([1, 2, 3]), positions=from_floats(TRUE))
+    return [
+        (ch.START, start),
+        *([(ch.TRUTH_LANDMARKS, truth)] if landmarks else []),
+        (ch.TRUTH, build.truth(robot="r1", stamps=at, poses=from_floats(true_path))),
+        (ch.TRAJECTORY, build.trajectory(robot="r1", stamps=at, poses=from_floats(path))),
+        (ch.FINAL_MAP, fused),
+    ]
+
+
+@pytest.mark.parametrize("landmarks", [True, False])
+def test_the_truth_is_aligned_with_a_map_in_an_arbitrary_frame(landmarks):
+    told = told_of(*in_an_arbitrary_frame(landmarks=landmarks, known=False))
+    before, of_map = (each for each in told if each["k"] == "align")
+    assert before == {"k": "align", "f": None, "v": None}
+    assert of_map["f"] == next(each["f"] for each in told if each["k"] == "map") == "r1/1"
+    assert of_map["v"] == pytest.approx(MAP_FROM_TRUTH)
+
+
+def test_the_truth_is_not_moved_in_its_own_frame():
+    told = told_of(*in_an_arbitrary_frame(landmarks=True, known=True))
+    assert not [each for each in told if each["k"] == "align"]
+
+
+def test_without_an_alignment_the_truth_is_left_out():
+    told = told_of(
+        *(each for each in in_an_arbitrary_frame(landmarks=False, known=False)
+          if each[0] is not ch.TRAJECTORY)
+    )  # fmt: skip
+    assert [each["v"] for each in told if each["k"] == "align"] == [None, None]
+
+
+@pytest.mark.parametrize(("known", "moved"), [(False, True), (True, False)])
+def test_foxgloves_true_landmarks_are_in_the_frame_of_the_map(known, moved):
+    node = ViewerNode()
+    pose = build.pose_estimate(
+        stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
+        pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3)),
+    )  # fmt: skip
+    views = []
+    for channel, message in [
+        *in_an_arbitrary_frame(landmarks=True, known=known)[:3], (ch.TEAM_POSE, pose),
+        *in_an_arbitrary_frame(landmarks=True, known=known)[3:],
+    ]:  # fmt: skip
+        views += node.handle(channel, message)
+    scenes = [SceneUpdate.FromString(each.payload) for each in views if each.key == "view/map"]
+    true = next(each for each in scenes[-1].entities if each.id == "true landmarks")
+    places = [(cube.pose.position.x, cube.pose.position.y) for cube in true.cubes]
+    np.testing.assert_allclose(places, transform_points(MAP_FROM_TRUTH, TRUE) if moved else TRUE)
+
+
 def test_a_submap_and_a_prior_are_links_to_and_from_the_centre():
     page = PageFrames()
     for channel in (ch.SUBMAP, ch.OWN_MAP, ch.PRIOR):
@@ -321,6 +421,19 @@ def test_a_port_that_is_taken_is_told_with_a_remedy(log):
                 session(log, "127.0.0.1", *ports, growing=False),
             ):
                 pass
+
+
+def test_a_second_view_gives_foxglove_a_free_port_and_says_so(log, monkeypatch, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        monkeypatch.setattr(view, "FOXGLOVE_PORT", taken)
+        with view.shown_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
+            assert urlsplit(shown.foxglove).port not in (taken, None)
+    said = capsys.readouterr().out
+    assert f"{shown.foxglove}   ({taken} is taken; --foxglove-port chooses another)" in said
+    with view.shown_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
+        assert urlsplit(shown.foxglove).port == taken
+    assert "is taken" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("host", ["nowhere.invalid", "192.0.2.1"])

@@ -1,13 +1,13 @@
 // The page: the stream of frames into the store, the time, and what is shown at it.
 
-import { LAYERS, MARKS, MapView, gridStep } from './mapview.js';
+import { CHANGES, LAYERS, MARKS, MapView, gridStep } from './mapview.js';
 import { Plot, colour } from './plots.js';
 import { Store, inOrder, upTo } from './store.js';
 
 const WARN = 1.1, FAIL = 1.3;  // of the joint cost per degree of freedom, as the centre's monitor
 const SCALE_WARN = Math.SQRT2; // of the covariance scale, and its inverse
 const TEXT_MS = 160;           // between two looks of tables
-const TRAFFIC_ROWS = 40;
+const TRAFFIC_ROWS = 40, CHANGE_ROWS = 40;
 const $ = (id) => document.getElementById(id);
 
 const store = new Store();
@@ -75,13 +75,34 @@ function showAll() {
 
 map.onMove = () => follow(null);
 map.onPick = (x, y) => {
+  $('why').textContent = linesAt(x, y).join('\n');
+  $('why').hidden = !$('why').textContent;
+};
+map.onHover = (x, y) => { map.canvas.title = linesAt(x, y).join('\n'); };
+
+/** The events and the landmark that are shown at a place on the screen, in words. */
+function linesAt(x, y) {
   const shown = store.mapAt(state.time);
   const i = map.landmarkAt(shown, x, y), events = map.eventsAt(x, y);
-  $('why').hidden = i < 0 && !events.length;
-  $('why').textContent = [...events.map((event) => `${event.t.toFixed(0)} s: ${event.x}`), ...(i < 0 ? [] : landmarkLines(shown, i))].join('\n');
-};
+  return [...events.map((event) => `${event.t.toFixed(0)} s: ${event.x}`), ...(i < 0 ? [] : landmarkLines(shown, i))];
+}
 
 function landmarkLines(shown, i) {
+  const change = shown.changes && shown.changes.of.get(shown.ids[i]);
+  const lines = membershipLines(shown, i);
+  if (!change) return lines;
+  const test = change.state === 'moved' ? `, χ² ${change.chi2.toFixed(0)} of 2 degrees of freedom` : '';
+  return [...lines, `since the saved map: ${changeText(change)}${test}`];
+}
+
+function changeText({ state: now, dx, dy, sigma, expected }) {
+  if (now === 'moved') return `moved by (${signed(dx)}, ${signed(dy)}) ± ${sigma.toFixed(3)} m`;
+  return now === 'gone' ? `gone: not seen, though ${expected.toFixed(0)} observations were due` : 'new';
+}
+
+function signed(v) { return `${v < 0 ? '−' : '+'}${Math.abs(v).toFixed(3)}`; }
+
+function membershipLines(shown, i) {
   return shown.why && shown.why[i].length
     ? [`landmark ${shown.ids[i]}, ${shown.n[i] === 1 ? 'tentative: one submap has it' : `confirmed by ${shown.n[i]}${!shown.final && shown.n[i] === 12 ? ' or more' : ''} submaps`}`, ...shown.why[i]]
     : [`landmark ${shown.ids[i]}, known by its name`];
@@ -104,6 +125,8 @@ $('layers').parentElement.open = innerWidth > 860;  // on a phone they would hid
 for (const [name, text] of LAYERS) {
   const button = document.createElement('button');
   button.textContent = text;
+  button.dataset.layer = name;
+  button.hidden = name === 'changes';  // until there is a saved map
   button.setAttribute('aria-pressed', String(map.on[name]));
   button.addEventListener('click', () => {
     map.on[name] = !map.on[name];
@@ -202,6 +225,7 @@ function look() {
   $('follow').title = $('follow').ariaLabel = `follow ${map.follow || state.chosen || 'a robot'} (R)`;
   lookAtWaiting();
   lookAtMap();
+  lookAtChanges();
   lookAtRobots();
   lookAtPeers();
   lookAtEvents();
@@ -256,6 +280,35 @@ function scaleSays(scale) {
 }
 
 function metresText(v) { return v < 0.995 ? `${(100 * v).toFixed(v < 0.0995 ? 1 : 0)} cm` : `${v.toFixed(2)} m`; }
+
+/** Counts of the landmarks by their state against the saved maps, and what has changed. */
+let changesShown;
+function lookAtChanges() {
+  $('changes-card').hidden = document.querySelector('[data-layer=changes]').hidden = !store.hasChanges;
+  const shown = store.mapAt(state.time), changes = shown && shown.changes;
+  if (changesShown === changes) return;
+  changesShown = changes;
+  $('changes-say').textContent = `since the saved map${changes ? '' : '; with the final map'}`;
+  const rows = changes ? changes.rows : [], states = Object.keys(CHANGES);
+  for (const name of states) $(`count-${name}`).textContent = changes ? rows.filter((row) => row.state === name).length : '–';
+  $('count-unchanged').textContent = changes ? changes.unchanged : '–';
+  const listed = [...rows].sort((a, b) => states.indexOf(a.state) - states.indexOf(b.state)).slice(0, CHANGE_ROWS);
+  $('changes').replaceChildren(...listed.map((row) => {
+    const item = document.createElement('li'), name = document.createElement('b'), text = document.createElement('span');
+    item.tabIndex = 0;
+    name.textContent = row.landmark;
+    text.textContent = changeText(row);
+    text.className = row.state;
+    item.append(name, text);
+    const show = () => map.show(row.x, row.y);
+    item.addEventListener('click', show);
+    item.addEventListener('keydown', (pressed) => { if (pressed.key === 'Enter') show(); });
+    return item;
+  }));
+  const more = rows.length - listed.length;
+  $('changes-more').hidden = !more;
+  $('changes-more').textContent = `and ${more} more: the report and its JSON list all`;
+}
 
 const rows = new Map();
 function lookAtRobots() {

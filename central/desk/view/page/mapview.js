@@ -9,7 +9,7 @@ const UNNAMED = 2 ** 31;           // from here on the map has numbered landmark
 const LABELS = 400;                // more landmarks than these have no numbers until they are near
 
 export const LAYERS = [
-  ['ellipses', '95 % ellipses'], ['labels', 'numbers'], ['paths', 'online paths'], ['smoothed', 'smoothed paths'],
+  ['ellipses', '95 % ellipses'], ['labels', 'numbers'], ['changes', 'changes'], ['paths', 'online paths'], ['smoothed', 'smoothed paths'],
   ['truth', 'truth'], ['seen', 'measurements'], ['view', 'field of view'], ['links', 'messages'],
   ['events', 'events'], ['particles', 'particles'],
 ];
@@ -17,6 +17,9 @@ export const MARKS = {  // colour of an event on the map and above the slider
   lost: 'bad', refused: 'bad', withdrawn: 'bad', warning: 'warn', map: 'good', joined: 'good',
   closure: 'good', undone: 'warn', restarted: 'warn',
 };
+export const CHANGES = { moved: 'warn', gone: 'bad', new: 'good' };  // colour of a landmark against the saved maps
+const NEAR = [[1, 1], [1, 0], [1, -1], [-1, 1], [-1, 0], [-1, -1], [0, 1.4], [0, -1.4]];
+const SIDES = [...NEAR, ...NEAR.map(([across, down]) => [2 * across, 2 * down])];  // of a name at its robot: right, down; the nearest first
 const PULSE_S = 0.8;               // of a message on its way, in seconds of the viewer
 
 export class MapView {
@@ -38,6 +41,8 @@ export class MapView {
     this.cost = 0;               // of painting them [ms]
     this.pending = false;
     this.frames = 0;
+    this.sides = new Map();      // of the robots' names, by robot
+    this.names = [];             // their boxes
     this.readColours();
     this.listen();
   }
@@ -67,7 +72,7 @@ export class MapView {
   }
 
   fit() {
-    const [left, bottom, right, top] = this.store.box;
+    const [left, bottom, right, top] = this.store.extent();
     if (!(right >= left)) return;
     const width = Math.max(right - left, 1), height = Math.max(top - bottom, 1);
     this.resize();
@@ -120,7 +125,10 @@ export class MapView {
     });
     canvas.addEventListener('pointermove', (event) => {
       const before = fingers.get(event.pointerId);
-      if (!before) return;
+      if (!before) {
+        if (this.onHover) this.onHover(event.offsetX * this.ratio, event.offsetY * this.ratio);
+        return;
+      }
       const now = [event.offsetX, event.offsetY];
       fingers.set(event.pointerId, now);
       this.centre = [
@@ -164,7 +172,7 @@ export class MapView {
     const { width, height } = this.canvas, fast = this.fast;
     const g = new SvgContext(width, height);
     this.fast = false;
-    this.paintLandmarks(g, this.store.mapAt(time));
+    this.paintLandmarks(g, this.store.mapAt(time), this.store.truthAt(time));
     this.paintPaths(g, time, new Map());
     this.paintMoving(g, time);
     this.fast = fast;
@@ -178,6 +186,7 @@ export class MapView {
     if (this.on.particles) this.paintParticles(g, time);
     if (this.on.events) this.paintEvents(g, time);
     for (const robot of robots) this.paintRobot(g, robot, time);
+    this.paintNames(g, time);
     if (this.on.links) this.paintLinks(g, time);
   }
 
@@ -200,15 +209,15 @@ export class MapView {
       this.pending = true;
       return;
     }
-    const map = this.store.mapAt(time);
-    const news = this.painted.map !== map || this.painted.trueMap !== this.store.trueMap;
+    const map = this.store.mapAt(time), motion = this.store.truthAt(time);
+    const news = this.painted.map !== map || this.painted.trueMap !== this.store.trueMap || this.painted.motion !== motion;
     const began = performance.now();
     this.fast = moved && !still && this.cost > 8;
     if (moved || fresh || this.painted.fast || (news && due)) {
       if (this.painted.fast && !this.fast) this.painted.paths = null;
-      this.paintLandmarks(this.landmarks.getContext('2d'), map);
+      this.paintLandmarks(this.landmarks.getContext('2d'), map, motion);
       this.painted = {
-        ...this.painted, view, shape, map, trueMap: this.store.trueMap, scale: this.scale, centre: [...this.centre],
+        ...this.painted, view, shape, map, motion, trueMap: this.store.trueMap, scale: this.scale, centre: [...this.centre],
         fast: this.fast,
       };
       this.paintedAt = began;
@@ -249,16 +258,16 @@ export class MapView {
     }
   }
 
-  paintLandmarks(g, map) {
+  paintLandmarks(g, map, motion) {
     this.paintGrid(g);
     const r = this.ratio;
-    if (this.on.truth && this.store.trueMap) {
+    if (this.on.truth && this.store.trueMap && motion) {
       g.strokeStyle = this.colours.truth;
       g.lineWidth = 1.2 * r;
       g.beginPath();
       const { xy } = this.store.trueMap, arm = 4 * r;
       for (let i = 0; i < xy.length; i += 2) {
-        const [x, y] = this.screen(xy[i], xy[i + 1]);
+        const [x, y] = this.screen(...moved(motion, xy[i], xy[i + 1]));
         if (x < -9 || y < -9 || x > this.canvas.width + 9 || y > this.canvas.height + 9) continue;
         g.moveTo(x - arm, y - arm); g.lineTo(x + arm, y + arm);
         g.moveTo(x - arm, y + arm); g.lineTo(x + arm, y - arm);
@@ -267,8 +276,10 @@ export class MapView {
     }
     if (!map) return;
     const count = map.ids.length, k = this.scale * r;
-    const seen = [];
+    const seen = [], changes = this.on.changes && map.changes;
     for (let i = 0; i < count; i++) {
+      const change = changes && changes.of.get(map.ids[i]);
+      if (change && change.state === 'gone') continue;  // it is drawn at its place in the saved map
       const [x, y] = this.screen(map.xy[2 * i], map.xy[2 * i + 1]);
       if (x > -40 && y > -40 && x < this.canvas.width + 40 && y < this.canvas.height + 40) seen.push([x, y, i]);
     }
@@ -297,19 +308,58 @@ export class MapView {
       g.fill();
     }
     if (this.on.labels && seen.length <= LABELS) {
-      g.font = `${11 * r}px system-ui, "DejaVu Sans", sans-serif`;
+      g.font = this.font(11);
       g.fillStyle = this.colours.soft;
       for (const [x, y, i] of seen) if (map.ids[i] < UNNAMED) g.fillText(map.ids[i], x + 6 * r, y - 5 * r);
     }
+    if (changes) this.paintChanges(g, changes);
   }
 
-  // The landmark of a map that is drawn within 12 pixels of a place on the screen; -1: there is none.
+  /**
+   * Landmarks that are not as the saved maps have them: of a moved one an arrow from its old place,
+   * of one that is gone a hollow mark there, around a new one a square.
+   */
+  paintChanges(g, changes) {
+    const r = this.ratio;
+    g.font = this.font(11);
+    for (const { landmark, state, x, y, dx, dy } of changes.rows) {
+      const [u, v] = this.screen(x, y), [p, q] = this.screen(x + dx, y + dy);
+      g.strokeStyle = g.fillStyle = this.colours[CHANGES[state]];
+      g.lineWidth = 1.6 * r;
+      if (state === 'new') {
+        g.beginPath(); g.rect(u - 6 * r, v - 6 * r, 12 * r, 12 * r); g.stroke();
+        continue;
+      }
+      g.setLineDash(state === 'gone' ? [3 * r, 2.5 * r] : []);
+      g.beginPath(); g.arc(u, v, (state === 'gone' ? 6 : 4) * r, 0, 2 * Math.PI); g.stroke();
+      g.setLineDash([]);
+      if (state === 'gone') {
+        if (this.on.labels && landmark < UNNAMED) g.fillText(landmark, u + 8 * r, v - 5 * r);
+        continue;
+      }
+      const long = Math.hypot(p - u, q - v), head = Math.min(8 * r, 0.6 * long), turn = Math.atan2(q - v, p - u);
+      g.beginPath(); g.moveTo(u, v); g.lineTo(p, q); g.stroke();
+      g.beginPath();
+      g.moveTo(p, q);
+      for (const side of [-0.45, 0.45]) g.lineTo(p - head * Math.cos(turn + side), q - head * Math.sin(turn + side));
+      g.closePath(); g.fill();
+      g.beginPath(); g.arc(p, q, 7 * r, 0, 2 * Math.PI); g.stroke();
+    }
+  }
+
+  font(size) { return `${size * this.ratio}px system-ui, "DejaVu Sans", sans-serif`; }
+
+  // The landmark of a map that is drawn within 12 pixels of a place on the screen, also its place in the saved map; -1: there is none.
   landmarkAt(map, x, y) {
     let best = -1, least = 12 * this.ratio;
-    for (let i = 0; map && i < map.ids.length; i++) {
-      const [u, v] = this.screen(map.xy[2 * i], map.xy[2 * i + 1]);
-      const away = Math.hypot(u - x, v - y);
+    const take = (i, place) => {
+      const [u, v] = this.screen(...place), away = Math.hypot(u - x, v - y);
       if (away < least) { best = i; least = away; }
+    };
+    for (let i = 0; map && i < map.ids.length; i++) {
+      const change = this.on.changes && map.changes && map.changes.of.get(map.ids[i]);
+      if (change) take(i, [change.x, change.y]);
+      if (!change || change.state !== 'gone') take(i, [map.xy[2 * i], map.xy[2 * i + 1]]);
     }
     return best;
   }
@@ -317,7 +367,7 @@ export class MapView {
   extendPaths(time, view) {
     const g = this.paths.getContext('2d');
     const inside = [...this.store.robots.values()].filter((robot) => !this.store.isOutside(robot, time));
-    const shown = inside.map((robot) => `${robot.name} ${this.store.firstInFrame(robot, time)}`).join();
+    const shown = `${this.store.truthAt(time)} ${inside.map((robot) => `${robot.name} ${this.store.firstInFrame(robot, time)}`)}`;
     const sameView = this.painted.paths === view && time >= this.painted.time && this.painted.store === this.store.hello && this.painted.shown === shown;
     if (!sameView) {
       g.clearRect(0, 0, this.canvas.width, this.canvas.height);
@@ -332,10 +382,10 @@ export class MapView {
 
   /** Paint what `ends` lacks of the paths until a time; it gets how far each is painted. */
   paintPaths(g, time, ends) {
-    const r = this.ratio;
+    const r = this.ratio, motion = this.store.truthAt(time);
     g.lineJoin = 'bevel';
     for (const robot of this.store.robots.values()) {
-      if (this.on.truth) this.extendPath(g, ends, `truth ${robot.name}`, robot.truth, time, this.colours.truth, 1 * r, 0.55);
+      if (this.on.truth && motion) this.extendPath(g, ends, `truth ${robot.name}`, robot.truth, time, this.colours.truth, 1 * r, 0.55, 0, motion);
       const beside = this.on.smoothed && robot.smoothed.length;
       if (beside) this.extendPath(g, ends, `smoothed ${robot.name}`, robot.smoothed, time, robot.colour, 2.2 * r, 0.95);
       // Poses from before a robot was in the team's frame are in its own frame.
@@ -345,7 +395,7 @@ export class MapView {
     }
   }
 
-  extendPath(g, ends, key, series, time, colour, width, alpha, first = 0) {
+  extendPath(g, ends, key, series, time, colour, width, alpha, first = 0, motion = null) {
     const from = Math.max(first, ends.get(key) || 0);
     const to = series.at(time);
     if (to <= from) return;
@@ -354,10 +404,14 @@ export class MapView {
     g.globalAlpha = alpha;
     g.beginPath();
     let drawn = 0;
-    let [x, y] = this.screen(series.get(from, 0), series.get(from, 1));
+    const at = (i) => {
+      const place = [series.get(i, 0), series.get(i, 1)];
+      return this.screen(...(motion ? moved(motion, ...place) : place));
+    };
+    let [x, y] = at(from);
     g.moveTo(x, y);
     for (let i = from + 1; i <= to; i++) {
-      const [nx, ny] = this.screen(series.get(i, 0), series.get(i, 1));
+      const [nx, ny] = at(i);
       if (i < to && Math.abs(nx - x) + Math.abs(ny - y) < 1.5) continue;  // nobody could see it
       if (Math.hypot(nx - x, ny - y) > 2.5 * this.scale * this.ratio + 400) g.moveTo(nx, ny); else g.lineTo(nx, ny);
       [x, y] = [nx, ny];
@@ -454,7 +508,7 @@ export class MapView {
     g.strokeStyle = this.colours.soft;
     g.lineWidth = 1.5 * r;
     g.beginPath(); g.rect(x - 9 * r, y - 9 * r, 18 * r, 18 * r); g.fill(); g.stroke();
-    g.font = `${11 * r}px system-ui, "DejaVu Sans", sans-serif`;
+    g.font = this.font(11);
     g.fillStyle = this.colours.soft;
     g.textAlign = 'center';
     g.fillText('centre', x, y + 22 * r);
@@ -511,12 +565,13 @@ export class MapView {
 
   paintRobot(g, robot, time) {
     const r = this.ratio;
-    if (this.on.truth) {
+    const motion = this.on.truth && this.store.truthAt(time);
+    if (motion) {
       const i = robot.truth.at(time);
       if (i >= 0) {
         const place = between(robot.truth, i, time);
-        const [x, y] = this.screen(place[0], place[1]);
-        this.arrow(g, x, y, place[2], 9 * r);
+        const [x, y] = this.screen(...moved(motion, place[0], place[1]));
+        this.arrow(g, x, y, place[2] + motion[2], 9 * r);
         g.strokeStyle = this.colours.truth;
         g.lineWidth = 1.3 * r;
         g.stroke();
@@ -543,13 +598,64 @@ export class MapView {
     g.lineWidth = 1.5 * r;
     g.strokeStyle = this.colours.ground;
     g.stroke();
-    g.font = `600 ${12 * r}px system-ui, "DejaVu Sans", sans-serif`;
-    const text = lost ? `${robot.name} lost` : robot.name;
-    g.lineWidth = 3.5 * r;
-    g.strokeText(text, x + 13 * r, y + 15 * r);
-    g.fillStyle = robot.colour;
-    g.fillText(text, x + 13 * r, y + 15 * r);
     g.globalAlpha = 1;
+  }
+
+  /** Names beside the robots, where they cover no number, landmark, robot or other name. */
+  paintNames(g, time) {
+    const r = this.ratio, font = `600 ${this.font(12)}`;
+    this.context.font = font;
+    const robots = [...this.store.robots.values()].flatMap((robot) => {
+      const place = this.placeAt(robot, time);
+      if (!place) return [];
+      const [x, y] = this.screen(place[0], place[1]);
+      const isLost = this.store.stateAt(robot, time) === 'lost';
+      const text = isLost ? `${robot.name} lost` : robot.name;
+      return [{ robot, x, y, text, isLost, width: this.context.measureText(text).width }];
+    });
+    const taken = [...robots.map(({ x, y }) => box(x, y, 12 * r, 12 * r)), ...this.landmarkBoxes(this.store.mapAt(time))];
+    this.names = [];
+    for (const { robot, x, y, text, isLost, width } of robots) {
+      const w = width / 2 + 2 * r, reach = [2 * w + 24 * r, 52 * r];
+      const near = taken.filter((each) => overlap(each, box(x, y, ...reach)));
+      let best = null, least = Infinity;
+      const before = this.sides.get(robot.name);
+      for (const side of [...(before === undefined ? [] : [before]), ...SIDES.keys()]) {  // a name stays where it can
+        const [across, down] = SIDES[side];
+        const at = box(x + Math.sign(across) * w + across * 11 * r, y + down * 15 * r, w, 7 * r);
+        const covered = near.reduce((sum, each) => sum + overlap(at, each), 0);
+        if (covered < least) { best = { at, side }; least = covered; }
+        if (!covered) break;
+      }
+      this.sides.set(robot.name, best.side);
+      this.names.push(best.at);
+      taken.push(best.at);
+      g.font = font;
+      g.globalAlpha = isLost ? 0.4 : 1;
+      g.strokeStyle = this.colours.ground;
+      g.fillStyle = robot.colour;
+      g.lineWidth = 3.5 * r;
+      const [left, , , bottom] = best.at;
+      g.strokeText(text, left + 2 * r, bottom - 3 * r);
+      g.fillText(text, left + 2 * r, bottom - 3 * r);
+      g.globalAlpha = 1;
+    }
+  }
+
+  /** Boxes [left, top, right, bottom] of landmarks and of their numbers; none where numbers are not shown for their number. */
+  landmarkBoxes(map) {
+    const r = this.ratio, boxes = [];
+    let shown = 0;
+    for (let i = 0; map && i < map.ids.length; i++) {
+      const [x, y] = this.screen(map.xy[2 * i], map.xy[2 * i + 1]);
+      if (x < -40 || y < -40 || x > this.canvas.width + 40 || y > this.canvas.height + 40) continue;
+      if (++shown > LABELS) return [];
+      boxes.push(box(x, y, 3 * r, 3 * r));
+      if (this.on.labels && map.ids[i] < UNNAMED) {
+        boxes.push([x + 6 * r, y - 14 * r, x + (6 + 7 * String(map.ids[i]).length) * r, y - 4 * r]);
+      }
+    }
+    return boxes;
   }
 
   arrow(g, x, y, heading, size) {
@@ -561,6 +667,14 @@ export class MapView {
     g.lineTo(...at(-2.5, size));
     g.closePath();
   }
+}
+
+/** [left, top, right, bottom] of a box by its middle and half sizes. */
+function box(x, y, w, h) { return [x - w, y - h, x + w, y + h]; }
+
+/** The area that two boxes have in common. */
+function overlap(a, b) {
+  return Math.max(0, Math.min(a[2], b[2]) - Math.max(a[0], b[0])) * Math.max(0, Math.min(a[3], b[3]) - Math.max(a[1], b[1]));
 }
 
 /** The place that is so far ahead and left of a pose. */

@@ -30,6 +30,7 @@ const POSE = 7;   // x, y, heading, xx, xy, yy, heading's variance
 const ERROR = 7;  // x, y, heading, their 3σ, NEES per degree of freedom
 const TRUTH = 3;
 const SEEN = 3;   // landmark, −1 without identity, or teammate; ahead, left
+const UNMOVED = [0, 0, 0];
 const PLACED = /\blandmarks? (\d+)/;
 
 function floats(text) {
@@ -51,6 +52,8 @@ export class Store {
     this.maps = [];
     this.mapTimes = [];
     this.trueMap = null;
+    this.align = new Map();  // place of the truth in a map's frame that is not its own; null: undetermined
+    this.hasChanges = false;
     this.figures = new Map();
     this.traffic = new Map();
     this.events = [];
@@ -62,6 +65,7 @@ export class Store {
     this.complete = false;
     this.version = 0;
     this.box = [Infinity, Infinity, -Infinity, -Infinity];
+    this.trueBox = [...this.box];
   }
 
   robot(name) {
@@ -79,8 +83,7 @@ export class Store {
     return found;
   }
 
-  extend(values, width) {
-    const box = this.box;
+  extend(values, width, box = this.box) {
     for (let i = 0; i + 1 < values.length; i += width) {
       box[0] = Math.min(box[0], values[i]); box[1] = Math.min(box[1], values[i + 1]);
       box[2] = Math.max(box[2], values[i]); box[3] = Math.max(box[3], values[i + 1]);
@@ -97,12 +100,13 @@ export class Store {
       case 'outside': this.robot(frame.r).outside.push([frame.t], [Number(frame.v)]); break;
       case 'frame': this.robot(frame.r).frames.push([frame.t], []); break;
       case 'err': this.robot(frame.r).error.push(frame.t, frame.v); break;
-      case 'truth': this.robot(frame.r).truth.push(frame.t, frame.v); this.extend(frame.v, TRUTH); break;
+      case 'truth': this.robot(frame.r).truth.push(frame.t, frame.v); this.extend(frame.v, TRUTH, this.trueBox); break;
       case 'truth_map':
         this.trueMap = { ids: frame.ids, xy: frame.xy };
-        this.extend(frame.xy, 2);
+        this.extend(frame.xy, 2, this.trueBox);
         break;
       case 'map': this.takeMap(frame); break;
+      case 'align': this.align.set(frame.f, frame.v); break;
       case 'cloud': {
         const robot = this.robot(frame.r);
         robot.clouds.push(floats(frame.v));
@@ -132,7 +136,15 @@ export class Store {
   }
 
   takeMap(frame) {
-    const map = { ...frame, ids: names(frame.ids), xy: floats(frame.xy), c: floats(frame.c) };
+    const map = { ...frame, ids: names(frame.ids), xy: floats(frame.xy), c: floats(frame.c), changes: null };
+    if (frame.changes) {
+      this.hasChanges = true;
+      const rows = frame.changes.rows.map(([landmark, state, x, y, dx, dy, sigma, chi2, expected]) => ({
+        landmark, state, x, y, dx, dy, sigma, chi2, expected,
+      }));
+      map.changes = { unchanged: frame.changes.unchanged, rows, of: new Map(rows.map((row) => [row.landmark, row])) };
+      this.extend(rows.flatMap((row) => [row.x, row.y]), 2);
+    }
     const last = this.mapTimes[this.mapTimes.length - 1];
     this.maps.push(map);
     this.mapTimes.push(last === undefined ? frame.t : Math.max(frame.t, last));
@@ -184,6 +196,18 @@ export class Store {
   mapAt(time) {
     const i = upTo(this.mapTimes, time) - 1;
     return i < 0 ? null : this.maps[i];
+  }
+
+  /** The place of the truth in the frame of the map at a time; null: undetermined, it is not shown. */
+  truthAt(time) {
+    const map = this.mapAt(time), found = this.align.get(map ? map.f : null);
+    return found === undefined ? UNMOVED : found;
+  }
+
+  /** The extent of all that is shown; of the truth where it is in the map's frame. */
+  extent() {
+    const [a, b, c, d] = this.box, [e, f, g, h] = this.trueBox;
+    return this.align.size ? this.box : [Math.min(a, e), Math.min(b, f), Math.max(c, g), Math.max(d, h)];
   }
 
   /** The row of a robot's pose at a time; −1 where it has none in the team's frame. */
