@@ -337,13 +337,15 @@ export class MapView {
         if (this.on.labels && landmark < UNNAMED) g.fillText(landmark, u + 8 * r, v - 5 * r);
         continue;
       }
-      const long = Math.hypot(p - u, q - v), head = Math.min(8 * r, 0.6 * long), turn = Math.atan2(q - v, p - u);
-      g.beginPath(); g.moveTo(u, v); g.lineTo(p, q); g.stroke();
+      const ring = 7 * r, long = Math.hypot(p - u, q - v) - ring, turn = Math.atan2(q - v, p - u);
+      g.beginPath(); g.arc(p, q, ring, 0, 2 * Math.PI); g.stroke();
+      if (long <= 0) continue;  // the ring covers both places
+      const head = Math.min(9 * r, long), tip = [p - ring * Math.cos(turn), q - ring * Math.sin(turn)];
+      g.beginPath(); g.moveTo(u, v); g.lineTo(...tip); g.stroke();
       g.beginPath();
-      g.moveTo(p, q);
-      for (const side of [-0.45, 0.45]) g.lineTo(p - head * Math.cos(turn + side), q - head * Math.sin(turn + side));
+      g.moveTo(...tip);
+      for (const side of [-0.45, 0.45]) g.lineTo(tip[0] - head * Math.cos(turn + side), tip[1] - head * Math.sin(turn + side));
       g.closePath(); g.fill();
-      g.beginPath(); g.arc(p, q, 7 * r, 0, 2 * Math.PI); g.stroke();
     }
   }
 
@@ -616,13 +618,14 @@ export class MapView {
     const taken = [...robots.map(({ x, y }) => box(x, y, 12 * r, 12 * r)), ...this.landmarkBoxes(this.store.mapAt(time))];
     this.names = [];
     for (const { robot, x, y, text, isLost, width } of robots) {
-      const w = width / 2 + 2 * r, reach = [2 * w + 24 * r, 52 * r];
+      const w = width / 2 + 2 * r, reach = [2 * w + 28 * r, 52 * r];
       const near = taken.filter((each) => overlap(each, box(x, y, ...reach)));
       let best = null, least = Infinity;
       const before = this.sides.get(robot.name);
-      for (const side of [...(before === undefined ? [] : [before]), ...SIDES.keys()]) {  // a name stays where it can
+      const stays = before < NEAR.length ? [before] : [];  // a name stays near where it can
+      for (const side of [...stays, ...SIDES.keys()]) {
         const [across, down] = SIDES[side];
-        const at = box(x + Math.sign(across) * w + across * 11 * r, y + down * 15 * r, w, 7 * r);
+        const at = box(x + Math.sign(across) * w + across * 13 * r, y + down * 15 * r, w, 7 * r);
         const covered = near.reduce((sum, each) => sum + overlap(at, each), 0);
         if (covered < least) { best = { at, side }; least = covered; }
         if (!covered) break;
