@@ -55,9 +55,9 @@ def save_map(
     measurements in common are recognised. datum: of the map's frame.
 
     With the biases c that all sensors share, landmarks and errors of single robots, y = (o, x), are
-    N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. What the measurements tell of
-    (c, o) is saved beside it without the priors, which the later day's settings give again: each
-    counts once, and Student's t, which the joint Gaussian only approximates, keeps its tails.
+    N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. The map also has the likelihood of
+    (c, o) by the measurements alone. It leaves out the priors, which the later day's settings give:
+    each counts once, and its Student's t keeps the tails that a joint Gaussian would lose.
 
     Landmarks that are gone are left out. One that moved by e, which chance explains at SEQUENTIAL,
     may be an error of today: its covariance is P_ii + e eᵀ.

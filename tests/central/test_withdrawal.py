@@ -366,7 +366,7 @@ def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | 
 
 
 def test_where_two_robots_contradict_themselves_the_team_is_not_folded_without_each():
-    """Whoever is left out, one of them is left: noise that the team states too small."""
+    """Each fold without one robot has a contradiction left: the team states its noise too small."""
     asked = []
 
     def without(robots: Collection[str]) -> Agreement:

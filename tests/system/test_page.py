@@ -47,13 +47,18 @@ def url(tmp_path_factory):
         yield shown.url
 
 
-@pytest.fixture
-def page(browser, url):
-    """The page on a recorded log, fully read, on a desktop."""
+def open_page(browser, url):
+    """Open the page on a desktop, without errors of before."""
     browser.errors.clear()
     browser.size(1280, 800)
     browser.open(url)
     browser.wait(READY)
+
+
+@pytest.fixture
+def page(browser, url):
+    """The page on a recorded log, fully read, on a desktop."""
+    open_page(browser, url)
     # The badge is written with all tables, after the last message.
     browser.wait("document.querySelector('#badge').textContent === 'LOG'")
     browser.wait(f"document.querySelector('#landmarks').textContent === '{LANDMARKS}'")
@@ -223,10 +228,7 @@ def changed_url(tmp_path_factory):
 
 @pytest.fixture
 def changed(browser, changed_url):
-    browser.errors.clear()
-    browser.size(1280, 800)
-    browser.open(changed_url)
-    browser.wait(READY)
+    open_page(browser, changed_url)
     browser.wait("document.querySelector('#count-moved').textContent === '1'")
     return browser
 

@@ -46,18 +46,18 @@ CommonError = Bias | int
 which all robots measure that landmark too far.
 """
 SharedError = CommonError | RobotBias
-"""An error of a submap: a bias of its robot's or of all sensors, a marker's, or, in a saved map,
-one of a robot of then.
+"""An error of a submap: a bias of its robot or of all sensors, an error of a marker, or in a saved
+map the error of one robot on the days of the map.
 """
 DRIFT: Mapping[Bias, float] = MappingProxyType(
     {"forward_scale": 0.2, "range_offset": 0.1, "range_scale": 0.1}
 )
 """Scale of a robot's bias on another day about that of a saved map, in scales of its prior.
 
-Ranges err by the optics or electronics of a sensor, which age over months; the way driven by tyres,
-load and floor. Others are not remembered: a clock is set anew with each start of its computer, and
-a sensor that was taken off and mounted again is off by up to 0.3°, more than the prior's scale. The
-loss is that of Student's t, so a sensor that was replaced loses the tie.
+Errors of ranges come from the sensor's optics and electronics, which age over months; errors of the
+driven distance from tyres, load and floor. Clock offsets and bearings are not carried over: a clock
+is set anew with each start of its computer, and a sensor that is mounted again turns by up to 0.3°,
+more than the prior's scale. The loss is that of Student's t, so a replaced sensor loses the tie.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
@@ -452,8 +452,8 @@ def _add_errors(
 def _remember(
     growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> tuple[list[int], list[Prior]]:
-    """Add the nodes of the errors of single robots in a saved map; return also what is known of
-    them: their priors, and the likelihood by the map's measurements.
+    """Add the nodes of the errors of single robots in a saved map; return them with their priors,
+    and with their likelihood by the map's measurements.
     """
     own, stream = contribution.own, contribution.stream
     nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
