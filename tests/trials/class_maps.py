@@ -32,7 +32,7 @@ ROBOTS = (0, 1, 2)
 RIGHT = 0.95
 """Probability that an object's class is right."""
 TAILS = 4.0
-"""Degrees of freedom of the differences of paired objects."""
+"""Degrees of freedom of the differences of the same objects in two maps."""
 STEPS = 100
 
 
@@ -73,20 +73,26 @@ def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[
 
 
 def fit_motion(one: IslandView, two: IslandView, closure: Closure) -> np.ndarray:
-    """Motion of the first map's paired landmarks onto the second's, by maximum likelihood.
+    """Motion of the first map's landmarks onto the second's, by maximum likelihood.
 
-    The differences of objects' centres have heavy tails: they are taken as Student's t of TAILS
-    degrees of freedom, by expectation maximisation (Lange, Little and Taylor 1989).
+    A map may have an object several times, and a pair of two such parts is off by their distance.
+    The partner of a landmark is therefore unknown: one of the second map's, each in Student's t of
+    TAILS degrees of freedom about it, or none of them, with the density of landmarks. Solved by
+    expectation maximisation (Granger and Pennec 2002, ECCV; Lange, Little and Taylor 1989).
     """
-    a = one.joint.mean[[pair.first for pair in closure.pairs]]
-    b = two.joint.mean[[pair.second for pair in closure.pairs]]
-    weights = np.ones(len(a))
+    a, b = one.joint.mean, two.joint.mean
+    first, second = np.array([(pair.first, pair.second) for pair in closure.pairs]).T
+    motion = np.array(procrustes(b[second], a[first], np.ones(len(first))))
+    variance = float(((b[second] - transform_points(motion, a[first])) ** 2).mean())
     for _ in range(STEPS):
-        motion = procrustes(b, a, weights)
-        off = ((b - transform_points(np.array(motion), a)) ** 2).sum(axis=1)
-        variance = (weights * off).sum() / (2 * len(a))
-        weights = (TAILS + 2) / (TAILS + off / variance)
-    return np.array(motion)
+        off = ((transform_points(motion, a)[:, None] - b) ** 2).sum(axis=2)
+        near = (1.0 + off / (TAILS * variance)) ** (-0.5 * TAILS - 1.0) / (2.0 * np.pi * variance)
+        partner = near / (near.sum(axis=1, keepdims=True) + one.profile.density)
+        weights = partner * (TAILS + 2.0) / (TAILS + off / variance)
+        variance = (weights * off).sum() / (2.0 * partner.sum())
+        towards = weights @ b / weights.sum(axis=1)[:, None]
+        motion = np.array(procrustes(towards, a, weights.sum(axis=1)))
+    return motion
 
 
 def loop_error(found: dict[tuple[int, int], Closure]) -> tuple[float, float]:

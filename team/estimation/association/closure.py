@@ -28,9 +28,9 @@ from teamslam.team.estimation.association.island_view import (
 )
 from teamslam.team.estimation.association.joint_compatibility import (
     SURE_AFTER,
-    MergedPairs,
+    Alignment,
     assign_jointly,
-    grow_pairs,
+    grow_alignment,
 )
 from teamslam.team.estimation.association.verification import (
     Closure,
@@ -107,7 +107,7 @@ class Placement(NamedTuple):
     a place's pairs are found, and unmatched landmarks beside others are no evidence against it.
     """
 
-    merged: MergedPairs
+    merged: Alignment
     target: Side
     motion: Float[np.ndarray, "3"]
     absent: int
@@ -126,10 +126,19 @@ JointOf = Callable[[Vote], tuple[Joint, Side]]
 
 
 def align(
-    patch: Side, target: Side, joint_of: JointOf, profile: AssociationProfile, least: int
+    patch: Side,
+    target: Side,
+    joint_of: JointOf,
+    profile: AssociationProfile,
+    least: int,
+    *,
+    is_own: bool = False,
 ) -> list[Placement]:
     """Find the alignments of a patch with a target, by decreasing evidence; those of fewer votes
     than least / WEAK are neither closures of `least` pairs nor rivals.
+
+    is_own: the target is the patch's own map, and the alignment of landmarks with themselves is
+    left out.
     """
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
@@ -139,6 +148,9 @@ def align(
     most = 0
     for vote in votes[:TRIED]:
         if WEAK * len(vote.first) < most:
+            continue
+        if is_own and _is_identity(patch.ids[vote.first], target.ids[vote.second]):
+            most = max(most, len(vote.first))
             continue
         joint, part = joint_of(vote)
         merged = _grow_alignment(patch, part, joint, vote, profile)
@@ -182,7 +194,7 @@ def find_closure(
         for each in found[1:]
         if 2 * len(mine.intersection(each.pairs)) < len(each.merged.pairs)
     ]
-    mean = best.merged.joint.mean
+    mean = best.merged.mean
     places = mean[[pair.second for pair in best.merged.pairs]]
     closure = Closure(
         pairs=tuple(
@@ -221,12 +233,12 @@ def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: Associati
 
 
 def _count_absent(
-    merged: MergedPairs, patch: Side, target: Side, profile: AssociationProfile
+    merged: Alignment, patch: Side, target: Side, profile: AssociationProfile
 ) -> tuple[int, int]:
     """Count the landmarks of either side unmatched where the other side viewed, and those of them
     with none of the other side nearby.
     """
-    mean = merged.joint.mean
+    mean = merged.mean
     place = np.full(int(max(target.views.max(initial=-1), target.within.max())) + 1, -1)
     place[target.within] = np.arange(len(target.within))
     first, second = np.array([(pair.first, pair.second) for pair in merged.pairs]).T
@@ -308,7 +320,7 @@ def combine_maps(
 
 def _grow_alignment(
     patch: Side, target: Side, joint: Joint, vote: Vote, profile: AssociationProfile
-) -> MergedPairs | None:
+) -> Alignment | None:
     """Grow the largest alignment from one of a few pairs of seeds; None where all seeds fail."""
     place = dict(zip(target.within.tolist(), target.at.tolist(), strict=True))
     first = patch.at[vote.first]
@@ -318,13 +330,13 @@ def _grow_alignment(
     i, j = np.triu_indices(len(points), 1)
     far = np.argsort(-core.hypot(*(points[i] - points[j]).T), kind="stable")
     used: set[int] = set()
-    best: MergedPairs | None = None
+    best: Alignment | None = None
     for k in far:
         if {int(i[k]), int(j[k])} & used:
             continue
         used |= {int(i[k]), int(j[k])}
         seeds = [(int(first[at]), int(second[at])) for at in (i[k], j[k])]
-        found = grow_pairs(joint, candidates, profile, seeds=seeds, sure_sd=profile.near)
+        found = grow_alignment(joint, candidates, seeds, profile, profile.near)
         if found is not None and (best is None or found.llr > best.llr):
             best = found
         if len(used) >= 2 * SEEDS or (best is not None and len(best.pairs) >= len(first)):
@@ -381,8 +393,7 @@ def search_other_island(
         return side, lambda vote: combine_maps(own, joint, side, vote, profile)
 
     def aliases() -> list[Placement]:
-        found = align(of_patch, *target_of(mine), profile, profile.island_pairs)
-        return [each for each in found if not _is_identity(each, patch)]
+        return align(of_patch, *target_of(mine), profile, profile.island_pairs, is_own=True)
 
     found = find_closure(
         of_patch,
@@ -431,7 +442,7 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
                 continue
             return Closure(
                 pairs=found.pairs,
-                llr=found.llr,
+                llr=sum(pair.llr for pair in found.pairs),
                 absent=0,
                 rival_pairs=0,
                 rival_llr=0.0,
@@ -453,7 +464,7 @@ def _find_reachable(view: IslandView, patch: Indices) -> Indices:
     """Find the landmarks that may coincide with the patch's by the joint covariance; none where all
     are certain.
 
-    An alignment with any other landmark is no rival: `grow_pairs` would reject its seeds.
+    An alignment with any other landmark is no rival: `grow_alignment` would reject its seeds.
     """
     others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
@@ -507,10 +518,6 @@ def _halve(points: Float[np.ndarray, "n 2"], part: Indices) -> list[Indices]:
     return _halve(points, np.sort(order[:middle])) + _halve(points, np.sort(order[middle:]))
 
 
-def _is_identity(found: Placement, patch: Indices) -> bool:
-    """Whether an alignment of a patch with its own map places a third of its landmarks on
-    themselves.
-    """
-    pairs = found.pairs
-    same = sum(two == int(patch[one]) for one, two in pairs)
-    return bool(3 * same >= len(pairs))
+def _is_identity(first: Indices, second: Indices) -> bool:
+    """Whether a third of the pairs are of landmarks with themselves."""
+    return bool(3 * np.count_nonzero(first == second) >= len(first))

@@ -249,7 +249,7 @@ class IslandView:
             most_sd=most_sd,
             sure_sd=self.profile.near,
         )
-        if found is not None and found.pairs:
+        if found.pairs:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:

@@ -51,6 +51,13 @@ class MergedPairs(NamedTuple):
     pairs: tuple[Pair, ...]
     joint: Joint
 
+
+class Alignment(NamedTuple):
+    """Pairs in the order of their merges, and the positions of all landmarks given them [m]."""
+
+    pairs: tuple[Pair, ...]
+    mean: Float[np.ndarray, "n 2"]
+
     @property
     def llr(self) -> float:
         """Log-likelihood ratio of all pairs together."""
@@ -108,35 +115,96 @@ def merge_in_order(
     return MergedPairs(tuple(merged), joint)
 
 
+def grow_alignment(
+    joint: Joint,
+    candidates: tuple[Indices, Indices],
+    seeds: Sequence[tuple[int, int]],
+    profile: AssociationProfile,
+    sure_sd: float,
+) -> Alignment | None:
+    """Merge pairs one by one as `grow_pairs` does, after the seeds, whatever their rivals; None
+    where a seed fails its gate.
+    """
+    begun = merge_in_order(joint, seeds, profile)
+    if begun is None:
+        return None
+    first, second = candidates
+    left = ~np.isin(first, [pair.first for pair in begun.pairs])
+    first, second = _select_near(begun.joint, first[left], second[left], profile)
+    involved = np.unique(np.concatenate((first, second)))
+    grown = _grow(
+        MergedPairs(begun.pairs, begun.joint.select(involved)),
+        (np.searchsorted(involved, first), np.searchsorted(involved, second)),
+        profile,
+        (np.inf, sure_sd),
+    )
+    own = (
+        pair._replace(first=int(involved[pair.first]), second=int(involved[pair.second]))
+        for pair in grown.pairs[len(begun.pairs) :]
+    )
+    pairs = (*begun.pairs, *own)
+    return Alignment(pairs, _condition_mean(joint, pairs, profile))
+
+
+def _condition_mean(
+    joint: Joint, pairs: Sequence[Pair], profile: AssociationProfile
+) -> Float[np.ndarray, "n 2"]:
+    """Condition the mean on all pairs at once: m − PHᵀ (HPHᵀ + s₀²I)⁻¹ Hm."""
+    n = len(joint.mean)
+    first, second = (np.array(each) for each in zip(*(pair[:2] for pair in pairs), strict=True))
+    P = joint.covariance.reshape(n, 2, n, 2)
+    gain = (P[:, :, first] - P[:, :, second]).reshape(2 * n, -1)
+    rows = gain.reshape(n, 2, -1)
+    S = (rows[first] - rows[second]).reshape(-1, gain.shape[1])
+    S = S + core.squared(profile.slack) * np.eye(len(S))
+    difference = (joint.mean[first] - joint.mean[second]).ravel()
+    by = dense.product(gain, dense.solve(S, difference))
+    return np.asarray(joint.mean - by.reshape(n, 2))
+
+
 def grow_pairs(
     joint: Joint,
     candidates: tuple[Indices, Indices],
     profile: AssociationProfile,
     *,
-    seeds: Sequence[tuple[int, int]] = (),
     most_sd: float = np.inf,
     sure_sd: float = np.inf,
-) -> MergedPairs | None:
-    """Merge pairs one by one, the likeliest first; None where a seed fails its gate.
+) -> MergedPairs:
+    """Merge pairs one by one, the likeliest first.
 
     candidates: two lists of landmarks, pair by pair; a merged landmark's other pairs are dropped.
-    seeds: first pairs, whatever their rivals. most_sd: largest standard deviation of a merged pair;
-    sure_sd: the same, once SURE_AFTER pairs are merged.
+    most_sd: largest standard deviation of a merged pair; sure_sd: the same, once SURE_AFTER pairs
+    are merged.
     """
-    begun = merge_in_order(joint, seeds, profile)
-    if begun is None:
-        return None
-    merged, joint = list(begun.pairs), begun.joint
-    first, second = candidates
-    gone = np.isin(first, [pair.first for pair in merged])
-    open_ = ~joint.apart[first, second] & ~gone
+    near = _select_near(joint, *candidates, profile)
+    return _grow(MergedPairs((), joint), near, profile, (most_sd, min(most_sd, sure_sd)))
+
+
+def _select_near(
+    joint: Joint, first: Indices, second: Indices, profile: AssociationProfile
+) -> tuple[Indices, Indices]:
+    """Select the pairs that are not apart and within PREGATE gates."""
+    open_ = ~joint.apart[first, second]
     first, second = first[open_], second[open_]
     near = evaluate_pairs(joint, first, second, profile).chi2 < PREGATE * profile.gate
-    first, second = first[near], second[near]
+    return first[near], second[near]
+
+
+def _grow(
+    begun: MergedPairs,
+    candidates: tuple[Indices, Indices],
+    profile: AssociationProfile,
+    limits: tuple[float, float],
+) -> MergedPairs:
+    """Merge candidates one by one; limits: largest standard deviations, before and once SURE_AFTER
+    pairs are merged.
+    """
+    (*merged,), joint = begun
+    first, second = candidates
     while len(first):
         at = evaluate_pairs(joint, first, second, profile)
         least = required_llr(joint, first, second, at.sd, profile)
-        limit = min(most_sd, sure_sd) if len(merged) >= SURE_AFTER else most_sd
+        limit = limits[len(merged) >= SURE_AFTER]
         fits = (at.chi2 < profile.gate) & (at.llr >= least) & (at.sd <= limit)
         if not fits.any():
             break

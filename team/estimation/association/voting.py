@@ -32,6 +32,8 @@ MOST_OF_PART = 16
 """Number of a part's motions that are refined on all points."""
 MOST_COUNTED = 4_000_000
 """Number of cells up to which votes are counted cell by cell."""
+WIDER = 1.01
+"""Half of the strip in which the points within reach are searched, in reaches: for rounding."""
 MOST_DISTANCES = 2_000_000
 """Number of distances between points in memory at once."""
 
@@ -253,20 +255,34 @@ def _find_neighbours(
     reach: float,
     fits: Bool[np.ndarray, "n m"] | None,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find the nearest point of b for each point; mark those mutually nearest and within reach.
+    """Find the nearest point of b within reach of each point, else 0; mark those mutually nearest.
 
-    fits: the pairs of compatible classes; None: all.
+    Of points at equal distances the first one is the nearest. A point is compared with the points
+    of b in a strip of x. fits: the pairs of compatible classes; None: all.
     """
+    n, m = len(a), len(b)
     s, c = core.sin_and_cos(motions[:, 2:])
-    x = c * a[:, 0] - s * a[:, 1] + motions[:, :1]
-    y = s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]
-    away = core.squared(x[:, :, None] - b[:, 0]) + core.squared(y[:, :, None] - b[:, 1])
+    x = (c * a[:, 0] - s * a[:, 1] + motions[:, :1]).ravel()
+    y = (s * a[:, 0] + c * a[:, 1] + motions[:, 1:2]).ravel()
+    order = np.argsort(b[:, 0], kind="stable")
+    begin = np.searchsorted(b[order, 0], x - WIDER * reach)
+    count = np.searchsorted(b[order, 0], x + WIDER * reach) - begin
+    point = np.repeat(np.arange(len(x)), count)
+    to = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - begin, count)]
+    away = core.squared(x[point] - b[to, 0]) + core.squared(y[point] - b[to, 1])
+    near = away < core.squared(reach)
     if fits is not None:
-        away = np.where(fits, away, np.inf)
-    to_b, to_a = away.argmin(axis=2), away.argmin(axis=1)
-    nearest = np.take_along_axis(away, to_b[:, :, None], axis=2)[:, :, 0]
-    mutual = np.take_along_axis(to_a, to_b, axis=1) == np.arange(len(a))
-    return to_b, mutual & (nearest < core.squared(reach))
+        near &= fits[point % n, to]
+    point, to, away = point[near], to[near], away[near]
+    target = point // n * m + to
+    to_b, to_a = np.zeros(len(x), np.int64), np.zeros(len(motions) * m, np.int64)
+    mutual = np.zeros(len(x), np.bool_)
+    for group, other, nearest in ((point, to, to_b), (target, point, to_a)):
+        ranked = np.lexsort((other, away, group))
+        first = ranked[np.diff(group[ranked], prepend=-1) > 0]
+        nearest[group[first]] = other[first]
+    mutual[point] = to_a[point // n * m + to_b[point]] == point
+    return to_b.reshape(-1, n), mutual.reshape(-1, n)
 
 
 def _fit_motions(

@@ -235,6 +235,24 @@ def test_votes_that_are_counted_cell_by_cell_and_sorted_votes_give_the_same_alig
         np.testing.assert_array_equal(one.second, two.second)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_mutual_neighbours_are_those_of_all_distances_also_where_distances_are_equal(seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.integers(-3, 4, (12, 2)) / 2.0, rng.integers(-3, 4, (20, 2)) / 2.0
+    motions = np.column_stack([rng.integers(-2, 3, (5, 2)), rng.integers(0, 2, 5) * np.pi])
+    fits = rng.random((12, 20)) < 0.8 if seed % 2 else None
+    to, mutual = voting._find_neighbours(motions, a, b, 0.6, fits)
+    assert mutual.any()
+    for motion, partner, agree in zip(motions, to, mutual, strict=True):
+        off = ((apply_motion(motion, a)[:, None] - b) ** 2).sum(axis=2)
+        off = np.where(off < 0.6**2, off, np.inf)
+        off = off if fits is None else np.where(fits, off, np.inf)
+        nearest, back = off.argmin(axis=1), off.argmin(axis=0)
+        expected = np.isfinite(off.min(axis=1)) & (back[nearest] == np.arange(12))
+        np.testing.assert_array_equal(agree, expected)
+        np.testing.assert_array_equal(partner[agree], nearest[agree])
+
+
 WORLD = np.array([[8.0, 1.0], [9.0, -2.0], [7.0, 3.0]])
 
 

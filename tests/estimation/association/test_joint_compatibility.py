@@ -23,6 +23,7 @@ from teamslam.team.estimation.association.gating import (
 from teamslam.team.estimation.association.joint_compatibility import (
     assign_jointly,
     condition_on_pair,
+    grow_alignment,
     grow_pairs,
 )
 from teamslam.team.estimation.association.scans import UNASSIGNED
@@ -246,9 +247,12 @@ def test_a_common_error_is_estimated_by_the_first_pair_and_the_others_follow():
     new = [(x + shift, y) for x, y in old]
     joint = _joint([*old, *new], sd=0.02, common=3.0)
     one, two = (each.ravel() for each in np.meshgrid([3, 4, 5], [0, 1, 2], indexing="ij"))
-    found = grow_pairs(joint, (one, two), PROFILE_JOINT_COMPATIBILITY, seeds=[(3, 0)])
+    found = grow_alignment(joint, (one, two), [(3, 0)], PROFILE_JOINT_COMPATIBILITY, np.inf)
     assert {(pair.first, pair.second) for pair in found.pairs} == {(3, 0), (4, 1), (5, 2)}
     assert found.pairs[0].sd > 1.0 > found.pairs[1].sd
+    for pair in found.pairs:
+        joint = condition_on_pair(joint, pair.first, pair.second, PROFILE_JOINT_COMPATIBILITY)
+    assert found.mean == pytest.approx(joint.mean)
 
 
 def test_two_equal_partners_block_each_other_and_fragments_of_one_landmark_do_not():
