@@ -31,7 +31,7 @@ Stamps = bytes
 
 _SIZES = {"<f8": 8, "<f4": 4, "<u4": 4, "<i8": 8, "u1": 1}
 FEW = 16
-"""Largest number of plain floats that are encoded without an array."""
+"""Most floats that are encoded without an array."""
 _NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
 
 
@@ -43,12 +43,12 @@ def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
 
 
 def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
-    """Return a read-only float64 view."""
+    """View as float64, read-only."""
     return _array(data, "<f8", what)
 
 
 def derivatives(data: bytes, count: int, what: str) -> "np.typing.NDArray[np.float64]":
-    """Return `count` derivatives as float64: float32 on the wire, float64 in older logs."""
+    """Read `count` derivatives as float64: float32 on the wire, float64 in older logs."""
     dtype = "<f8" if len(data) == 8 * count else "<f4"
     found = _array(data, dtype, what)
     if len(found) != count:
@@ -59,49 +59,49 @@ def derivatives(data: bytes, count: int, what: str) -> "np.typing.NDArray[np.flo
 
 
 def ids(data: Ids, what: str) -> "np.typing.NDArray[np.uint32]":
-    """Return a read-only uint32 view."""
+    """View as uint32, read-only."""
     return _array(data, "<u4", what)
 
 
 def stamps(data: Stamps, what: str) -> "np.typing.NDArray[np.int64]":
-    """Return a read-only int64 view."""
+    """View as int64, read-only."""
     return _array(data, "<i8", what)
 
 
 def octets(data: bytes, what: str) -> "np.typing.NDArray[np.uint8]":
-    """Return a read-only uint8 view."""
+    """View as uint8, read-only."""
     return _array(data, "u1", what)
 
 
 def from_floats(values: Any) -> Floats:
-    """Encode as little-endian float64 bytes, C order."""
+    """Encode as float64, C order."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
 
 
 def from_derivatives(values: Any) -> bytes:
-    """Encode as little-endian float32 bytes, C order."""
+    """Encode as float32, C order."""
     return np.ascontiguousarray(values, dtype="<f4").tobytes()
 
 
 def from_numbers(values: Sequence[float]) -> Floats:
-    """Encode at most FEW plain floats as `from_floats` does, without an array."""
+    """Encode at most FEW floats as `from_floats` does, without an array."""
     return _NUMBERS[len(values)].pack(*values)
 
 
 def from_ids(values: Any) -> Ids:
-    """Encode as little-endian uint32 bytes."""
+    """Encode as uint32."""
     return np.ascontiguousarray(values, dtype="<u4").tobytes()
 
 
 def from_stamps(values: Any) -> Stamps:
-    """Encode as little-endian int64 bytes."""
+    """Encode as int64."""
     return np.ascontiguousarray(values, dtype="<i8").tobytes()
 
 
 def check_semidefinite(data: Floats, n: int, what: str) -> None:
     """Raise ValueError unless n × n floats are symmetric and positive semi-definite, of any rank.
 
-    A variance of zero belongs to an exact number; its row is then zero.
+    The row of an exact number (variance 0) is zero.
     """
     check_finite(data, what, n * n)
     matrix = floats(data, what).reshape(n, n)
@@ -118,9 +118,9 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
 
 
 def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> "np.ndarray":
-    """The 2 × 2 covariance of each landmark [m²], (count, 2, 2).
+    """Extract the 2 × 2 covariance of each landmark [m²], (count, 2, 2).
 
-    joint: the bytes are the packed upper triangle of all landmarks, else the packed blocks.
+    joint: the bytes are the packed upper triangle of all landmarks, else packed blocks.
     """
     values = floats(covariance, "covariance").astype(np.float64)
     if joint:  # row i of a packed upper triangle of n rows begins at i·n − i(i − 1)/2

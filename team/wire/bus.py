@@ -1,9 +1,7 @@
 """The interface of a bus, which carries payloads by key, and a bus in memory.
 
-`teamslam.team.wire.zenoh` has the bus over a network. A received `Sample` contains the relative
-key, the payload as published, the team time, and the publisher's wall clock and counter of this
-key. A node uses no bus: its shell receives and decodes the samples, and publishes the messages of
-the node.
+The bus over a network is `teamslam.team.wire.zenoh`. A node uses no bus: its shell receives and
+decodes the samples, and publishes the node's messages.
 """
 
 import re
@@ -56,7 +54,11 @@ _IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, Wit
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
-    """A received publication."""
+    """A received publication.
+
+    key: relative to the team. stamp_ns: team time. wall_ns: the publisher's clock. counter: the
+    publisher's for this key.
+    """
 
     key: str
     payload: bytes
@@ -66,7 +68,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
 
 
 class Outgoing(NamedTuple):
-    """A message on its channel, for a robot or node (empty if the channel's key has no name)."""
+    """A message on its channel, for a robot or node (empty if the key has no name)."""
 
     channel: Channel
     name: str
@@ -84,29 +86,26 @@ class BusError(RuntimeError):
 
 _PLACES = re.compile(r"\{(robot|node)\}")
 Answer = Callable[[bytes], Iterable[bytes]]
-"""A function from the payload of a query to the payloads of its replies."""
+"""Convert the payload of a query to the payloads of its replies."""
 
 
 @runtime_checkable
 class Tap(Protocol):
-    """A store of all samples that a bus sends and receives, replies included: an own log."""
+    """A store of all samples that a bus sends and receives, replies included."""
 
     def __call__(self, samples: list[Sample]) -> None:
         """Store samples."""
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Return the intervals of a robot's measurements that are missing in the store.
-
-        Each is (incarnation, first number, last number). A crash leaves them.
-        """
+        """Return the missing intervals of a robot's measurements (incarnation, first, last)."""
 
 
 @runtime_checkable
 class Bus(Protocol):
     """The bus as a shell uses it.
 
-    dropped: number of received samples without a valid attachment, or under another key than
-        that on which they were published.
+    dropped: number of received samples without a valid attachment, or under another key than they
+    were published on.
     """
 
     dropped: int
@@ -114,38 +113,35 @@ class Bus(Protocol):
     def publish(self, out: Outgoing) -> int:
         """Publish a message and return the size of its payload [bytes].
 
-        It blocks for a limited time while receivers are slower.
+        Block for a limited time while receivers are slower.
         """
 
     def publish_raw(self, sample: Sample) -> None:
-        """Publish a logged sample again, with its bytes, its stamps and its counter."""
+        """Publish a logged sample again, unchanged."""
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
         """Subscribe to a channel: `receive` returns each sample of other publishers once.
 
-        whole: deliver all stored samples of a `latest` channel, not only the newest one.
+        whole: deliver all stored samples of a `latest` channel, not only the newest.
         """
 
     def receive(self, timeout_s: float) -> list[Sample]:
         """Return the samples since the last call, in order; wait at most `timeout_s` for one."""
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel` for one name, or `*`.
-
-        The text of a ValueError is sent as the reply.
-        """
+        """Answer the queries of `channel` for one name, or `*`; a ValueError's text is a reply."""
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """Query, and return the payloads of the replies in order; raise `BusError` on an error.
+        """Query, and return the payloads of the replies in order, none without an answer.
 
-        Without an answer there is no reply.
+        Raises `BusError` on an error.
         """
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Send a query without waiting; `receive` returns the replies as samples of their channels.
+        """Send a query without waiting; `receive` returns the replies as samples.
 
-        Nothing is sent while the same query is open. A reply has no counter (`NO_COUNTER`), and the
-        wall clock of its arrival.
+        No effect while the same query is open. A reply has no counter (`NO_COUNTER`), and the wall
+        clock of its arrival.
         """
 
     def again(self) -> None:
@@ -158,10 +154,7 @@ class Bus(Protocol):
         """Return the keys with missing samples that their publisher may still have."""
 
     def publish_totals(self) -> Tally | None:
-        """Publish and return the number of samples of each key that this process has published.
-
-        None if no sample can be lost.
-        """
+        """Publish the number of published samples of each key; None if no sample can be lost."""
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed."""
@@ -179,7 +172,7 @@ class Bus(Protocol):
 def opened(sample: Sample) -> tuple[Channel, str, Message]:
     """Decode a sample and check it against its key; return channel, name and message.
 
-    Raises `WireError`, also for a message of a robot or node on the key of another one.
+    Raises `WireError`, also for a message of one robot or node on the key of another.
     """
     found = channel_of(sample.key)
     if found is None:
@@ -206,16 +199,13 @@ def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
 
 
 def shown(sample: Sample) -> tuple[Channel, str, Message]:
-    """Decode a sample as `opened` does, with printable texts, for readers that show it."""
+    """Decode a sample as `opened` does, with printable texts."""
     channel, name, message = opened(sample)
     return channel, name, readable(message) if isinstance(message, _IN_WORDS) else message
 
 
 def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
-    """Decode the valid samples as `shown` does, and leave out the others.
-
-    It is for readers that only observe: an invalid sample is no message of the team.
-    """
+    """Decode the valid samples as `shown` does, and leave out the others."""
     for sample in samples:
         try:
             yield shown(sample)
@@ -236,7 +226,7 @@ def _sender_of(channel: Channel, message: Message) -> str | None:
 
 
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
-    """Return a reply to a query as a sample of the channel of its message.
+    """Convert a reply to a sample of the channel of its message.
 
     A stored sample is returned as its author published it. Raises `WireError` if the message does
     not answer this query, or belongs to another robot.
@@ -263,19 +253,17 @@ def _kept(payload: bytes) -> Sample:
 
 
 NO_COUNTER = 2**32 - 1
-"""The counter of a sample that was a reply, which has none of its own."""
+"""The counter of a sample that was a reply."""
 
 
 LATEST_CACHE = 8_192
-"""Number of publications of a `latest` key that its publisher stores: a robot may be 4096
-measurements ahead.
-"""
+"""Stored publications of a `latest` key: a robot may be 4096 measurements ahead."""
 CLOUDS_CACHE = 1_024
-"""The same for particles, of kilobytes each."""
+"""Stored publications of particles, of kilobytes each."""
 MAPS_CACHE = 256
-"""The same for maps, of tens of kilobytes each; a joint covariance is larger."""
+"""Stored publications of maps, of tens of kilobytes each; a joint covariance is larger."""
 VIEWS_CACHE = 256
-"""The same for views, of tens of kilobytes each."""
+"""Stored publications of views, of tens of kilobytes each."""
 WHOLE_CACHE = 1_000_000
 
 
@@ -294,7 +282,7 @@ def cache_size(channel: Channel) -> int:
 class MemoryNetwork:
     """The keys of one process: publications are delivered at once, in order, to every other bus.
 
-    It stores the publications of `latest` and `all` channels for late joiners.
+    Publications of `latest` and `all` channels are stored for late joiners.
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
@@ -364,7 +352,7 @@ class MemoryBus:
         network.enter(self)
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and deliver at once; the wall clock of a memory bus is always zero."""
+        """Encode and deliver at once; the wall clock is always zero."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
         payload = encoded(out.message)
@@ -393,7 +381,7 @@ class MemoryBus:
         self._arrived.append(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """Return the samples since the last call; a memory bus never waits."""
+        """Return the samples since the last call; never wait."""
         arrived = self._arrived  # one by one: another thread may be publishing
         return [arrived.popleft() for _ in range(len(arrived))]
 

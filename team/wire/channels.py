@@ -1,14 +1,13 @@
 """The table of channels, the only place of keys.
 
-Keys are relative to the team; a bus puts `team/<team name>/` before them. The sender of a message
-owns the prefix of its key: a robot's process `robot/{robot}/…`, its driver `source/{robot}/…`, an
-operator `operator/…`, the others that of their name. A certificate for a prefix therefore
-authenticates a sender. The world is the source of every robot; the truth belongs to the world, too.
+A bus puts `team/<team name>/` before a key. The first part of a key names its sender:
+`robot/{robot}/…` a robot's process, `source/{robot}/…` its driver, `operator/…` an operator, the
+others themselves; a certificate for that prefix authenticates the sender. The world is the source
+of every robot, and owns the truth.
 
-`{robot}` stands for a robot's name (or a saved map, as `map-<name>`), `{node}` for `world`, `central`, `recorder`, `viewer`,
-`robot/<name>` or `source/<name>`, `{view}` for a view (`teamslam.team.wire.views`). In the rates an
-incarnation is one life of a robot's stream (the messages' `incarnation`), a keyframe one instant of
-observation.
+`{robot}`: a robot's name, or a saved map as `map-<name>`. `{node}`: `world`, `central`, `recorder`,
+`viewer`, `robot/<name>` or `source/<name>`. `{view}`: a view (`teamslam.team.wire.views`). Rates:
+an incarnation is one life of a robot's stream, a keyframe one instant of observation.
 """
 
 import re
@@ -19,8 +18,8 @@ from typing import Literal
 from teamslam.team.wire import messages as m
 
 Delivery = Literal["stream", "latest", "all"]
-"""How a message is delivered. A publisher blocks while its link is busy. The router drops a message
-to a receiver that is slower than the team; the receiver fetches it as after a cut link.
+"""Delivery of messages. A publisher blocks while its link is busy; the router drops messages to a
+slower receiver, which fetches them as after a cut link.
 
 stream: a receiver requests a missed message from its source, by the measurement counter.
 latest: a late joiner receives the newest message; after a cut link the missed ones are recovered.
@@ -41,9 +40,7 @@ _PATTERNS = {
 class Channel:
     """One row: the message on a key, its rate, its delivery, and its place in a log.
 
-    Rows are compared by identity.
-
-    alternatives: further messages on the key.
+    alternatives: further messages on the key. Rows are compared by identity.
     """
 
     name: str
@@ -71,10 +68,7 @@ class Channel:
         return before + name + after if after is not None else before
 
     def selectors(self, name: str = "*") -> tuple[str, ...]:
-        """Return the key expressions of one name, or of all (`*`), each of a fixed depth.
-
-        Names of nodes and views have up to two parts.
-        """
+        """Return the key expressions of one name, or of all (`*`), each of a fixed depth."""
         two = name == "*" and self._around[1] is not None and "{robot}" not in self.template
         return (self.key(name), self.key("*/*")) if two else (self.key(name),)
 
@@ -86,13 +80,13 @@ class Channel:
         return f"{first}/{name}" if first == "robot" and rest.startswith("{robot}") else first
 
     def owner(self, key: str) -> str | None:
-        """Return the robot or node of `key`; None if the key is of another channel."""
+        """Return the robot or node of `key`; None if it belongs to another channel."""
         match = self._pattern.fullmatch(key)
         return None if match is None else match.groupdict().get("name", "")
 
     @cached_property
     def _around(self) -> tuple[str, str | None]:
-        """The key before and behind the name; None behind it if the key has no name."""
+        """The key before and after the name; None after it if the key has no name."""
         parts = _PLACE.split(self.template)
         return parts[0], parts[2] if len(parts) > 1 else None
 
@@ -275,18 +269,18 @@ REPLIES = {
     FOLD: (TEAM_MAP,),
     SITE: (SAVED_MAP,),
 }
-"""The channels of the replies to each query."""
+"""Channels of the replies to each query."""
 UNOPENED = (*QUERIES, VIEW)
 """Rows whose traffic is not decoded: queries have no samples, views no messages of the team."""
 
 
 def robot_node(robot: str) -> str:
-    """Return the node name of a robot, as in liveliness tokens and status."""
+    """Return the node name of a robot."""
     return f"robot/{robot}"
 
 
 def source_node(robot: str) -> str:
-    """Return the node name of a robot's driver, as in liveliness tokens and status."""
+    """Return the node name of a robot's driver."""
     return f"source/{robot}"
 
 

@@ -1,11 +1,8 @@
 """Encode messages, and decode them with all checks, so that only valid ones reach a node.
 
-A payload is decoded into the class of its tag, field by field, and refused at the first byte that
-does not fit. Values are never unpacked without a type: a list of empty lists takes 75 times its
-size.
-
-A large payload is first read without creating what it contains: its tag, and the number and the
-nesting of its values.
+A payload is decoded into the class of its tag and refused at the first byte that does not fit.
+Values are never unpacked without a type: a list of empty lists takes 75 times its size. Number and
+nesting of the values of a large payload are checked before any is created.
 """
 
 from functools import cache
@@ -22,11 +19,11 @@ LARGEST_PAYLOAD = 64 * 2**20
 
 
 class WireError(ValueError):
-    """An invalid payload; `reason` is one of the texts below, `detail` a sentence.
+    """An invalid payload.
 
-    Reasons: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length", "not
-        finite", "not symmetric", "not positive definite", "not ascending", "out of bounds", "too
-        large", "too deep", "damaged", "wrong field".
+    reason: "wrong tag", "wrong version", "truncated", "trailing bytes", "wrong length", "not
+    finite", "not symmetric", "not positive definite", "not ascending", "out of bounds", "too
+    large", "too deep", "damaged" or "wrong field". detail: a sentence.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -51,9 +48,9 @@ _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def decoded(payload: bytes, *expected: type[M]) -> M:
-    """Decode and check a payload field by field; raises `WireError`.
+    """Decode and check a payload; raises `WireError`.
 
-    expected: the accepted classes, as those of a channel; without any, all.
+    expected: the accepted classes; without any, all.
     """
     if len(payload) > LARGEST_PAYLOAD:
         raise WireError("too large", f"{len(payload)} bytes, {LARGEST_PAYLOAD} at most")
@@ -126,12 +123,11 @@ def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
 
 @cache
 def _decoder(kinds: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder[Any]:
-    """Return a decoder of the messages of these classes; without any, of all."""
     return msgspec.msgpack.Decoder(Union[kinds or tuple(BY_TAG.values())])  # noqa: UP007
 
 
 def tag_in(payload: bytes) -> str:
-    """Return the tag at the beginning of a payload; empty if it has none."""
+    """Return the tag of a payload; empty if it has none."""
     try:
         return read_tag(payload)
     except StructureError:
@@ -155,20 +151,20 @@ def _kind(tag: str, expected: tuple[type[Message], ...]) -> type[Message]:
 
 
 SMALL = 2**18
-"""Payloads of up to so many bytes have too few values to matter."""
+"""Payloads up to this size [bytes] have too few values to matter."""
 MOST_VALUES = 250_000
-"""Largest number of values in a message; arrays of numbers are one value each."""
+"""Most values in a message; an array of numbers is one value."""
 DEEPEST = 16
 """Deepest nesting of a message; the known ones have four levels."""
 _LONGEST_TAG = 100
 _INVALID = 0xC1
 _SCALARS = {0xC0: 0, 0xC2: 0, 0xC3: 0, 0xCA: 4, 0xCB: 8,
             0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}  # fmt: skip
-"""By the code of a scalar, the number of bytes after it."""
+"""Number of bytes after the code of a scalar."""
 _TEXTS = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}
-"""By the code of a `bin` or `str`, the number of bytes of its length."""
+"""Number of bytes of the length of a `bin` or `str`, by code."""
 _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
-"""By the code of an array or a map, the number of bytes of its length, and the values an entry."""
+"""Number of bytes of the length of an array or map, and of values per entry, by code."""
 
 
 class StructureError(ValueError):
@@ -227,8 +223,9 @@ def check_structure(payload: bytes) -> None:
 
 
 def _value_at(payload: bytes, at: int) -> tuple[int, int]:
-    """The number of values within the value at a place, and the place behind its head, or behind
-    it where there are none.
+    """Return the number of values inside the value at `at`, and the position after its head.
+
+    The position is that after the value if there are none inside.
     """
     code = _byte(payload, at)
     at += 1
@@ -253,7 +250,7 @@ def _value_at(payload: bytes, at: int) -> tuple[int, int]:
 
 
 def _group_at(payload: bytes) -> tuple[int, int]:
-    """The number of values of the array with which a payload begins, and the place of the first."""
+    """Return the number of values of the payload's array, and the position of the first."""
     code = _byte(payload, 0)
     if code >> 4 == 0b1001:
         return code & 15, 1
@@ -263,7 +260,7 @@ def _group_at(payload: bytes) -> tuple[int, int]:
 
 
 def _length(payload: bytes, at: int, width: int) -> tuple[int, int]:
-    """An unsigned number of so many bytes, and the place behind it."""
+    """Return the unsigned number of `width` bytes, and the position after it."""
     if len(payload) < at + width:
         raise _truncated()
     return int.from_bytes(payload[at : at + width], "big"), at + width

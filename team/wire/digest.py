@@ -1,4 +1,4 @@
-"""The digests by which messages name their inputs, and the announcement of a configuration."""
+"""Digests by which messages name their inputs, and the announcement of a configuration."""
 
 import hashlib
 
@@ -7,35 +7,35 @@ import msgspec
 from teamslam.team.wire import messages as m
 
 NO_MAP = bytes(8)
-"""The digest that stands for no map."""
+"""The digest of no map."""
 
 
 class Digest:
-    """An incremental digest of parts of bytes."""
+    """An incremental digest of byte strings."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=8)
 
     def update(self, *parts: bytes) -> None:
-        """Add parts."""
+        """Add byte strings, each with its length."""
         for part in parts:
             self._hash.update(len(part).to_bytes(8, "little"))
             self._hash.update(part)
 
     def copy(self) -> "Digest":
-        """Return an independent digest of the same parts."""
+        """Return an independent copy."""
         other = Digest()
         other._hash = self._hash.copy()
         return other
 
     @property
     def value(self) -> bytes:
-        """The 8-byte digest of the parts so far."""
+        """The 8-byte digest so far."""
         return self._hash.digest()
 
 
 def digest_of(*parts: bytes) -> bytes:
-    """Return the 8-byte BLAKE2b digest by which messages name a configuration or a set."""
+    """Return the 8-byte BLAKE2b digest of byte strings."""
     digest = Digest()
     digest.update(*parts)
     return digest.value

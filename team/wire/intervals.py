@@ -1,4 +1,4 @@
-"""Sets of integers as sorted, disjoint, closed intervals, whatever their lengths."""
+"""Sets of integers as sorted, disjoint, closed intervals."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
@@ -37,7 +37,6 @@ class IntervalSet:
         return len(self._begins)
 
     def __iter__(self) -> Iterator[Interval]:
-        """Iterate over the intervals in ascending order."""
         return zip(self._begins, self._ends, strict=True)
 
     @property
@@ -52,7 +51,7 @@ class IntervalSet:
             del self._begins[1 : 1 + excess], self._ends[:excess]
 
     def next_absent(self, number: int) -> int:
-        """Return the smallest integer from `number` on that is not in the set."""
+        """Return the smallest integer ≥ `number` that is not in the set."""
         at = bisect_left(self._ends, number)
         inside = at < len(self._begins) and self._begins[at] <= number
         return self._ends[at] + 1 if inside else number

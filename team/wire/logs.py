@@ -1,8 +1,8 @@
 """The log of a process, whose lines others can neither flood nor forge.
 
-Every record of the logger `teamslam` passes one filter. Each place in the program may log AT_ONCE
+One filter sees every record of the logger `teamslam`. Each place in the program may log AT_ONCE
 lines, and regains PER_S lines a second; the next line counts the omitted ones. Control characters
-are escaped, so that a record is one line, of at most LONGEST characters.
+are escaped, so that a record is one line of at most LONGEST characters.
 """
 
 import logging
@@ -10,22 +10,19 @@ import logging
 from teamslam.team.wire.text import cut, one_line
 
 AT_ONCE = 50
-"""Number of lines that one place in the program may log at once."""
 PER_S = 0.5
-"""Number of lines that it regains each second."""
 LONGEST = 4_000
-"""Largest number of logged characters of a line."""
 
 
 class Limits(logging.Filter):
-    """A filter that limits the rate of records by their place, and escapes their texts."""
+    """Limit the rate of records by their place, and escape their texts."""
 
     def __init__(self) -> None:
         super().__init__()
         self._sites: dict[tuple[str, int], tuple[float, float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Decide whether the record is logged, and make its message one printable line."""
+        """Decide whether to log the record, and make its message one printable line."""
         now = record.created
         site = (record.pathname, record.lineno)
         allowance, since, left_out = self._sites.get(site, (float(AT_ONCE), now, 0))

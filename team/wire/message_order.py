@@ -1,8 +1,7 @@
 """The order of messages of `latest` channels, by content instead of arrival.
 
-Zenoh orders the samples of one publisher on one key, but a restarted centre, a late joiner's cache
-and a repeated reply deliver older messages after newer ones. Each order here is total, so receivers
-of the same messages end with the same message, whatever the order of arrival.
+A restarted centre, a late joiner's cache and a repeated reply deliver older messages after newer
+ones. Each order is total, so receivers of the same messages end with the same one.
 """
 
 from collections.abc import Sequence
@@ -15,9 +14,8 @@ SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 def set_order(received: int, withdrawn: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     """Return the sort key of a set: number of received submaps, of withdrawn robots, and size.
 
-
-    The number of received submaps only grows. With the same submaps the fold may withdraw a further
-    robot, but reinstates none; of sets with equal numbers the larger one contains the other.
+    The number of received submaps only grows. With the same submaps the fold may withdraw further
+    robots, but reinstates none; of sets with equal numbers the larger contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return received, withdrawn, sum(each.sequence + 1 for each in members), vector
@@ -46,9 +44,7 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
 def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
     """Return the larger numbers of both messages, or the message of the newer incarnation.
 
-
-    A restarted process first reports smaller numbers; the larger ones remain valid, since equal
-    measurements give equal submaps.
+    A restarted process first reports smaller numbers; the larger ones remain valid.
     """
     if known is None or new.incarnation > known.incarnation:
         return new
@@ -65,7 +61,7 @@ def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
 
 
 def later_end(new: m.End, known: m.End | None) -> m.End:
-    """Return the end with the larger counter of each stream in both messages; notes of `new`."""
+    """Return the end with the larger counter of each stream; notes of `new`."""
     if known is None:
         return new
     streams = {each.robot: each for each in known.streams}

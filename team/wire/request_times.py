@@ -1,19 +1,19 @@
-"""The times at which missing data are requested: after a delay, then at growing intervals."""
+"""Times at which missing data are requested: after a delay, then at growing intervals."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 PATIENCE_S = 0.5
-"""Delay [s] before the first request: the data may be on its way."""
+"""Delay [s] before the first request."""
 LONGEST_S = 8.0
-"""Longest interval [s] between two equal requests; intervals double up to it."""
+"""Longest interval [s] between two equal requests, which double."""
 K = TypeVar("K", bound=Hashable)
 
 
 @dataclass
 class RequestTimes(Generic[K]):
-    """Gaps by name, each with the time of its beginning and of its next request."""
+    """Gaps by name, each with the time of its next request."""
 
     _gaps: dict[K, tuple[Hashable, float, float]] = field(default_factory=dict)
 

@@ -1,7 +1,7 @@
 r"""Printable forms of foreign texts, which may contain terminal escapes or forged lines.
 
-C0 and C1 control characters (line ends among them), bidirectional overrides and other invisible
-format characters are written as `\x1b` or `\u202e`. Stored texts keep their bytes.
+Control characters (line ends among them), bidirectional overrides and other invisible format
+characters are written as `\x1b` or `\u202e`. Stored texts keep their bytes.
 """
 
 import unicodedata
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def one_line(text: str) -> str:
-    """Return a text as one line without control characters, for a terminal, log or report."""
+    """Write a text as one line without control characters."""
     return text if text.isprintable() else "".join(map(_printable, text))
 
 
@@ -24,7 +24,7 @@ def lines(text: str) -> str:
 
 
 def cut(text: str, length: int) -> str:
-    """Shorten a text to `length` characters, with an ellipsis in place of the rest."""
+    """Shorten a text to `length` characters, the last an ellipsis."""
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 

@@ -1,8 +1,8 @@
 """The table of views, which a viewer node publishes in the schemas of other tools.
 
-No node decodes a view, no estimate depends on it, and verification skips it. Foxglove, Lichtblick
-and Rerun support its schema, so they open a log without configuration. Frames: `map` is the frame
-of the team's map, `robot/<name>` that of a robot; metres, radians, counter-clockwise; z = 0.
+No estimate depends on a view, and verification skips it. Foxglove, Lichtblick and Rerun open a log
+with these schemas without configuration. Frames: `map` is that of the team's map, `robot/<name>`
+that of a robot; metres, radians, counter-clockwise; z = 0.
 """
 
 import re
@@ -20,9 +20,9 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; unknown ones are left out.
 
-    Errors are those of the map without alignment to the truth; landmark_nees_per_dof is the map's
-    NEES per degree of freedom (1 is consistent), joint if the map has a joint covariance, else of
-    each landmark by itself. status: the centre's figures, with those of the consistency monitor.
+    map_rmse_m: without alignment to the truth. landmark_nees_per_dof: 1 is consistent; joint if the
+    map has a joint covariance, else of each landmark by itself. status: the centre's figures, with
+    those of the consistency monitor.
     """
 
     team_time_s: float
@@ -34,10 +34,10 @@ class TeamFigures(msgspec.Struct, frozen=True):
 
 
 class RobotFigures(msgspec.Struct, frozen=True):
-    """Figures of one robot for plots: its running pose, and its errors with their 3σ bounds.
+    """Running pose of a robot for plots, and its errors with their 3σ bounds.
 
-    Figures without truth are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is
-    1. status: the robot's own figures.
+    Without truth the errors are left out. nees_per_dof: eᵀ P⁻¹ e / 3, whose expectation is 1.
+    status: the robot's own figures.
     """
 
     team_time_s: float
@@ -56,7 +56,7 @@ class RobotFigures(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class View:
-    """One row: key, schema (of Foxglove by its name, of ours by its fields), rate, meaning."""
+    """One row: key, schema (Foxglove's by name, ours by its fields), rate, meaning."""
 
     template: str
     schema: str | type[msgspec.Struct]
@@ -64,7 +64,7 @@ class View:
     meaning: str
 
     def key(self, robot: str = "") -> str:
-        """Return the relative key; of a view of a robot, for that robot."""
+        """Return the relative key, of one robot if it has a place for it."""
         return self.template.replace("{robot}", robot)
 
     def is_of(self, key: str) -> bool:
@@ -95,7 +95,7 @@ VIEWS: tuple[View, ...] = tuple(v for v in list(globals().values()) if isinstanc
 
 
 def view_of(key: str) -> View | None:
-    """Return the view of a relative key; None for keys of channels and unknown keys."""
+    """Return the view of a relative key; None if there is none."""
     if VIEW.owner(key) is None:
         return None
     return next((view for view in VIEWS if view.is_of(key)), None)

@@ -1,13 +1,12 @@
 """The messages: frozen, versioned, positional; one module for each kind of publisher.
 
-On the wire a message is a MessagePack array `[tag, field, field, …]` in the order of its class;
-`tag` is "name/version". A later version of the program may append fields (with defaults) without a
-new version; readers ignore further fields. A new meaning, unit or frame is a new version. Arrays
-travel as `bin`: little-endian, C order, of the type that `Floats`, `Ids` or `Stamps` names. SI
-units, radians, bearings in (−π, π].
+On the wire a message is a MessagePack array `[tag, field, field, …]`; `tag` is "name/version". A
+later program may append fields with defaults without a new version; readers ignore further fields.
+A new meaning, unit or frame is a new version. Arrays are `bin`: little-endian, C order, of the type
+`Floats`, `Ids` or `Stamps`. SI units, radians, bearings in (−π, π].
 
-Every message has `stamp_ns`, its team time: the time of the measurement that it is about. `check`
-raises `ValueError` with the reason where the numbers do not fit the message.
+`stamp_ns` is the team time of the measurement that the message is about. `check` raises
+`ValueError` with the reason where the numbers do not fit the message.
 """
 
 from teamslam.team.wire.messages.base import Author as Author
@@ -112,4 +111,3 @@ def _by_tag(base: type[Message]) -> dict[str, type[Message]]:
 
 
 BY_TAG = _by_tag(Message)
-"""Every message class by its tag."""

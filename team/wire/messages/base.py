@@ -1,4 +1,4 @@
-"""The base of all messages: types of fields, and checks of arrays that several messages share."""
+"""The base of all messages: types of fields, and shared checks of arrays."""
 
 from typing import Annotated, Literal
 
@@ -23,12 +23,12 @@ Real = Annotated[float, Meta(ge=-1e300, le=1e300)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, array_like=True, gc=False):
-    """A message with its team time: the stamp of the measurement that it is about."""
+    """A message with its team time."""
 
     stamp_ns: StampNs
 
     def check(self) -> None:
-        """Raise ValueError if the arrays do not fit together; the base has none."""
+        """Raise ValueError if the arrays do not fit together."""
 
 
 def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: bool) -> None:
@@ -50,7 +50,7 @@ def check_counts(count_bytes: bytes, groups: int, total: int) -> None:
 
 
 def check_classes(class_bytes: bytes, count: int) -> None:
-    """Raise ValueError unless there are as many finite numbers for each of `count` things."""
+    """Raise ValueError unless there are equally many finite numbers for each landmark."""
     numbers = len(floats(class_bytes, "classes"))
     if numbers and (not count or numbers % count):
         raise ValueError(f"wrong length: classes has {numbers} numbers for {count} landmarks")
@@ -58,5 +58,5 @@ def check_classes(class_bytes: bytes, count: int) -> None:
 
 
 def tag_of(message: type[Message]) -> str:
-    """Return the tag of a message, "name/version"."""
+    """Return the tag, "name/version"."""
     return str(message.__struct_config__.tag)

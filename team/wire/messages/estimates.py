@@ -11,11 +11,11 @@ from teamslam.team.wire.messages.base import Count, Digest, Message, Name, Text,
 
 
 class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
-    """A robot's own running map in the team's frame: landmark means and covariances.
+    """A robot's running map in the team's frame.
 
-    exchange: number of exchanges of maps under a rule with feedback (lockstep); 0 under `join`.
-    means: L × 2 floats. covariance: packed upper triangle of the 2L × 2L joint if `joint`, else the
-    L packed 2 × 2 blocks (3 floats each).
+    exchange: number of map exchanges under a rule with feedback (lockstep); 0 under `join`. means:
+    L × 2 floats. covariance: packed upper triangle of the 2L × 2L joint if `joint`, else L packed 2
+    × 2 blocks.
     """
 
     robot: Name
@@ -32,13 +32,12 @@ class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
 
 
 class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
-    """A robot's pose at stamp_ns, with its 3 × 3 covariance, in the frame `frame`.
+    """A robot's pose at stamp_ns, with its 3 × 3 covariance, in `frame`.
 
     map_digest: the fused map that it uses (8 zero bytes: none). sequence: the submap in progress.
-    frame: in the notation of `FusedMap.frame`; empty in logs of earlier versions. in_team_frame:
-    frame is the team's; on team/pose that of the named map, on own/pose if the initial pose is
-    known. A pose on team/pose that is not in the team's frame is the own pose and withdraws the
-    poses before it.
+    frame: as `FusedMap.frame`; empty in older logs. in_team_frame: frame is the team's; on
+    team/pose that of the named map, on own/pose if the initial pose is known. A pose on team/pose
+    outside the team's frame is the own pose and withdraws the poses before it.
     """
 
     robot: Name
@@ -56,10 +55,7 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
 
 
 class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
-    """A thinned particle cloud, for viewers: P × 3 poses and P weights.
-
-    They are in the frame of the robot's own poses (`robot/{robot}/own/pose`).
-    """
+    """A thinned particle cloud for viewers: P × 3 poses and P weights, in the frame of own/pose."""
 
     robot: Name
     poses: Floats
@@ -73,9 +69,8 @@ class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
 class Innovation(Message, frozen=True, kw_only=True, tag="innovation/1"):
     """NIS of a window's measurements, Σ νᵀ S⁻¹ ν; χ²(dof) if the models are right.
 
-    dof: degrees of freedom, two for each measurement of an already mapped landmark. (robot,
-    incarnation, sequence) and stamp_ns are those of the window's submap; an estimator over the
-    whole stream publishes the NIS of the measurements since its last one.
+    dof: two for each measurement of a mapped landmark. sequence: the window's submap; an estimator
+    over the whole stream publishes the NIS since its last message.
     """
 
     robot: Name
@@ -88,8 +83,8 @@ class Innovation(Message, frozen=True, kw_only=True, tag="innovation/1"):
 class Rendezvous(Message, frozen=True, kw_only=True, tag="rendezvous/1"):
     """Release of `submaps` buffered submaps; the oldest was buffered for `waited_s` seconds.
 
-    teammates: the observed robots, which release theirs on this message; empty if the robot was
-    observed itself, or its stream has ended.
+    teammates: the observed robots, which release theirs, too; empty if the robot was observed
+    itself, or its stream has ended.
     """
 
     robot: Name
@@ -109,7 +104,7 @@ class Disposition(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class Done(Message, frozen=True, kw_only=True, tag="done/1"):
     """End of a robot's work: all measurements are consumed, and the last submap is sent.
 
-    last_map: sequence of the last own map, if the rule consumes own maps; −1: none.
+    last_map: sequence of the last own map, if the rule consumes own maps; else −1.
     """
 
     robot: Name

@@ -1,4 +1,4 @@
-"""The team's map, priors and trajectories, with the parts of these messages."""
+"""The team's map, priors, trajectories and saved maps."""
 
 from itertools import pairwise
 from typing import Annotated, Literal
@@ -31,15 +31,15 @@ from teamslam.team.wire.messages.orders import Judgement
 
 ChangeState = Literal["unchanged", "moved", "gone", "new"]
 MOST_SAVED = 2000
-"""Most landmarks of a saved map, whose joint covariance has 64 MB."""
+"""Most landmarks of a saved map (joint covariance: 64 MB)."""
 MOST_OWN = 500
-"""Most errors of single robots in a saved map: five of a hundred robots."""
+"""Most errors of single robots in a saved map."""
 MOST_SETS = 10_000
 """Most streams in a saved map: five a day for five years."""
 
 
 class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """One entry of a version vector: it contains the submaps of a stream up to `sequence`.
+    """Entry of a version vector: the submaps of a stream up to `sequence`.
 
     Under a rule on whole maps sequence is that of the robot's map, under a rule on raw measurements
     their counter.
@@ -51,7 +51,7 @@ class VersionEntry(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """Estimate of an error that all submaps of (robot, incarnation) share, with its sigma."""
+    """Estimate of an error that all submaps of (robot, incarnation) share."""
 
     robot: Author
     incarnation: Count
@@ -61,7 +61,7 @@ class BiasEstimate(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """The landmarks of the map to which M unnamed landmarks of (robot, incarnation) belong.
+    """Landmarks of the map to which M unnamed landmarks of (robot, incarnation) belong.
 
     sequences, locals: submap, and number less 2³¹. identities: as in the map. steps: M bytes, the
     step of association that merged it: 0 none, 1 track, 2 near, 3 sweep, 4 closure, 5 merge of
@@ -79,13 +79,13 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """A closure or a merge of robots: accepted, undone, or waiting, with its figures.
+    """A closure or a merge of robots, with its figures.
 
-    kind: "closure", "merge", "undone" or "waits". stamp_ns: end of the last submap in it. about:
-    the two sides. pairs, llr: number of pairs, and the sum of their log-likelihood ratios;
-    rival_pairs, rival_llr: of the best other alignment. share: matched share of the landmarks
-    there, of the side that has fewer. sd: largest standard deviation of a pair [m]. why: the failed
-    test. absent: landmarks of one side that are missing where the other side looked.
+    kind: "closure", "merge", "undone" or "waits". stamp_ns: end of its last submap. about: the two
+    sides. pairs, llr: number of pairs, and sum of their log-likelihood ratios; rival_pairs,
+    rival_llr: of the best other alignment. share: matched share of the landmarks there, of the side
+    that has fewer. sd: largest standard deviation of a pair [m]. why: the failed test. absent:
+    landmarks of one side that are missing where the other side looked.
     """
 
     stamp_ns: StampNs
@@ -102,13 +102,12 @@ class AssociationDecision(msgspec.Struct, frozen=True, kw_only=True, array_like=
 
 
 class LandmarkChange(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """The state of a landmark against the saved maps of earlier days.
+    """State of a landmark against the saved maps of earlier days.
 
-    dx, dy [m]: its displacement since then, in the frame of the map; sigma [m]: standard deviation
-    of one coordinate of it; chi2: of two degrees of freedom that it has not moved; sigma and chi2
-    are 0 for a landmark that is gone or new. dx, dy of one that is gone: of the map's place for it,
-    where a submap has its number elsewhere. expected: how often one that is gone should have been
-    observed.
+    dx, dy [m]: its displacement in the frame of the map; sigma [m]: of one coordinate of it; chi2:
+    two degrees of freedom, that it has not moved; both 0 for a gone or new landmark. dx, dy of a
+    gone one: from the map's place to that of a submap with its number. expected: how often a gone
+    one should have been observed.
     """
 
     landmark: Count
@@ -139,9 +138,9 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """A cause of misfit: of a robot, of a landmark, or of the team (neither).
 
     value, sigma: (dx, dy) [m] of a landmark's second place from its first; (dx, dy, dtheta) of a
-    robot that was carried off; else one number, and none where the cause has none. evidence: cost
-    that the cause removes, per degree of freedom, or the log-likelihood ratio of a view that
-    changed at once. at_ns: team time of the change; 0: no time. place: (x, y) [m] of it, if known.
+    robot that was carried off; else one number or none. evidence: removed cost per degree of
+    freedom, or the log-likelihood ratio of a view that changed at once. at_ns: team time of the
+    change; 0: none. place: (x, y) [m] of it, if known.
     """
 
     cause: Cause
@@ -158,24 +157,22 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     """The team's map: landmark means and covariances, its set and its frame.
 
-    members: the version vector of its set, ordered; missing: submaps known to be in a gap of it, as
-    (robot, incarnation, sequence). digest: 8-byte name of the set, the rule and its settings.
-    frame: the stream whose start fixes the frame, "robot/incarnation". provisional: some members
-    are ahead of the watermark. covariance: as in MapEstimate. chi2, dof: the joint cost; 0, 0 if
-    the rule has none. exchange: number of the lockstep round, 0 under `join`. reasons: why robots
-    are not joined, signs of another minimum, and of models that do not fit the data. biases: by
-    robot, incarnation and name, if submaps have sensitivities. joined: how robots with an unknown
-    start were joined, with the evidence. withdrawn: withdrawn robots, ascending. covariance_scale:
-    factor by which the submaps' covariances should be multiplied, from their agreement; 1 is
-    consistent, 0: unknown. lost: robots whose streams are incomplete in the final map, ascending;
-    such a map is provisional. heard: number of submaps and withdrawals that the centre had
-    received; the newer of two maps has more, or as many and more members. memberships: by robot and
-    incarnation, if landmarks have no names; a landmark of one submap is tentative, and a running
-    map names the first and last few members of each. decisions: the newest closures and merges of
-    robots, then the waiting ones. verdicts: the operators' verdicts in the map. changes: in a final
-    map with a saved one, the state of each landmark, by number. diagnosis: causes of misfit, the
-    best one first. left_out: the version vector of the withdrawn robots' submaps, which the
-    diagnosis compares with the map.
+    members: version vector of its set; missing: submaps known to be in a gap of it. digest: of the
+    set, the rule and its settings. frame: the stream whose start fixes the frame,
+    "robot/incarnation". provisional: some members are ahead of the watermark. covariance: as in
+    MapEstimate. chi2, dof: the joint cost; 0, 0 if the rule has none. exchange: number of the
+    lockstep round, 0 under `join`. reasons: why robots are not joined, signs of another minimum,
+    and of models that do not fit the data. biases: if submaps have sensitivities. joined: how
+    robots with an unknown start were joined, with the evidence. withdrawn, lost: ascending; the
+    streams of lost robots are incomplete in the final map, which is then provisional.
+    covariance_scale: factor by which the submaps' covariances should be multiplied, from their
+    agreement; 1 is consistent, 0: unknown. heard: number of submaps and withdrawals received; the
+    newer of two maps has more, or as many and more members. memberships: if landmarks have no
+    names; a landmark of one submap is tentative, and a running map names the first and last few
+    members of each. decisions: the newest closures and merges of robots, then the waiting ones.
+    verdicts: the operators'. changes: in a final map with a saved one, the state of each landmark,
+    by number. diagnosis: causes of misfit, the best one first. left_out: version vector of the
+    withdrawn robots' submaps, which the diagnosis compares with the map.
     """
 
     rule: Text
@@ -221,15 +218,16 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
 
 
 class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
-    """The joint marginal of a robot's last fused end pose and landmarks.
+    """Joint marginal of a robot's last fused end pose and landmarks.
 
     digest: the set; sequence: the robot's last submap in it (−1: none; the pose is the start pose).
     mean: 3 + 2L floats; covariance: packed upper triangle. The robot uses its further submaps as
-    the centre does: covariances times covariance_factor, means moved by the shared errors (biases).
-    members, heard: as in FusedMap; withdrawn: number of withdrawn robots; they order two priors.
-    frame: of pose and landmarks, as in FusedMap; in_team_frame: the robot is in the team's map. If
-    not, the prior withdraws those before it. Without landmarks `frame` is then the robot's own, and
-    ids, mean and covariance are empty; else `frame` is the team's, and mean, 2L floats, and
+    the centre does: covariances times covariance_factor, means moved by `biases`. members, heard:
+    as in FusedMap; withdrawn: number of withdrawn robots; they order two priors. frame: of pose and
+    landmarks, as in FusedMap; in_team_frame: the robot is in the team's map.
+
+    If not, the prior withdraws those before it. Without landmarks `frame` is then the robot's own,
+    and ids, mean and covariance are empty; else `frame` is the team's, and mean (2L floats) and
     covariance are those of landmarks alone, by which the robot estimates its pose.
     """
 
@@ -261,9 +259,9 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
     """A robot's smoothed poses in the final map: K stamps, K × 3 poses, K × 9 floats.
 
     Under `join` they are the ends of its submaps, under `batch` its keyframes. start,
-    start_covariance: start of the first submap, 3 and 9 floats; crosses: K × 9 floats, the
-    covariance of each pose with the one before it (of the first with the start), row by row. These
-    three are empty under `batch`.
+    start_covariance: start of the first submap, 3 and 9 floats; crosses: K × 9 floats, row-major,
+    the covariance of each pose with the one before it (of the first with the start). All three are
+    empty under `batch`.
     """
 
     robot: Name
@@ -289,7 +287,7 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
 
 
 class RobotBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, order=True):
-    """An error that all submaps of a robot share, by the robot's name."""
+    """An error that all submaps of a robot share."""
 
     robot: Name
     bias: Bias
@@ -298,23 +296,23 @@ class RobotBias(msgspec.Struct, frozen=True, kw_only=True, array_like=True, orde
 class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     """The final map of a team as one Gaussian, for a file and for the set of a later team.
 
-    stamp_ns: the end of its last submap. name: of the map; its landmarks are a member `map-<name>`
-    of the set. ids: L, ascending; from 2³¹ on landmarks without identity. means: 2L floats [m].
-    covariance: packed upper triangle of their joint covariance, positive definite, with the errors
-    `biases` taken as zero. biases: errors that all sensors share on every day, ascending;
-    sensitivity: B × 2L floats: given these errors b the means are means + bᵀ sensitivity. Errors of
-    single robots are part of the covariance. counts: number of submaps of each landmark, those of
-    earlier days included. frame: as in FusedMap. sets: digests of the first submap of each robot's
-    stream in it, on all days, ascending: two maps with a stream in common cannot be joined.
-    software, core: version of the program, digest of the native core. datum: latitude [deg],
-    longitude [deg] and height [m] of the frame's origin on WGS84, x east and y north; empty: not
-    stated. own: K errors of single robots in it, ascending; with the errors `biases` taken as zero,
-    own_means: their K means; own_covariance: packed upper triangle of their covariance; own_cross:
-    K × 2L floats: their covariance with the means of the landmarks, whose `covariance` contains
-    them. own_sensitivity: B × K floats: given the errors b their means are own_means + bᵀ
-    own_sensitivity. likeliest, evidence: B + K floats and the packed upper triangle of an
-    information matrix, positive definite: the likelihood N(likeliest, evidence⁻¹) of (biases, own)
-    by the measurements in the map, without any prior of these errors.
+    stamp_ns: end of its last submap. Its landmarks are a member `map-<name>` of the set. ids: L,
+    ascending; from 2³¹ on landmarks without identity. means: 2L floats [m]. covariance: packed
+    upper triangle of their joint covariance, positive definite, given zero `biases`. biases: errors
+    that all sensors share on every day, ascending; sensitivity: B × 2L floats: given these errors b
+    the means are means + bᵀ sensitivity. counts: number of submaps of each landmark, earlier days
+    included. frame: as in FusedMap. sets: digests of the first submap of each robot's stream in it,
+    on all days, ascending: two maps with a stream in common cannot be joined. software, core:
+    version of the program, digest of the native core. datum: latitude [deg], longitude [deg] and
+    height [m] of the frame's origin on WGS84, x east and y north; empty: not stated.
+
+    own: K errors of single robots, ascending. Given zero `biases`, own_means: their K means;
+    own_covariance: packed upper triangle of their covariance; own_cross: K × 2L floats, their
+    covariance with the means of the landmarks, whose `covariance` contains them. own_sensitivity: B
+    × K floats: given b their means are own_means + bᵀ own_sensitivity. likeliest, evidence: B + K
+    floats and the packed upper triangle of an information matrix, positive definite: the likelihood
+    N(likeliest, evidence⁻¹) of (biases, own) by the measurements in the map, without any prior of
+    these errors.
     """
 
     name: Name
@@ -339,7 +337,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
 
     @property
     def author(self) -> str:
-        """The name of its member of the set."""
+        """Name of its member of the set."""
         return MAP + self.name
 
     def check(self) -> None:  # noqa: D102
@@ -367,7 +365,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
                 raise ValueError(f"out of bounds: datum at {latitude:g}°, {longitude:g}°")
 
     def _check_own(self, n: int) -> None:
-        """Check the errors of single robots: with the landmarks they have a covariance."""
+        """Check the errors of single robots, with their joint covariance with the landmarks."""
         K = len(self.own)
         if any(a >= b for a, b in pairwise(self.own)):
             raise ValueError("not ascending: own")

@@ -26,7 +26,7 @@ from teamslam.team.wire.messages.base import (
 
 
 class Measurement(Message, frozen=True, kw_only=True):
-    """A measurement of a sensor stream, with the robot's measurement counter as `number`."""
+    """A measurement of a sensor stream; `number` is the robot's measurement counter."""
 
     robot: Name
     incarnation: Count
@@ -34,10 +34,9 @@ class Measurement(Message, frozen=True, kw_only=True):
 
 
 class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
-    """Measurement 0 of an incarnation: the start pose in the team's frame, if it is known.
+    """Measurement 0 of an incarnation: the start pose in the team's frame.
 
-    pose: 3 floats (x, y, theta); empty: unknown. covariance: 3 × 3 floats, row by row; empty:
-    exact.
+    pose: 3 floats (x, y, theta); empty: unknown. covariance: 3 × 3 floats, row-major; empty: exact.
     """
 
     pose: Floats
@@ -52,7 +51,9 @@ class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
 
 
 class Odometry(Measurement, frozen=True, kw_only=True, tag="odometry/1"):
-    """One odometry interval that ends at stamp_ns: mean forward speed and yaw rate over it."""
+    """Mean forward speed [m/s] and yaw rate [rad/s] over an odometry interval that ends at
+    stamp_ns.
+    """
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
     forward: Real
@@ -60,10 +61,10 @@ class Odometry(Measurement, frozen=True, kw_only=True, tag="odometry/1"):
 
 
 class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
-    """One odometry interval that ends at stamp_ns, as the motion over it.
+    """Motion over an odometry interval that ends at stamp_ns.
 
     increment: 3 floats (forward [m], left [m], turn [rad]), the pose of its end in the frame of its
-    start. covariance: 3 × 3 floats, row by row, of an error in the frame of its end (pose ∘
+    start. covariance: 3 × 3 floats, row-major, of an error in the frame of its end (pose ∘
     Exp(error)), of any rank; empty: none is stated.
     """
 
@@ -80,10 +81,10 @@ class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
 
 
 class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
-    """One odometry interval of a car that ends at stamp_ns, as its encoders read it.
+    """Encoders of a car over an odometry interval that ends at stamp_ns.
 
-    wheel_speed [m/s]: of the rear wheel that carries the encoder. steering [rad]: the angle of the
-    front wheels, left is positive. The robot's motion model converts both to a motion.
+    wheel_speed [m/s]: of the rear wheel that carries the encoder. steering [rad]: angle of the
+    front wheels, positive to the left. The robot's motion model converts both to a motion.
     """
 
     duration_ns: Annotated[int, Meta(ge=0, lt=2**62)]
@@ -136,9 +137,7 @@ class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
 
 
 AnyOdometry = Odometry | Increment | Steering
-"""A measurement of one odometry interval."""
 AnyScan = Observations | Points
-"""A measurement of landmarks with identities."""
 
 
 class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
@@ -147,8 +146,7 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
     Some may be clutter. Two of one scan are different landmarks. covariances: L × 3 floats, packed
     2 × 2 of (range, bearing), or empty: the sensor's noise. signatures: L floats that are similar
     for one landmark, such as a trunk's diameter [m], or empty. classes: C floats of each, the
-    column ln P(its reported class | class c) of the detector's confusion matrix for the classes c
-    of the team, or empty.
+    column ln P(its reported class | class c) of the detector's confusion matrix, or empty.
     """
 
     ranges: Floats
@@ -199,11 +197,7 @@ _CLASSES = frozenset(Measurement.__subclasses__())
 
 
 def is_measurement(message: Message) -> TypeGuard[Measurement]:
-    """Whether a message is a measurement, in a tenth of the time of `isinstance`.
-
-    The metaclass of messages is derived from that of abstract base classes, whose instance checks
-    are calls.
-    """
+    """Return whether a message is a measurement, in a tenth of the time of `isinstance`."""
     return type(message) in _CLASSES
 
 
@@ -238,8 +232,7 @@ class StreamHead(Message, frozen=True, kw_only=True, tag="stream_head/1"):
 class MeasurementsRequest(Message, frozen=True, kw_only=True, tag="readings_wanted/1"):
     """Query to a source for measurements first … last of a stream; last −1: all.
 
-    only: the source replies with stored measurements and does not begin a new incarnation for
-    missing ones.
+    only: reply with stored measurements and do not begin a new incarnation for missing ones.
     """
 
     robot: Name

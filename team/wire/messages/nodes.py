@@ -17,7 +17,7 @@ from teamslam.team.wire.messages.base import (
 
 
 class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):
-    """A node's configuration (JSON), announced once; `digest` is its 8-byte name elsewhere."""
+    """A node's configuration (JSON); `digest` is its 8-byte name elsewhere."""
 
     node: Text
     incarnation: Count
@@ -26,11 +26,11 @@ class Configuration(Message, frozen=True, kw_only=True, tag="configured/1"):
 
 
 class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):
-    """Progress of a node with a stream: counts of measurements and of submaps.
+    """Counts of measurements and submaps of a stream that a node has handled.
 
-    A robot reports consumed measurements (during an exchange of maps: received ones); stamp_ns is
-    the team time before which it sends no further submap. The centre reports submaps in its set,
-    the recorder recorded measurements.
+    A robot reports consumed measurements (during an exchange of maps: received ones); it sends no
+    further submap before stamp_ns. The centre reports submaps in its set, the recorder recorded
+    measurements.
     """
 
     node: Text
@@ -41,7 +41,7 @@ class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):
 
 
 class Status(Message, frozen=True, kw_only=True, tag="status/1"):
-    """Status of a node, for people: a state, figures by name, warnings."""
+    """State, figures and warnings of a node, for people."""
 
     node: Text
     state: Text
@@ -53,7 +53,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault/1"):
     """A message that a node could not handle and set aside; stamp_ns is the message's.
 
     origin: its key, or the query's for a reply, or the name of a duty without message. count: the
-    publisher's counter of the key; -1: none. message: its tag; empty before it was decoded. error,
+    publisher's counter of the key; −1: none. message: its tag; empty before it was decoded. error,
     text: the exception's class and text. place: module:function:line. digest: 8 bytes, the
     payload's BLAKE2b.
     """
@@ -94,9 +94,9 @@ class Tally(Message, frozen=True, kw_only=True, tag="tally/1"):
 class KeptRequest(Message, frozen=True, kw_only=True, tag="kept_wanted/1"):
     """Query to the router for stored samples, newest last.
 
-    channels: names of the requested channels. node: the requesting node. run_ns: age of its run;
-    ends of a team are sent if they are younger, or if a process of this node was in that run and
-    left without a `Tally`.
+    channels: their names. node: the requesting node. run_ns: age of its run; ends of a team are
+    sent if they are younger, or if a process of this node was in that run and left without a
+    `Tally`.
     """
 
     channels: tuple[Text, ...]
@@ -105,10 +105,7 @@ class KeptRequest(Message, frozen=True, kw_only=True, tag="kept_wanted/1"):
 
 
 class Kept(Message, frozen=True, kw_only=True, tag="kept/1"):
-    """A stored sample of the router, as its author published it.
-
-    stamp_ns, wall_ns, counter: of the sample's attachment.
-    """
+    """A stored sample of the router, with its attachment, as its author published it."""
 
     key: Text
     payload: bytes

@@ -11,8 +11,8 @@ from teamslam.team.wire.messages.base import Author, Count, Message, Name, Text
 class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
     """Withdrawal of a robot or of a saved map, for good; a member of the set.
 
-    The map is that of the set without the robot's submaps and inter-robot factors. by: its author,
-    "operator" or "central". reason: text.
+    The map is that of the set without the robot's submaps and inter-robot factors. by: "operator"
+    or "central".
     """
 
     robot: Author
@@ -21,9 +21,9 @@ class Withdrawal(Message, frozen=True, kw_only=True, tag="withdrawal/1"):
 
 
 class WithdrawalHeard(Message, frozen=True, kw_only=True, tag="withdrawal_heard/1"):
-    """An order to withdraw `withdrawn` that a robot repeated, in logs of earlier versions.
+    """An order to withdraw `withdrawn` that `robot` repeated, in logs of earlier versions.
 
-    robot: the repeating one. by, reason: as in the order. No node publishes or receives it.
+    No node publishes or receives it.
     """
 
     robot: Name
@@ -52,8 +52,8 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
     """An operator's statement that two local landmarks are one, or two; a member of the set.
 
-    Of contradicting verdicts "two" holds. robot: that of the first landmark. by: the author.
-    reason: text. withdrawn: this judgement is taken back, for good.
+    Of contradicting verdicts "two" holds. robot: that of the first landmark. withdrawn: this
+    judgement is taken back, for good.
     """
 
     robot: Author
@@ -73,7 +73,6 @@ class GivenUp(Message, frozen=True, kw_only=True, tag="given_up/1"):
     """Order that no process waits for a node.
 
     The final map names a robot with missing data as lost. by: "operator", "launch" or "central".
-    reason: text.
     """
 
     node: Text
@@ -82,10 +81,7 @@ class GivenUp(Message, frozen=True, kw_only=True, tag="given_up/1"):
 
 
 class TeamEnd(Message, frozen=True, kw_only=True, tag="team_end/1"):
-    """Order that ends all streams of a live team.
-
-    by: the author. reason: text.
-    """
+    """Order that ends all streams of a live team."""
 
     by: Text
     reason: Text

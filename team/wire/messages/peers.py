@@ -9,8 +9,7 @@ from teamslam.team.wire.messages.base import Author, Count, Digest, Message, Nam
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
-    """The members of one stream that a node has: initial pose, and submaps with their factors.
-
+    """Members of one stream that a node has: initial pose, and submaps with their factors.
 
     sequences: first, last, first, last, … of closed intervals, ascending, with gaps between them.
     digest: of these members, independent of their order. newest_ns: end of the newest submap.
@@ -35,8 +34,8 @@ class Statements(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
     """Summary of a peer's set, from which others derive their requests.
 
-    serial: number of the summary of this process. digest: of the set; equal digests are equal sets.
-    holdings: by robot and incarnation, statements: by robot, both ascending.
+    serial: number of the summary of this process. digest: equal digests are equal sets. holdings:
+    by robot and incarnation, statements: by robot, both ascending.
     """
 
     node: Text
@@ -69,8 +68,7 @@ class Requested(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
 
 
 class MembersRequest(Message, frozen=True, kw_only=True, tag="members_wanted/1"):
-    """Query to a peer for members of the set. node: the requesting node.
-
+    """Query of `node` to a peer for members of the set.
 
     statements: the robots about which all orders and ends are requested.
     """
@@ -101,7 +99,7 @@ class FoldRequest(Message, frozen=True, kw_only=True, tag="fold_wanted/1"):
 
 
 class Certificate(Message, frozen=True, kw_only=True, tag="certificate/1"):
-    """A robot's certificate (DER), which verifies its signatures; a member of the set."""
+    """A robot's certificate (DER) for its signatures; a member of the set."""
 
     robot: Name
     certificate: Annotated[bytes, Meta(min_length=1, max_length=8192)]
@@ -111,8 +109,8 @@ class Signature(Message, frozen=True, kw_only=True, tag="signature/1"):
     """Signature of a member by its author, a robot or an operator, for peers that relay it.
 
     robot: the subject of the member. member: 32 bytes, the BLAKE2b of the key's length (2 bytes,
-    little-endian), key and payload. signature: an operator's stands behind its certificate (DER),
-    and this behind its length (2 bytes, little-endian).
+    little-endian), key and payload. signature: an operator's follows its certificate (DER), and
+    this its length (2 bytes, little-endian).
     """
 
     robot: Name

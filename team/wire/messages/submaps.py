@@ -26,19 +26,19 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     Its inputs are the measurements first_measurement … last_measurement of (robot, incarnation) and
     the configuration with the digest `config` (seed included). ids: L, ascending. mean: 3 + 3K + 2L
     floats (end pose, pose nodes, landmarks) in the frame of the start pose. covariance: packed
-    upper triangle, row by row. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings:
-    number of its SightingFactor messages. biases: errors that the robot's submaps share, B of them,
-    ascending; sensitivity: B × n float32 (float64 in older logs), the mean's derivative by each:
-    given the error b of the bearings [rad], of the detections' clock [s], of the scale of the
-    ranges or of the speed, the mean is mean + b · sensitivity. curvature: n of them, the second
-    derivative by the clock's error, which adds ½ b² · curvature; empty where there is none.
-    gated: number of rejected landmark measurements, which no others of the window confirmed.
+    upper triangle, row-major. nodes: K stamps in (start_ns, stamp_ns], ascending. sightings: number
+    of its SightingFactor messages. gated: number of rejected landmark measurements.
+
+    biases: B errors that the robot's submaps share, ascending; sensitivity: B × n float32 (float64
+    in older logs), ∂mean/∂b for the error b of the bearings [rad], of the detections' clock [s], or
+    of the scale of the ranges or of the speed: given b the mean is mean + b · sensitivity.
+    curvature: n of them, ∂²mean/∂b² by the clock's error, which adds ½ b² · curvature; empty: none.
 
     ids from 2³¹ on are unnamed landmarks, associated in the window: 2³¹ + a local index. counts:
-    number of measurements of each, ascending by id. keyframes: number of the window's keyframes
-    with detections. seen: ⌈keyframes/8⌉ bytes of each unnamed landmark; bit k (the least of byte k
-    // 8 first) is set if keyframe k contains it. Two landmarks in one keyframe are different.
-    classes: C floats of each, ln P(its detections' classes | class c) up to a constant, or empty.
+    number of measurements of each. keyframes: number of the window's keyframes with detections.
+    seen: ⌈keyframes/8⌉ bytes of each unnamed landmark; bit k (the least of byte k // 8 first) is
+    set if keyframe k contains it. Two landmarks in one keyframe are different. classes: C floats of
+    each, ln P(its detections' classes | class c) up to a constant, or empty.
     """
 
     robot: Name
@@ -129,7 +129,7 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
     × 2 (range, bearing). measurements: counters of the inter-robot measurements in it, ascending;
     with the submap's odometry and configuration they are its inputs. A fix of the robot's position
     has the teammate `map-gnss`; range and bearing are those of the antenna from the pose (0, −10⁵,
-    0) in the survey's frame, and point, 2 floats (none: the base), is the antenna in the node's.
+    0) in the survey's frame, and point, 2 floats (empty: the base), is the antenna in the node's.
     """
 
     robot: Name

@@ -6,7 +6,7 @@ from teamslam.team.wire.messages.base import Message, Name, StampNs, check_count
 
 
 class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):
-    """True poses of a robot, for the evaluator only: T stamps and T × 3 floats (x, y, theta)."""
+    """True poses of a robot, for the evaluation only: T stamps and T × 3 floats (x, y, theta)."""
 
     robot: Name
     stamps: Stamps
@@ -17,7 +17,7 @@ class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):
 
 
 class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"):
-    """True landmark positions, for the evaluator only: L ids and L × 2 floats."""
+    """True landmark positions, for the evaluation only: L ids and L × 2 floats."""
 
     ids: Ids
     positions: Floats
@@ -29,10 +29,10 @@ class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"
 
 
 class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
-    """True landmarks of a robot's detections, for the evaluator only.
+    """True landmarks of a robot's detections, for the evaluation only.
 
-    stamps: of M scans of detections; counts: the detections of each; labels: of each detection the
-    landmark's number, or NO_LABEL.
+    stamps: of M scans; counts: detections of each; labels: of each detection the landmark's number,
+    or NO_LABEL.
     """
 
     robot: Name
@@ -46,11 +46,11 @@ class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
 
 
 NO_LABEL = 2**32 - 1
-"""The label of clutter, and of detections with an unknown landmark."""
+"""The label of clutter, and of detections of an unknown landmark."""
 
 
 class TruthPositions(Message, frozen=True, kw_only=True, tag="truth_positions/1"):
-    """Positions of a robot by another sensor, such as a GPS, for the evaluator only.
+    """Positions of a robot by another sensor, such as a GPS, for the evaluation only.
 
     T stamps and T × 2 floats (x, y) in a frame of its own; some may be metres off.
     """

@@ -1,8 +1,8 @@
 """Access control at the router: a node publishes its own keys and receives those of its team.
 
 Zenoh's rules select by message, direction as the router sees it, and key; a subject is a
-certificate's common name. There are no templates, so each node has a rule. It includes its advanced
-publishers' caches and heartbeats, `…/@adv/pub/*/*/*`.
+certificate's common name. Each node has a rule, which includes its advanced publishers' caches and
+heartbeats, `…/@adv/pub/*/*/*`.
 """
 
 from collections.abc import Sequence
@@ -27,10 +27,9 @@ TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
 
 
 def owned(node: str) -> tuple[str, ...]:
-    """Keys, relative to the team, that only this node may publish, answer and hold tokens on.
+    """Return the keys, relative to the team, that only this node may publish and answer on.
 
-    They are those of the table of channels, of a fixed depth. The world drives every robot's
-    sensors, so it shares those keys with each `source-…`.
+    The world drives every robot's sensors, so it shares those keys with each `source-…`.
     """
     kind, _, name = node.partition("-")
     if node == REPLAY:
@@ -52,7 +51,7 @@ def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
 
 
 def access_control(roster: Roster) -> dict[str, Any]:
-    """Zenoh's `access_control` for a team; everything else is refused."""
+    """Return Zenoh's `access_control` for a team; everything else is refused."""
     prefix = f"team/{roster.team}/"
     every = [f"{prefix}**", f"{prefix}**/@adv/**"]
     truths = [key for channel in TRUTHS for key in channel.selectors()]

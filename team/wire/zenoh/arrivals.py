@@ -1,7 +1,7 @@
 """Track the publications of a publisher: deliver each once and find the missing ones.
 
-A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats.
-As long as it lives, a receiver can detect every gap: `docs/decisions/07-delivery-by-counts.md`.
+A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats,
+so a receiver detects every gap (docs/decisions/07-delivery-by-counts.md).
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ LONGEST_S = 8.0
 DELAY_S = 2.0
 """Longest delay [s] of publications after a gap."""
 MOST_GAPS = 4096
-"""Largest number of gaps per publisher and key; then the oldest is given up."""
+"""Most gaps per publisher and key; then the oldest is given up."""
 T = TypeVar("T")
 
 
@@ -24,10 +24,8 @@ T = TypeVar("T")
 class Arrivals(Generic[T]):
     """Publications of one publisher on one key; those before `first` are not requested.
 
-    Memory is proportional to the arrivals, not to the numbers, which come from the wire.
-
-    in_order: delay publications after a gap until it is closed or overdue. newest: last number
-    received.
+    Memory is proportional to the arrivals, not to the numbers, which come from the wire. in_order:
+    delay publications after a gap until it is closed or overdue. newest: last number received.
     """
 
     first: int
@@ -44,7 +42,7 @@ class Arrivals(Generic[T]):
     _loose: bool = field(default=False, init=False)
 
     def take(self, number: int, item: T) -> list[T]:
-        """Record an arrival; returns the items to deliver now, none for a duplicate."""
+        """Record an arrival; return the items to deliver now, none for a duplicate."""
         if number < self.first:  # not requested: Zenoh delivers it once
             return [item]
         if number in self._settled:
@@ -76,10 +74,10 @@ class Arrivals(Generic[T]):
         return [*self._gone, *self._open()]
 
     def due(self, now_s: float) -> tuple[int, int | None] | None:
-        """Interval to request now, if a gap is old enough; end None: everything since.
+        """Return the interval to request now, if a gap is old enough; end None: everything since.
 
-        A repeated request is for everything since: the cache always holds the newest publication,
-        so a reply without the missing numbers shows that they are gone.
+        A repeated request is for everything since: the cache always has the newest publication, so
+        a reply without the missing numbers shows that they are gone.
         """
         missing = self.missing
         if missing is None:
@@ -95,15 +93,14 @@ class Arrivals(Generic[T]):
         return missing if self._asked == 1 else (missing[0], None)
 
     def overdue(self, now_s: float) -> list[T]:
-        """Release the items of an overdue gap; none are delayed until it is closed."""
+        """Release the items of an overdue gap; until it closes none are delayed."""
         if self._since_s is None or now_s - self._since_s < DELAY_S:
             return []
         self._loose = True
         return self._released(self.newest + 1)
 
     def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
-        """Record the publisher's complete reply for `first` to `newest`; returns the items to
-        deliver.
+        """Record the complete reply for `first` to `newest`; return the items to deliver.
 
         Numbers still missing are gone. known: the last number at the request. If it exceeds the
         publisher's and nothing newer arrived since, it was that of another key: after a cut Zenoh
@@ -121,7 +118,7 @@ class Arrivals(Generic[T]):
         return self._settled.next_absent(self.first)
 
     def _give_up(self, first: int, last: int) -> None:
-        """Record the numbers first … last as gone; none if last < first."""
+        """Record the numbers first … last as gone."""
         self._gone.add(first, last)
         self._gone.join_first(MOST_GAPS)
         self._settled.add(first, last)

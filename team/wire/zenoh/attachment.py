@@ -1,10 +1,9 @@
-"""Pack and unpack the attachment of a publication: its stamps, its counter, a hash of its key.
+"""The attachment of a publication: stamps, counter, and a hash of its key.
 
-32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns], the publisher's counter of the
-key, and a hash of the whole key (BLAKE2b with a digest of 8 bytes, of the key's UTF-8). Zenoh
-abbreviates keys by numbers per link; data in flight when a link is cut is read with the numbers of
-the new link and can arrive under another key. The hash reveals that. The length is the version of
-the format: 24 bytes have no hash.
+32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns] and counter of the key, and the
+8-byte BLAKE2b of the whole key (UTF-8). Zenoh abbreviates keys by numbers per link, so data in
+flight when a link is cut can arrive under another key; the hash reveals that. The length is the
+version of the format: 24 bytes have no hash.
 """
 
 import hashlib
@@ -25,12 +24,12 @@ class Attachment(NamedTuple):
 
 
 class AttachmentError(ValueError):
-    """A publication without a sound attachment, or published on another key."""
+    """A publication without a valid attachment, or published on another key."""
 
 
 @lru_cache(maxsize=4096)
 def hash_of(key: str) -> bytes:
-    """Hash of a whole key, with its `team/<team>/`: 8 bytes."""
+    """Return the 8-byte hash of a whole key, with its `team/<team>/`."""
     return hashlib.blake2b(key.encode(), digest_size=8).digest()
 
 

@@ -1,12 +1,8 @@
 """The bus over Zenoh: publish, subscribe, query and answer for one process of the team.
 
-Each payload has an attachment (`teamslam.team.wire.zenoh.attachment`).
-`teamslam.team.wire.zenoh.delivery` implements a channel's delivery;
-`teamslam.team.wire.zenoh.recovery` requests samples that Zenoh does not recover.
-
-Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue:
-there is no further thread, the order of arrival is preserved across subscriptions, and a slow node
-never blocks the link (the team's credit bounds the queue). A bus does not receive its own samples.
+Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue: the
+order of arrival is preserved across subscriptions, and a slow node never blocks the link (the
+team's credit bounds the queue).
 """
 
 import atexit
@@ -41,10 +37,7 @@ _ALIVE_TIMEOUT_S = 5.0
 _FLUSH = "router/flush"
 _FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly or is stopped
 MOST_WAITING = 1_000
-"""Queue length of an observing node beyond which dispensable samples are dropped.
-
-Each sample keeps its receive buffer alive: some 10 kB.
-"""
+"""Queue length beyond which an observing node drops dispensable samples, of some 10 kB each."""
 MOST_KEYS = 16_384
 """Most keys on which a bus receives samples; a team of 100 robots has 4,500."""
 
@@ -61,9 +54,10 @@ _Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | Non
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    keys: this node's certificate for TLS; None: TCP. stop: with it, wait for a silent router until
-    the event is set. Raises `BusError` when no router answers within `patience_s`, or either side
-    refuses the other. One thread publishes and receives; `close` may be called from any.
+    keys: this node's certificate for TLS; None: TCP. sheds: dispensable channels. stop: wait for a
+    silent router until this event. Raises `BusError` when no router answers within `patience_s`, or
+    either side refuses the other. One thread publishes and receives; `close` may be called from
+    any.
     """
 
     def __init__(
@@ -131,7 +125,7 @@ class ZenohBus:
         """Wait until the router has received the publications, which a closing session may drop.
 
         The query follows them on their link and nobody answers it, so its end comes from the
-        router. Without a link it ends at once.
+        router.
         """
         with suppress(zenoh.ZError):
             for _ in self._session.get(
@@ -143,8 +137,9 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Report the sample count of each key, this report included, to reveal lost samples at the
-        end. None for a process without a token.
+        """Publish the sample count of each key, this message included, to reveal lost samples.
+
+        None for a process without a token.
         """
         if not self._tokens:
             return None
@@ -162,9 +157,9 @@ class ZenohBus:
         return tally
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and publish, stamped with the wall clock; returns the payload's size [bytes].
+        """Encode and publish, stamped with the wall clock; return the payload's size [bytes].
 
-        Blocks while the link is busy; after ten seconds Zenoh drops the link and connects anew.
+        Block while the link is busy; after ten seconds Zenoh drops the link and connects anew.
         """
         counter = self._counters.get(out.key, 0)
         self._counters[out.key] = counter + 1
@@ -224,10 +219,7 @@ class ZenohBus:
                 self._recovery.watch(key)
 
     def _admit(self, item: _Item) -> None:
-        """Queue a received item, except samples on keys of no channel or of too many keys.
-
-        Called on Zenoh's receiving threads.
-        """
+        """Queue a received item, except samples on keys of no channel or of too many keys."""
         if isinstance(item, zenoh.Sample | _Token):
             sample = item.sample if isinstance(item, _Token) else item
             key = str(sample.key_expr).removeprefix(self._prefix)
@@ -251,17 +243,16 @@ class ZenohBus:
         return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
-        """Queue an observing node's dispensable sample, unless it is too far behind."""
+        """Queue a dispensable sample unless too many items wait."""
         if self._queue.qsize() < MOST_WAITING:
             self._admit(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """Return all samples received since the last call, in order; waits at most `timeout_s` for
-        the first.
+        """Return all samples since the last call, in order; wait at most `timeout_s` for the first.
 
         Queries are answered here, on the caller's thread: a node's state needs no lock. Missing
-        samples are requested and returned when they arrive, after later ones. Samples that arrive
-        during the call are left for the next, which bounds it for a fast team.
+        samples are requested and returned when they arrive. Samples that arrive during the call are
+        left for the next, which bounds it for a fast team.
         """
         self._check_open()
         self._link.look(time.monotonic())
@@ -318,17 +309,17 @@ class ZenohBus:
             samples += self._recovery.arrived(sample, item.source_info)
 
     def again(self) -> None:
-        """Request and deliver all samples of `all` channels and whole subscriptions once more."""
+        """Request and deliver all samples of `all` channels and whole subscriptions again."""
         self._recovery.again()
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples published and not received, even if no longer available: by key, intervals of a
-        publisher's counters.
+        """Return the missing samples, available or not: by key, intervals of a publisher's
+        counters.
         """
         return self._recovery.lacking()
 
     def awaited(self) -> set[str]:
-        """Keys with missing samples that their publisher may still have."""
+        """Return the keys with missing samples that their publisher may still have."""
         return self._recovery.awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
@@ -378,14 +369,14 @@ class ZenohBus:
             )
 
     def is_alive(self, node: str) -> bool:
-        """Whether the router has the node's liveliness token."""
+        """Return whether the router has the node's liveliness token."""
         self._check_open()
         key = self._prefix + ALIVE.key(node)
         replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
     def other_teams(self) -> list[str]:
-        """Other teams with processes at this router."""
+        """Return the names of other teams with processes at this router."""
         self._check_open()
         keys = [
             str(reply.ok.key_expr)

@@ -1,12 +1,8 @@
 """Implement the deliveries of the table of channels by Zenoh's means.
 
-All publishers block while their link to the router is busy; the router drops samples to a slow
-receiver (`teamslam.team.wire.zenoh.router`).
-
-stream: a plain publisher; samples of a cut, and dropped ones, are lost.
-latest: a cache and heartbeats; a late joiner requests the newest sample, and after a cut or a drop
-the receiver requests the missed ones, as far back as the cache reaches.
-all: as `latest` with everything cached, and a late joiner requests everything.
+stream: a plain publisher. latest: a cache and heartbeats; a late joiner requests the newest sample,
+and after a cut or a drop the receiver requests the missed ones, as far back as the cache reaches.
+all: everything is cached, and a late joiner requests everything.
 """
 
 from collections.abc import Callable
@@ -60,9 +56,7 @@ def subscribe(
     *,
     whole: bool,
 ) -> None:
-    """Pass the samples of other publishers to `put`, on Zenoh's thread. whole: as
-    `ZenohBus.subscribe`.
-    """
+    """Pass the samples of other publishers to `put`, on Zenoh's thread."""
     callback = Callback(put, indirect=False)
     remote = zenoh.Locality.REMOTE
     if channel.delivery == "stream":

@@ -15,11 +15,11 @@ from teamslam.team.wire.bus import BusError
 TOKENS_S = 5.0
 """Timeout [s] for the list of tokens that are present."""
 CAPACITY = 65_536
-"""Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and with it the
-router, which then drops messages.
+"""Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and the router then
+drops messages.
 """
 AT_ONCE = 10_000
-"""Largest number of messages per subscription and call of `receive`."""
+"""Most messages per subscription and call of `receive`."""
 LOOK_S = 0.005
 """Polling interval [s] while nothing has arrived."""
 
@@ -37,10 +37,9 @@ class ForeignSample(NamedTuple):
 class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
-    Zenoh's thread fills one channel per subscription without running Python, so a process that is
-    busy decoding does not block it. Samples of one key keep their publisher's order, those of
-    different keys have none. latched: keys whose earlier samples are requested from the publishers'
-    caches.
+    Zenoh's thread fills one channel per subscription without running Python, so a busy process does
+    not block it. Samples of one key keep their publisher's order. latched: keys whose earlier
+    samples are requested from the publishers' caches.
     """
 
     def __init__(
@@ -140,7 +139,7 @@ class ForeignKeys:
         publisher.put(payload, attachment=attachment)
 
     def receive(self, timeout_s: float) -> list[ForeignSample]:
-        """Return up to AT_ONCE samples per subscription; waits `timeout_s` for the first."""
+        """Return up to AT_ONCE samples per subscription; wait `timeout_s` for the first."""
         until = time.monotonic() + timeout_s
         while True:
             found = self._taken()
@@ -149,7 +148,7 @@ class ForeignKeys:
             time.sleep(LOOK_S)
 
     def _taken(self) -> list[ForeignSample]:
-        """Tokens first: they announce the types of the samples that follow."""
+        """Return tokens first: they announce the types of the samples that follow."""
         found = [_of_token(sample) for sample in self._first]
         self._first.clear()
         for channel in self._tokens:

@@ -2,7 +2,7 @@
 
 One TLS handshake by the standard library distinguishes the cases. Only evidence refuses a link: a
 TLS alert about our certificate, a router certificate that fails verification, an answer that is not
-TLS. A timeout, a closed connection or another network error is a reason to wait.
+TLS. A timeout or a network error is a reason to wait.
 """
 
 import re
@@ -27,7 +27,7 @@ _ALERTS = {
     "DECRYPT_ERROR": "it is of another authority than the router's, of the same name",
 }
 _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL", "HTTP_REQUEST")
-"""Reasons of OpenSSL for an answer that is not TLS."""
+"""OpenSSL's reasons for an answer that is not TLS."""
 
 
 @dataclass(frozen=True)

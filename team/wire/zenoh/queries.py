@@ -25,7 +25,7 @@ class Question:
     answer: Answer
 
     def reply(self) -> None:
-        """Answer the query; the sender of an unsound request receives the error."""
+        """Answer the query; the sender of an invalid request receives the error."""
         request = b"" if self.query.payload is None else self.query.payload.to_bytes()
         with self.query as query:
             try:
@@ -37,7 +37,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """One reply to a request; without a payload the end, or an error with its reason."""
+    """One reply to a request; without a payload its end, or an error with its reason."""
 
     channel: Channel
     name: str
@@ -106,7 +106,7 @@ class Queries:
         )
 
     def taken(self, reply: Reply) -> list[Sample]:
-        """Convert a reply to a sample; empty for the end or an unsound reply."""
+        """Convert a reply to a sample; empty for the end or an invalid reply."""
         key = reply.channel.key(reply.name)
         if reply.payload is None:
             self._requests.discard((reply.channel.name, reply.name))

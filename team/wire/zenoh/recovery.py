@@ -4,10 +4,9 @@ Zenoh's advanced subscriber gives some late joiners only a part of the history. 
 publisher are therefore counted (`teamslam.team.wire.zenoh.arrivals`) and compared with its
 heartbeats, and gaps older than half a second are requested.
 
-Keys, publishers and numbers come from the wire, so the publishers tracked per node and in all are
-bounded; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
-the centre five per robot, and a restarted process is a new publisher: a team of a hundred robots,
-each restarted thirty times, is within the bounds.
+Keys, publishers and numbers come from the wire, so the tracked publishers are bounded, per node and
+in all; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
+the centre five per robot; a team of 100 robots, each restarted 30 times, is within the bounds.
 """
 
 import struct
@@ -30,15 +29,15 @@ _LOOK_S = 0.1  # interval of the checks for missing samples
 _ANSWER_S = 10.0
 _SEVERAL = ""  # replaces a publisher's key: its samples arrived on several
 MOST_OF_A_NODE = 4_096
-"""Most tracked publishers, each on one key, on the keys of one node."""
+"""Most tracked publishers on the keys of one node, each on one key."""
 MOST_PUBLISHERS = 131_072
 """Most tracked publishers in all: some 100 MB."""
 MOST_BEATS = 131_072
-"""Number of stored heartbeats beyond which they are cleared."""
+"""Most stored heartbeats; then they are cleared."""
 LONGEST_KEY = 512
-"""Longest key, in characters, on which missing samples are requested."""
+"""Longest key [characters] on which missing samples are requested."""
 MOST_ASKED = 256
-"""Largest number of cache requests in one check."""
+"""Most cache requests in one check."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Heartbeat:
 
 @dataclass
 class CacheAnswer:
-    """Complete reply of a publisher's cache: the requested interval, and the samples.
+    """Complete reply of a publisher's cache to one request.
 
     known: the publisher's last number at the request. newest: that of the reply.
     """
@@ -67,9 +66,7 @@ class CacheAnswer:
 
 
 class Recovery:
-    """Recovery for one session. Zenoh's thread calls `put`; all other methods are for one
-    thread.
-    """
+    """Recovery for one session. Zenoh's thread calls `put`, one thread all other methods."""
 
     def __init__(
         self,
@@ -125,7 +122,7 @@ class Recovery:
             self._incomplete.add((beat.key, beat.publisher))
 
     def answered(self, answer: CacheAnswer) -> list[Sample]:
-        """Record a cache's complete reply; returns the samples to deliver now."""
+        """Record a cache's complete reply; return the samples to deliver now."""
         if not answer.repeated or answer.failed or answer.newest < 0:
             return []
         arrivals = self._arrivals.get((answer.key, answer.publisher))
@@ -136,9 +133,7 @@ class Recovery:
         return arrivals.answered(answer.first, answer.newest, answer.known)
 
     def arrived(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
-        """Record a received publication; returns the samples to deliver now, each once and in
-        order.
-        """
+        """Record a received publication; return the samples to deliver now, in order."""
         publisher, number = _numbered(source)
         arrivals = self._arrivals_of(sample.key, publisher, number)
         if arrivals is None:
@@ -151,7 +146,9 @@ class Recovery:
         return delivered
 
     def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample] | None:
-        """Arrivals of one publisher on one key; None beyond the bounds, and on a key of no channel.
+        """Return the arrivals of one publisher on one key; None beyond the bounds, and on a key of
+        no channel.
+
         On a `latest` channel nothing before the first known number is requested.
         """
         found = self._arrivals.get((key, publisher))
@@ -175,7 +172,7 @@ class Recovery:
         LOG.warning(text, key, self.untracked)
 
     def overdue(self, now_s: float) -> list[Sample]:
-        """Request missing samples; returns those that are no longer delayed by a gap."""
+        """Request missing samples; return those that are no longer delayed by a gap."""
         if now_s < self._look_due or not self._incomplete:
             return []
         self._look_due = now_s + _LOOK_S
@@ -218,7 +215,7 @@ class Recovery:
         )
 
     def again(self) -> None:
-        """Request and deliver all samples of `all` channels and whole subscriptions once more."""
+        """Request and deliver all samples of `all` channels and whole subscriptions again."""
         self._arrivals.clear()
         self._tracked.clear()
         self._keys.clear()
@@ -226,7 +223,7 @@ class Recovery:
         self._beats.clear()  # the next heartbeats count as new
 
     def awaited(self) -> set[str]:
-        """Keys with missing samples that their publisher may still have."""
+        """Return the keys with missing samples that their publisher may still have."""
         return {
             key
             for key, publisher in self._incomplete
@@ -234,8 +231,8 @@ class Recovery:
         }
 
     def lacking(self) -> dict[str, list[tuple[int, int]]]:
-        """Samples published and not received, even if no longer available: by key, intervals of a
-        publisher's counters.
+        """Return the missing samples, available or not: by key, intervals of a publisher's
+        counters.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
@@ -245,11 +242,10 @@ class Recovery:
 
 
 def _node_of(key: str) -> str:
-    """Node that owns a key."""
     first, _, rest = key.partition("/")
     return f"{first}/{rest.partition('/')[0]}" if first in ("robot", "source") else first
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
-    """The publisher as in its heartbeats, and its number of the publication."""
+    """Return the publisher as in its heartbeats, and its number of the publication."""
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

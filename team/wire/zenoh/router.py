@@ -28,19 +28,18 @@ if TYPE_CHECKING:  # not needed without keys
 REFUSALS = "error,zenoh_link_tls=warn"
 """Zenoh's log filter with keys: refused connections, with reasons."""
 DROP_US = 300_000
-"""Time [us] that a publication waits for a subscriber's full queue before it is dropped.
+"""Time [µs] that a publication waits for a subscriber's full queue before it is dropped.
 
-Zenoh marks that queue as congested and drops further publications to it at once until the
-subscriber reads again: a stopped subscriber delays the others once. It fetches the missed samples
-as after a cut link.
+Zenoh then drops further publications to it at once until it reads again: a stopped subscriber
+delays the others once.
 """
 DROP_LARGE_US = 1_000_000
-"""Additional time [us] for a publication of more than one batch."""
+"""Additional time [µs] for a publication of more than one batch."""
 CLOSE_US = 2_000_000
-"""Time [us] that a reply or a query waits for a full queue before the link is closed.
+"""Time [µs] that a reply or a query waits for a full queue before the link is closed.
 
 Its process reconnects. A publication dropped for its size is fetched by a query, so a message of S
-bytes needs a link of (S - 5 MB) in that time.
+bytes needs a link of (S − 5 MB) in that time.
 """
 QUEUE_BATCHES = 16
 """Batches of 64 kB per subscriber's queue, Zenoh's largest number."""
@@ -61,7 +60,7 @@ MOST_TEAMS = 1_000
 def router(
     listen: str = "tcp/127.0.0.1:0", keys: "tuple[Credentials, Roster] | None" = None
 ) -> Iterator[str]:
-    """Run a router in this process; yields its endpoint.
+    """Run a router in this process; yield its endpoint.
 
     keys: the router's credentials and the roster of accepted nodes: it then uses TLS only and logs
     refused nodes, with the reason. Raises `BusError` when it cannot listen there.
@@ -124,7 +123,7 @@ class _Keeper:
         )
 
     def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
-        """Stored messages of a key's team, and the key within the team."""
+        """Return the stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
         if team not in self._teams and len(self._teams) >= MOST_TEAMS:
             return StoredMessages(), rest  # not kept

@@ -59,11 +59,10 @@ def client(
     keys: "Credentials | None",
     stop: threading.Event | None = None,
 ) -> zenoh.Session:
-    """Open a client's session; raises `BusError` if none opens within `patience_s` or the router
-    refuses us.
+    """Open a client's session; raises `BusError` after `patience_s`, or if the router refuses us.
 
-    stop: with it, wait until the event for a router that accepts connections without answering, as
-    a stopped or busy one does.
+    stop: wait until this event for a router that accepts connections without answering, as a
+    stopped or busy one does.
     """
     settings: dict[str, object] = {
         "mode": "client",
@@ -120,11 +119,10 @@ class RouterLink:
     """The link of one session to its router: logs why it is down, and raises on evidence against
     it.
 
-    Silence never ends a process: a router that is gone, stopped or behind a bad radio link is
-    waited for without limit. Only evidence raises `BusError`: the result of a handshake
+    Silence never ends a process. Only evidence raises `BusError`: the result of a handshake
     (`teamslam.team.wire.zenoh.handshake`), or the router's statement that its roster lacks our
-    certificate. Zenoh connects a revoked certificate, too, and drops its messages silently; so each
-    new link is followed by that query.
+    certificate. Zenoh connects a revoked certificate, too, and drops its messages silently; so that
+    query follows each new link.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:

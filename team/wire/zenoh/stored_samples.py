@@ -1,15 +1,15 @@
 """Samples of a team that a router stores for absent processes: ends and orders.
 
-A stored sample keeps its key, bytes and attachment, and thereby its author: with keys, access
-control lets only that node publish on the key. It is decoded and checked before it is stored, and
-an end replaces only an end of the same author.
+A stored sample keeps its key, bytes and attachment, and thereby its author. It is checked before it
+is stored, and an end replaces only an end of the same author.
 
-Ends (`ENDS`: the centre's final map; without a centre each robot's final map and conclusion) are
-stored until their author publishes another. A starting process cannot tell whether it belongs to
-the finished run or to a new one. The router stores which nodes of that run never announced their
-end (`Tally`): a node of that name is sent the end until one of its processes announces its own.
-Orders of operators who have left (a robot withdrawn or given up, verdicts on landmarks, the end of
-a live team) are valid until the centre's final map, or until no process of the team is present.
+Ends (`ENDS`) are stored until their author publishes another. A starting process cannot tell
+whether it belongs to the finished run or to a new one. The router stores which nodes of that run
+never announced their end (`Tally`): a node of that name is sent the end until one of its processes
+announces its own.
+
+Orders of operators who have left are valid until the centre's final map, or until no process of the
+team is present.
 """
 
 import threading
@@ -21,12 +21,12 @@ from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.messages import FusedMap, Kept, KeptRequest
 
 MOST_ORDERS = 10_000
-"""Most stored orders to a team, signatures included; others must be repeated."""
+"""Most stored orders to a team, signatures included."""
 MOST_ENDS = 400
 """Most keys of stored ends: two per robot of the largest team, and others."""
 
 MOST_NODES = 1_000
-"""Number of nodes of a team whose end is tracked."""
+"""Most nodes of a team whose end is tracked."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class StoredMessages:
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
-        """Record a node's liveliness token; returns whether the node crashed."""
+        """Record a node's liveliness token; return whether the node crashed."""
         with self._lock:
             if alive:
                 self._there.add(node)
@@ -110,7 +110,7 @@ class StoredMessages:
         self._named.clear()
 
     def answer(self, request: KeptRequest, now_s: float) -> list[bytes]:
-        """Stored samples for a node, the oldest first, as payloads of `Kept`."""
+        """Return the stored samples for a node, the oldest first, as payloads of `Kept`."""
         with self._lock:
             orders = [reply for reply, name in self._orders.items() if name in request.channels]
             ends = [
