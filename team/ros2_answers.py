@@ -2,10 +2,10 @@
 
 Frames follow REP 105. The ROS 2 robot itself publishes odom → base; `Answers` adds
 
-    map_from_odom(t) = map_from_base(t) · odom_from_base(t)⁻¹,
+  map_from_odom(t) = map_from_base(t) · odom_from_base(t)⁻¹,
 
 with the robot's pose in the team's frame (`map`) and the odometry's pose at the same time. Once the
-robot has left the team's frame, the last transform stays valid, since nothing newer is known.
+robot has left the team's frame, the last transform stays valid.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ MOST_PATH = 2000
 PATH_GROWTH, PATH_S = 1.02, 1.0
 """A path is published again once it has grown by this factor, at most every PATH_S of team time."""
 MOST_WAITING = 1000
-"""Messages of the team that wait for `LiveAnswers.publish`."""
+"""Most messages that wait for `LiveAnswers.publish`."""
 TRANSFORM_S = 0.1
 """Period [s] at which the newest map → odom is repeated with the odometry's newest stamp."""
 HELD_S = 30.0
@@ -39,7 +39,7 @@ HELD_S = 30.0
 
 
 class Answer(NamedTuple):
-    """One message for a topic; latched: a late subscriber receives the newest one, too."""
+    """One message for a topic; latched: a late subscriber receives the newest one."""
 
     topic: str
     kind: str
@@ -75,7 +75,7 @@ class Answers:
         return self._odometry[-1][0] if self._odometry else None
 
     def convert(self, message: m.Message) -> list[Answer]:
-        """The ROS 2 messages of one of the team's messages; none where it has no counterpart."""
+        """Convert one of the team's messages; empty where ROS 2 has no counterpart."""
         match message:
             case m.PoseEstimate() if message.in_team_frame:
                 return self._pose(message)
@@ -115,7 +115,7 @@ class Answers:
         return [self._answer(topic, "nav_msgs/msg/Path", stamp_ns, content, latched=True)]
 
     def transform(self, stamp_ns: int) -> list[Answer]:
-        """The newest map → odom, valid at a time; nothing before the first pose in the map."""
+        """Return the newest map → odom, valid at a time; empty before the first pose in the map."""
         if self._map_from_odom is None:
             return []
         names = self.names
@@ -123,7 +123,7 @@ class Answers:
         return [self._answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, ros.transforms(one))]
 
     def _odometry_at(self, stamp_ns: int) -> Pose | None:
-        """The odometry's pose at a time, interpolated; None outside of the poses held."""
+        """Interpolate the odometry's pose at a time; None outside of the kept poses."""
         held = self._odometry
         if not held or not held[0][0] <= stamp_ns <= held[-1][0]:
             return None
@@ -226,8 +226,8 @@ class RosPublisher:
 class LiveAnswers:
     """Publishes one robot's results to ROS 2 while it drives.
 
-    `add_odometry` is called by the reader of the robot's topics and `add_message` by the driver's
-    thread; `publish` runs where the session is. has_tf: the transform map → odom is published, too.
+    `add_odometry` is called by the reader of the robot's topics, `add_message` by the driver's
+    thread; `publish` runs where the session is. has_tf: also publish the transform map → odom.
     """
 
     def __init__(self, robot: str, topics: RobotTopics, *, has_tf: bool = True) -> None:
@@ -239,7 +239,7 @@ class LiveAnswers:
         self._transformed_s = 0.0
 
     def add_odometry(self, stamp_ns: int, pose: Pose, frame: str, child: str) -> None:
-        """Add a pose in the odometry's frame; the first one tells the frames' names."""
+        """Add a pose in the odometry's frame; the first one determines the frames' names."""
         names = self._answers.names
         if (frame, child) != (names.odometry_frame, names.base_frame) and frame:
             self._answers.names = names_of(self._robot, self._topics.odometry, frame, child)

@@ -1,8 +1,7 @@
-"""A ROS 2 robot's driver, with no ROS on our side: its topics on Zenoh become a robot's stream.
+"""A ROS 2 robot's driver, without ROS: its topics on Zenoh become a robot's stream.
 
-What comes is decoded, translated as a bag's messages are, and handed to the driver. Damaged
-messages, what the driver refuses, and what was lost on its way are counted and named; nothing of it
-ends the process.
+Messages are decoded, translated as a bag's, and passed to the driver. Damaged, refused and lost
+messages are counted and named; none ends the process.
 """
 
 import logging
@@ -45,15 +44,15 @@ from teamslam.team.wire.zenoh.foreign_keys import ForeignSample
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
 HELD = 1000
-"""Messages of a topic whose type no token has told yet."""
+"""Most waiting messages of a topic of unknown type."""
 MOST_REASONS = 100
-"""Reasons for which messages are dropped that are told apart: a key's type may be any text."""
+"""Most reasons for dropping that are told apart: a key's type may be any text."""
 WARN_S = 10.0
-"""Between two words about what is dropped."""
+"""Interval [s] between two reports of dropped messages."""
 SILENT_S = 10.0
-"""Odometry that has not come by then [s] is named."""
+"""Time [s] after which missing odometry is reported."""
 BEHIND_S = 1.0
-"""A message that waits longer says that the driver is slower than its topics."""
+"""Waiting time [s] of a message from which the driver is slower than its topics."""
 NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
 
@@ -68,41 +67,41 @@ class Robot(Protocol):
 
     @property
     def sensor_mount(self) -> tuple[float, float, float] | None:
-        """Where the robot's process has its sensor; None where that is not known."""
+        """The sensor's pose by the robot's process; None: unknown."""
 
     @property
     def antenna(self) -> tuple[float, float] | None:
-        """Where the robot's process has its GNSS antenna; None where that is not known."""
+        """The GNSS antenna's place by the robot's process; None: unknown."""
 
     def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
-        """Speeds since the last call."""
+        """Add speeds since the last call."""
 
     def odometry_pose(self, t: Decimal, x: float, y: float, theta: float) -> None:
-        """The pose in the odometry's frame."""
+        """Add the pose in the odometry's frame."""
 
     def observe_points(
         self, t: Decimal, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
     ) -> None:
-        """Landmarks; covariances: of each its own 2 × 2."""
+        """Add landmarks; covariances: 2 × 2 of each."""
 
     def sight(
         self, t: Decimal, teammates: Sequence[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
-        """Teammates."""
+        """Add teammates."""
 
     def fix(self, t: Decimal, x: float, y: float, covariance: ArrayLike | None) -> None:
-        """Position of the antenna."""
+        """Add a position of the antenna."""
 
 
 class Ros2Driver:
-    """Takes what is published on a robot's topics, and hands it to its driver.
+    """Passes the publications on a robot's topics to its driver.
 
-    taken: messages by topic; dropped: by reason; lost: published, and never here. What waits is
-    handed over in the order of its stamps, since topics come in no order among themselves.
-    on_odometry: called with each odometry pose and its frames.
-    datum: origin of the plane of the team's fixes, which are dropped without one.
-    name, others: the robot's name, and the topics of the others in the file, which may be its own,
-    too: a detection there belongs to the robot from whose base its frame hangs.
+    taken: messages by topic; dropped: by reason; lost: published and never received. Waiting
+    messages are passed on in the order of their stamps, since topics have no common order.
+    on_odometry: called with each odometry pose and its frames. datum: origin of the plane of the
+    team's fixes, which are dropped without one. name, others: the robot's name, and the topics of
+    the others in the file, which may be its own, too: a detection there belongs to the robot to
+    whose base its frame is attached.
     """
 
     def __init__(
@@ -151,18 +150,18 @@ class Ros2Driver:
 
     @property
     def latched(self) -> list[str]:
-        """Key expressions of latched topics (static transforms), published once at any time."""
+        """Key expressions of latched topics (static transforms)."""
         return expressions(sorted(self._static), self._domain)
 
     tokens = (BRIDGE_TOKENS,)
 
     def take(self, sample: ForeignSample) -> None:
-        """One publication, handed over at once, with all that waited."""
+        """Pass on one publication, with all that waited."""
         self.put(sample)
         self.deliver()
 
     def put(self, sample: ForeignSample) -> None:
-        """One publication, which waits for its turn, or a token that tells a topic's type."""
+        """Queue one publication, or learn a topic's type from a token."""
         if sample.token:
             told = of_token(sample.key)
             if told is not None and sample.alive:
@@ -191,12 +190,13 @@ class Ros2Driver:
 
     @property
     def waiting(self) -> int:
-        """Messages that came and were not handed over yet."""
+        """Number of waiting messages."""
         return len(self._backlog) + sum(map(len, self._translated.values()))
 
     def deliver(self, most: int | None = None) -> None:
-        """Hand over what waits, so many measurements at most: the earliest stamp of all topics is
-        next, and of one topic whatever came first.
+        """Pass on waiting measurements, at most `most`: the earliest stamp of all topics is next.
+
+        Measurements of one topic keep their order of arrival.
         """
         count = 0
         while most is None or count < most:
@@ -210,7 +210,7 @@ class Ros2Driver:
                 self._note(f"{earliest}: refused", str(error))
 
     def _earliest(self) -> str | None:
-        """The topic whose next measurement has the earliest stamp."""
+        """Return the topic whose next measurement has the earliest stamp."""
         heads = []
         for topic in self._backlog.waiting:
             queue = self._translated.setdefault(topic, deque())
@@ -221,7 +221,7 @@ class Ros2Driver:
         return min(heads)[1] if heads else None
 
     def _decoded(self, topic: str, kind: str, payload: bytes) -> list[Measured]:
-        """The measurements of one message; a static transform has none."""
+        """Return the measurements of one message; a static transform has none."""
         self.taken[topic] += 1
         if kind not in READERS:
             self._note(f"{topic}: messages of type {kind} are not read")
@@ -286,7 +286,7 @@ class Ros2Driver:
 
     @property
     def mounts(self) -> list[tuple[float, float, float]]:
-        """Where the robot's sensor is taken to be (x [m], y [m], yaw [rad]); empty until it saw."""
+        """Assumed poses of the sensor (x [m], y [m], yaw [rad]); empty before the first detection."""
         return list(dict.fromkeys(mount.pose for mount in self._translator.mounts.values()))
 
     def _note(self, reason: str, detail: str = "") -> None:
@@ -298,7 +298,7 @@ class Ros2Driver:
             self._said[reason] = self.dropped[reason]
 
     def figures(self) -> dict[str, float]:
-        """Messages: that came, were lost on their way, wait, and were dropped here."""
+        """Count received, lost, waiting and dropped messages."""
         return {
             "messages": float(self.taken.total()),
             "messages_lost": float(self.lost.count.total()),
@@ -309,8 +309,9 @@ class Ros2Driver:
 
     @property
     def refusal(self) -> str:
-        """The text about detections none of which can be assigned to this robot, with the remedy;
-        empty as long as some can, and until the transforms had time to come.
+        """Text and remedy if no detection can be assigned to this robot; else empty.
+
+        Empty also until the transforms had SILENT_S to arrive.
         """
         question = self._translator.question()
         if not question or self._translator.has_detections:
@@ -361,7 +362,7 @@ class Ros2Driver:
         return tuple(said)
 
     def report(self) -> None:
-        """Say what was dropped since the last word, at most every WARN_S seconds."""
+        """Log the messages dropped since the last report, at most every WARN_S seconds."""
         now = time.monotonic()
         if now - self._said_at < WARN_S:
             return
@@ -379,7 +380,7 @@ class Ros2Driver:
 
 
 def _stamped(record: Record) -> Record:
-    """A message without a stamp has the time of its arrival."""
+    """Stamp a message without a stamp with the time of its arrival."""
     if isinstance(record, TransformsRecord) or record.stamp_ns:
         return record
     return record._replace(stamp_ns=time.time_ns())

@@ -1,7 +1,7 @@
 """The driver delivers a program's measurements to the robot's process.
 
-Each measurement is checked, written to the robot's file and published by a separate thread: a call
-never waits for the network. Receivers request missed measurements; the driver answers from the
+Each measurement is checked, written to the robot's file and published by a separate thread, so a
+call never waits for the network. Receivers request missed measurements; the driver answers from the
 file.
 """
 
@@ -39,12 +39,13 @@ REMIND_S = 10.0
 GAP_S = 2.0
 """Longest interval [s] that odometry without a duration covers."""
 BRIDGE_S = 5.0
-"""A gap between intervals up to this [s] is bridged, by a motion with a large covariance."""
+"""Longest gap [s] between intervals that a motion with a large covariance bridges."""
 AWAY_S = 60.0
-"""Longest interval [s] over which two odometry poses are differenced; the odometry may have been
-reset within a longer one."""
+"""Longest interval [s] over which two odometry poses are differenced; a reset may be within a
+longer one.
+"""
 JUMP_S = 86_400.0
-"""A later stamp than this [s] after the last odometry is from another clock."""
+"""A stamp later than this [s] after the last odometry is from another clock."""
 AHEAD_S = 10.0
 """A landmark measurement stamped further [s] ahead of the odometry is from another clock."""
 LIKELY_RAD_S = 4.0 * np.pi
@@ -53,7 +54,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class DriverError(RuntimeError):
-    """The driver can not continue; the text says why and what to do."""
+    """The driver cannot continue; the text says why and what to do."""
 
 
 class Driver:
@@ -61,18 +62,18 @@ class Driver:
 
     robot: name of the robot. team: name of the team, as in the scenario. connect: endpoint of the
     router. keys: folder with the certificate `source-<robot>`. file: file of all measurements,
-    default `<robot>.stream`; a driver started again with the same file continues its stream.
-    start: (x [m], y [m], theta [rad]) in the team's frame; None: unknown. start_covariance: 3 × 3;
-    None: exactly known. landmarks: all landmark ids, if known. latency_s: longest delay of a
-    detection behind the odometry of its time. patience_s: time to wait for the router with a new
-    file; 0: connect later. bounds: physical limits of the robot; without them a yaw rate beyond
-    LIKELY_RAD_S is refused, too. on_message: called in another thread with each message of the team
-    for this robot: poses in the team's frame (`PoseEstimate`), maps (`FusedMap`), smoothed paths
+    default `<robot>.stream`; a driver started again with the same file continues its stream. start:
+    (x [m], y [m], theta [rad]) in the team's frame; None: unknown. start_covariance: 3 × 3; None:
+    exactly known. landmarks: all landmark ids, if known. latency_s: longest delay of a detection
+    behind the odometry of its time. patience_s: time to wait for the router with a new file; 0:
+    connect later. bounds: physical limits of the robot; without them a yaw rate beyond LIKELY_RAD_S
+    is refused, too. on_message: called in another thread with each message of the team for this
+    robot: poses in the team's frame (`PoseEstimate`), maps (`FusedMap`), smoothed paths
     (`Trajectory`) and the status of its process; it has to return at once. map: file of a saved map
     that the team's map joins, as by `teamslam central --map`; one driver of the team is enough.
 
     Times `t` are seconds on one clock for the whole team, such as Unix time. Raises DriverError if
-    the driver can not start; each call raises MeasurementError for an impossible value.
+    the driver cannot start; each call raises MeasurementError for an impossible value.
     """
 
     def __init__(
@@ -267,8 +268,8 @@ class Driver:
     ) -> None:
         """Add a scan of landmarks without identities at t: ranges [m] and bearings [rad].
 
-        classes: a row for each, the probability of its reported class given each class, which is
-        that column of the detector's confusion matrix.
+        classes: for each landmark the row P(its reported class | class c), that column of the
+        detector's confusion matrix.
         """
         stamp_ns = measurement_messages.stamp_of(t, "detect")
         seen = measurement_messages.detections(
@@ -298,17 +299,17 @@ class Driver:
 
     @property
     def path(self) -> Path:
-        """The file of all measurements."""
+        """File of all measurements."""
         return self._journal.path
 
     @property
     def last_time(self) -> float | None:
-        """The newest time in the file [s]; None: the file is empty."""
+        """Newest time in the file [s]; None: the file is empty."""
         return 1e-9 * self._journal.newest_ns if self._journal.incarnation else None
 
     @property
     def team_has_ended(self) -> bool:
-        """Whether the run is over: the final map is out, or an operator has ended the team."""
+        """Whether the final map is published or an operator has ended the team."""
         return self._node.finished or self._node.ordered_to_end
 
     @property
@@ -332,7 +333,7 @@ class Driver:
         return None if models is None else models.gnss.antenna
 
     def status(self) -> m.Status:
-        """The stream's state: counts, receivers' progress and problems."""
+        """Return counts, receivers' progress and problems of the stream."""
         return self._link.status()
 
     def tell(self, figures: Mapping[str, float], warnings: Iterable[str]) -> None:
@@ -485,7 +486,7 @@ class Driver:
         return self._odometer.as_before(lasts_ns)
 
     def _head(self, stamp_ns: int) -> dict[str, Any]:
-        """Fields of every measurement; ordering sets incarnation and number."""
+        """Return the fields of every measurement; ordering sets incarnation and number."""
         return {"stamp_ns": stamp_ns, "robot": self.robot, "incarnation": 0, "number": 0}
 
     def _increment(
@@ -505,7 +506,7 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """The length of the interval that ends now [ns].
+        """Return the length of the interval that ends now [ns].
 
         None: no interval; `_drive` bridges the gap, or the next incarnation begins.
         """
@@ -592,7 +593,6 @@ def _times(
 
 
 def _read_map(path: Path, *, with_keys: bool) -> m.SavedMap:
-    """Read a saved map for the team's set; raises DriverError."""
     if with_keys:
         raise DriverError(
             f"{path}: with keys a driver may not publish a map: give it to `teamslam central --map`"

@@ -2,8 +2,7 @@
 
 The file is append-only: a head (MessagePack), then records `<IBq` (payload length, kind, stamp
 [ns]), the payload (a measurement with number 0) and its CRC-32. An incomplete last record is
-removed; a file with an incomplete head is started again. `Sorter` reconstructs the numbers from the
-records, so a restarted driver continues its stream.
+removed; a file with an incomplete head is started again.
 """
 
 import fcntl
@@ -35,9 +34,9 @@ Place = tuple[int, int]
 class Sorter:
     """Sort items by their places, with a bounded delay.
 
-    A camera's frame may arrive tens of milliseconds after the odometry of its time. A measurement
-    is therefore held until one newer by `latency_ns` has arrived. Its number depends on the order
-    of the calls alone and can be reconstructed from the file.
+    A camera's frame may arrive tens of milliseconds after the odometry of its time, so a
+    measurement is held until one newer by `latency_ns` has arrived. Its number depends on the order
+    of the calls alone; a restarted driver reconstructs it from the file.
     """
 
     def __init__(self, latency_ns: int) -> None:
@@ -86,18 +85,18 @@ _LONGEST = 9
 
 
 class JournalError(RuntimeError):
-    """A driver's file can not be used; the text names file, reason and remedy."""
+    """A driver's file cannot be used; the text names file, reason and remedy."""
 
 
 @dataclass
 class Journal:
     """One robot's file, open for appending (`opened`). Any thread may read.
 
-    incarnation: the one in progress; 0: none. state: state of the stream, as in its head.
-    delivered: every receiver has all of it. calls: offsets of all records but marks, in order of
-    arrival. driven_ns, pose: end of the last odometry interval, and the odometry pose there. cut:
-    number of bytes behind the last whole record; is_damaged: they are no incomplete record. clock:
-    the wall clock at the last mark.
+    incarnation: the one in progress; 0: none. state: of the stream, as in its head. delivered:
+    every receiver has all of it. calls: offsets of all records but marks, in order of arrival.
+    driven_ns, pose: end of the last odometry interval, and the odometry pose there. cut: number of
+    bytes behind the last whole record; is_damaged: they are no incomplete record. clock: the wall
+    clock at the last mark.
     """
 
     path: Path
@@ -125,17 +124,17 @@ class Journal:
 
     @property
     def incarnations(self) -> list[int]:
-        """The incarnations in the file, in order."""
+        """Incarnations in the file, ascending."""
         with self._lock:
             return sorted(self._numbered)
 
     def count(self, incarnation: int) -> int:
-        """Number of measurements of an incarnation that are numbered."""
+        """Return the number of numbered measurements of an incarnation."""
         with self._lock:
             return len(self._numbered.get(incarnation, ()))
 
     def message(self, incarnation: int, number: int) -> m.Measurement:
-        """A numbered measurement."""
+        """Return a numbered measurement."""
         with self._lock:
             at = self._numbered[incarnation][number]
         message: m.Message = decoded(self.payload(at))
@@ -143,12 +142,12 @@ class Journal:
         return msgspec.structs.replace(message, number=number)
 
     def payload(self, at: int) -> bytes:
-        """The payload of the record at this offset."""
+        """Return the payload of the record at this offset."""
         length = _HEAD.unpack(os.pread(self._file, _HEAD.size, at))[0]
         return os.pread(self._file, length, at + _HEAD.size)
 
     def too_late(self, stamp_ns: int, kind: int) -> bool:
-        """Whether a measurement of a later place already has its number."""
+        """Return whether a measurement of a later place already has its number."""
         released = self._sorter.released
         return released is not None and (stamp_ns, kind) < released
 
@@ -225,7 +224,7 @@ class Journal:
 
     @property
     def next_incarnation(self) -> int:
-        """The number of the next incarnation."""
+        """Number of the next incarnation."""
         return self.incarnation + 1 if self.incarnation else self.first_incarnation
 
     def read(self) -> None:
@@ -244,7 +243,7 @@ class Journal:
         self.cut, self._size = end - at, at
 
     def cut_off(self) -> str:
-        """Remove the bytes behind the last whole record; returns a description.
+        """Remove the bytes behind the last whole record; return a description.
 
         A killed process leaves an incomplete record. After damage within the file a copy is kept.
         """
@@ -267,11 +266,11 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
 
 
 def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
-    """Open a robot's journal for appending; returns it with a description of its contents.
+    """Open a robot's journal for appending; return it with a description of its contents.
 
     A delivered stream, or one that has not grown for OLD_S, is moved aside; the new one begins with
-    the next incarnation number. Raises JournalError for a file of another robot or of no driver,
-    or one that another driver has open.
+    the next incarnation number. Raises JournalError for a file of another robot or of no driver, or
+    one that another driver has open.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _locked(path, robot)
@@ -302,7 +301,7 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
 
 
 def _read_whole(journal: Journal) -> bool:
-    """Read an open file; returns False for an empty one. Raises JournalError."""
+    """Read an open file; return False for an empty one. Raises JournalError."""
     found = _head_of(journal)
     if found is not None:
         journal.first_incarnation, journal._size = found
@@ -311,7 +310,7 @@ def _read_whole(journal: Journal) -> bool:
 
 
 def _first_after(aside: Path | None, robot: str) -> int:
-    """The first incarnation of a new file: the next one after those of the file set aside."""
+    """Return the first incarnation of a new file, after those of the file set aside."""
     if aside is not None:
         with suppress(JournalError, OSError):
             earlier = _locked(aside, robot)
@@ -324,7 +323,6 @@ def _first_after(aside: Path | None, robot: str) -> int:
 
 
 def _begun(journal: Journal, latency_ns: int) -> Journal:
-    """Write the head of an empty journal."""
     head = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": journal.first_incarnation})
     os.ftruncate(journal._file, 0)
     journal._write(head, 0)
@@ -347,7 +345,7 @@ def _locked(path: Path, robot: str) -> Journal:
 
 
 def _head_of(journal: Journal) -> tuple[int, int] | None:
-    """The first incarnation in a file's head, and the head's length; None: an empty file.
+    """Return the first incarnation in a file's head, and the head's length; None: an empty file.
 
     A crash may leave a part of the head and zeros, which count as empty. Raises JournalError for a
     file of another robot or of no driver.
@@ -375,7 +373,7 @@ def _head_of(journal: Journal) -> tuple[int, int] | None:
 
 
 def _is_blank(file: int, at: int) -> bool:
-    """Whether a file has only zeros from here on."""
+    """Return whether a file has only zeros from here on."""
     while block := os.pread(file, 2**20, at):
         if any(block):
             return False
@@ -384,7 +382,7 @@ def _is_blank(file: int, at: int) -> bool:
 
 
 def _newest_aside(path: Path) -> Path | None:
-    """The file that was set aside last."""
+    """Return the file that was set aside last."""
     number = 1
     while path.with_name(f"{path.name}.{number}").exists():
         number += 1

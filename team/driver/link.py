@@ -20,9 +20,7 @@ from teamslam.team.wire.bus import BusError
 from teamslam.team.wire.zenoh.bus import ZenohBus
 
 HEAD_S = 1.0
-"""Wall time [s] between two stream heads."""
 PACE_S = 0.01
-"""Wait [s] when there is nothing to publish."""
 ATTEMPT_S = 0.3
 """Duration [s] of an attempt to reach a router that is not there."""
 AGAIN_S = 2.0
@@ -30,14 +28,17 @@ AGAIN_S = 2.0
 SECOND_PATIENCE_S = 6.0
 """Wait [s] for another driver's token: that of a cut-off driver lasts for its lease of 5 s."""
 HEAR_S = 0.5
-"""The robot's process, if present, reports its progress within this time [s]."""
+"""Time [s] within which a present robot's process reports its progress."""
 LAST_S = 5.0
 """Longest time [s] for the remaining publications at the end."""
 _LOG = logging.getLogger("teamslam")
 
 
 class Link:
-    """Run a source's node on a bus of its own; lock: guards writes to the journal."""
+    """Run a source's node on a bus of its own.
+
+    lock: guards writes to the journal.
+    """
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class Link:
             self._moved.wait(timeout_s)
 
     def status(self) -> m.Status:
-        """The node's status, with problems of the link."""
+        """Return the node's status, with problems of the link."""
         status = self._node.status()
         if self._trouble is None:
             return status
@@ -102,7 +103,7 @@ class Link:
         return msgspec.structs.replace(status, warnings=warnings)
 
     def why_it_waits(self) -> str:
-        """Describe what `end` is waiting for, with the remedy."""
+        """Describe the process that `end` needs, with the remedy."""
         if self._trouble is not None:
             return str(self._trouble)
         robot = self._node.journal.robot

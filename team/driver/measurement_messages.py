@@ -17,13 +17,13 @@ M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
 NAMED = "a small letter, then small letters, digits and _ (32 at most)"
 UNNAMED = 2**31
-"""Landmark ids from here on are reserved for landmarks without identity."""
+"""Ids from here on are reserved for landmarks without identity."""
 LARGEST_SIGMA_RAD = 0.5
 """A larger standard deviation of a bearing [rad] is probably in degrees."""
 
 
 class MeasurementError(ValueError):
-    """A value can not be a measurement; the text names it, its place and the remedy.
+    """A value cannot be a measurement; the text names it, its place and the remedy.
 
     The whole call is refused.
     """
@@ -206,7 +206,7 @@ def square(covariance: ArrayLike | None, what: str) -> bytes:
 
 
 def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
-    """Encode covariances of (range [m], bearing [rad])."""
+    """Pack covariances of (range [m], bearing [rad])."""
     packed = _blocks(covariances, count, what)
     for sigma in np.sqrt(np.asarray(covariances)[:, 1, 1]).tolist() if packed else ():
         if sigma > LARGEST_SIGMA_RAD:

@@ -21,9 +21,9 @@ Pose = tuple[float, float, float]
 class Odometer:
     """State of the odometry: end of the last interval, and the odometry pose there if given.
 
-    speeds: forward [m/s] and yaw rate [rad/s] of the last interval. gap_ns: time before the last
-    interval without odometry, beyond clock jitter. home: first pose. steps, fastest: number of
-    intervals and their highest speed [m/s]. rates: (ahead, left, turn) per second of the last one.
+    speeds: forward [m/s] and yaw rate [rad/s] of the last interval. gap_ns: time before it without
+    odometry, beyond clock jitter. home: first pose. steps, fastest: number of intervals and their
+    highest speed [m/s]. rates: (ahead, left, turn) per second of the last one.
     """
 
     robot: str
@@ -38,7 +38,8 @@ class Odometer:
     rates: Pose = field(default=(0.0, 0.0, 0.0), init=False)
 
     def until(self, stamp_ns: int, duration_ns: int | None, call: str) -> int | None:
-        """The length [ns] of the interval that ends now; None: the first, without a duration.
+        """Return the length [ns] of the interval that ends now; None: the first, without a
+        duration.
 
         An interval begins where the last one ended, within clock jitter; `add` changes the state.
         """
@@ -93,8 +94,8 @@ class Odometer:
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
 
     def was_reset(self, step: Pose, duration_ns: int, pose: Pose) -> bool:
-        """Whether the odometry was reset: a jump back to its first pose, or a step RESET_TIMES as
-        fast as the fastest one.
+        """Return whether the odometry was reset: a jump back to its first pose, or a step
+        RESET_TIMES as fast as the fastest one.
         """
         way, usual_m = float(np.hypot(*step[:2])), max(self.fastest, USUAL_M_S) * duration_ns * 1e-9
         home = pose == self.home and way > 2.0 * usual_m
@@ -102,12 +103,12 @@ class Odometer:
         return known and (home or way > RESET_TIMES * usual_m)
 
     def as_before(self, duration_ns: int) -> Pose:
-        """The motion of an interval at the rates of the one before."""
+        """Return the motion of an interval at the rates of the one before."""
         seconds = duration_ns * 1e-9
         return self.rates[0] * seconds, self.rates[1] * seconds, self.rates[2] * seconds
 
     def bridge(self) -> tuple[Pose, list[float]]:
-        """The motion over the gap at the last speeds, and its covariance (row-major, 3 × 3).
+        """Return the motion over the gap at the last speeds, and its covariance (row-major, 3 × 3).
 
         Standard deviations equal the motion, at least UNMEASURED, at most half a turn.
         """

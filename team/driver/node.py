@@ -1,7 +1,4 @@
-"""The driver's node: publish the file's measurements, answer requests, track the receivers.
-
-It is the source of one robot's stream, as the world is of all streams (`teamslam.sim.publisher`).
-"""
+"""The driver's node: publish the file's measurements, answer requests, track the receivers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,10 +32,10 @@ class SourceNode:
     """Call `begin`, then `publish` and `handle` in turn until `finished`.
 
     An incarnation is published once the robot has consumed the one before, since it drops the rest
-    of that. delivered, recorded: progress reported by the robot and the recorder. done:
-    incarnation, measurements and submaps of the robot's `Done`. joined: incarnation and submaps
-    acknowledged by the centre. is_peer: the robot keeps a set of its own. concluded: it has its
-    final map. models: configuration announced by the robot's process.
+    of that. delivered, recorded: progress of the robot and the recorder. done: incarnation,
+    measurements and submaps of the robot's `Done`. joined: incarnation and submaps acknowledged by
+    the centre. is_peer: the robot keeps a set of its own. concluded: it has its final map. models:
+    configuration announced by the robot's process.
     """
 
     journal: Journal
@@ -95,8 +92,8 @@ class SourceNode:
     """Channels of the team's results, for a program that has subscribed to them."""
 
     def begin(self) -> list[Outgoing]:
-        """Publish the saved maps, and the stream's initial pose and its head, for receivers that
-        missed them.
+        """Publish the saved maps, and the stream's initial pose and head, for receivers that missed
+        them.
         """
         maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self.maps]
         if not self._incarnation:
@@ -114,7 +111,7 @@ class SourceNode:
         return out
 
     def _next(self) -> int | None:
-        """The number of the next measurement; may begin the next incarnation."""
+        """Return the number of the next measurement; may begin the next incarnation."""
         if self._published < self.journal.count(self._incarnation):
             return self._published
         if self._incarnation == self.journal.incarnation:
@@ -164,7 +161,7 @@ class SourceNode:
         return self._has_credit and self._published < self.journal.count(self._incarnation)
 
     def refusal(self, message: m.Message) -> str | None:
-        """The reason to refuse a message that claims more than was numbered; None: accepted.
+        """Return the reason to refuse a message that claims more than was numbered; None: accepted.
 
         The robot's first progress is accepted: it may belong to another file of the same robot.
         """
@@ -251,7 +248,7 @@ class SourceNode:
 
     @property
     def is_delivered(self) -> bool:
-        """Whether the driver may leave: no process can request its measurements again.
+        """Whether no process can request the measurements again.
 
         The robot has consumed all measurements, the centre has acknowledged all its submaps (a peer
         has its final map), and a recorder, if present, has everything.
@@ -275,7 +272,7 @@ class SourceNode:
         return " and ".join(missing)
 
     def status(self) -> m.Status:
-        """The driver's status."""
+        """Return the driver's status."""
         figures = {
             "measurements": float(self.journal.count(self.journal.incarnation)),
             "incarnation": float(self.journal.incarnation),

@@ -18,17 +18,14 @@ FIRST_INCARNATION = 1
 
 
 def channel_of(measurement: m.Measurement) -> ch.Channel:
-    """The channel on which a measurement is published."""
+    """Return the channel on which a measurement is published."""
     return next(row for row in ch.SENSORS if isinstance(measurement, row.kinds))
 
 
 def answered(
     requested: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
 ) -> list[bytes]:
-    """Encode the requested ones of `count` measurements, at most ANSWER.
-
-    measurement: returns one by its number.
-    """
+    """Encode the requested ones of `count` measurements, at most ANSWER."""
     last = count - 1 if requested.last < 0 else min(requested.last, count - 1)
     last = min(last, requested.first + ANSWER - 1)
     return [encoded(measurement(number)) for number in range(requested.first, last + 1)]

@@ -1,8 +1,8 @@
 """A team's certificate authority and the certificates that it issues.
 
-Keys are on curve P-256. A certificate names node (CN) and team (O), the router's also its host
-names. Node certificates are for clients only, so no robot can pose as the router. Validity begins
-an hour early, since robot clocks differ.
+Keys are on curve P-256. A certificate names node (CN) and team (O), the router's also its hosts.
+Node certificates are for clients only, so no robot can pose as the router. Validity begins an hour
+early, since robot clocks differ.
 """
 
 import os
@@ -60,8 +60,7 @@ def make_keys(
     """Create a missing authority and missing certificates in the folder.
 
     renew: nodes that get a new key and certificate under the same name. revoke: nodes whose name
-    the router no longer accepts; a later certificate has another name, so the old one stays
-    invalid. Raises KeysError.
+    the router no longer accepts; a later certificate has another name. Raises KeysError.
     """
     now = now or datetime.now(UTC)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""Checked credentials of a process: authority's certificate, own certificate, key.
+"""Credentials of a process: authority's certificate, own certificate, key.
 
-Zenoh gives refused clients no reason. So files, their match, node, team and validity are checked
-before connecting.
+Files, their match, node, team and validity are checked before connecting, since Zenoh gives refused
+clients no reason.
 """
 
 import re
@@ -37,14 +37,14 @@ class Credentials:
     readable_by_others: bool = False
 
     def context(self) -> ssl.SSLContext:
-        """TLS client context of the standard library."""
+        """Make a TLS client context of the standard library."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(self.authority)
         context.load_cert_chain(self.certificate, self.key)
         return context
 
     def warnings(self, now: datetime | None = None) -> list[str]:
-        """Warnings of near expiry or a key readable by others."""
+        """Warn of near expiry or a key readable by others."""
         found = []
         if self.ends - (now or datetime.now(UTC)) < SOON:
             found.append(
@@ -124,7 +124,7 @@ def _check_fit(
 
 
 def _named(certificate: x509.Certificate) -> tuple[str, str]:
-    """Common name and team; may be empty."""
+    """Return common name and team; either may be empty."""
     found = []
     for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
         values = certificate.subject.get_attributes_for_oid(oid)

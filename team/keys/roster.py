@@ -1,8 +1,8 @@
 """Roster of a team: nodes with a certificate, and their common names.
 
-A node is one sender: `robot-<name>`, `source-<name>` (the driver of a robot's sensors), `central`,
-`world`, `recorder`, `viewer`, `operator` (commands such as `launch`, `withdraw`), `router`, and
-`replay`, which may publish on every key and is created on request only.
+A node is one sender: `robot-<name>`, `source-<name>` (its driver), `central`, `world`, `recorder`,
+`viewer`, `operator` (commands such as `launch`, `withdraw`), `router`, and on request `replay`,
+which may publish on every key.
 """
 
 import re
@@ -34,8 +34,8 @@ class Issued(NamedTuple):
 class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Contents of the roster file.
 
-    nodes: certificate generation by node. hosts: host names of the router. revoked: last revoked
-    generation by node.
+    nodes: certificate generation by node. hosts: of the router. revoked: last revoked generation by
+    node.
     """
 
     team: str
@@ -44,28 +44,28 @@ class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     revoked: dict[str, int] = msgspec.field(default_factory=dict)
 
     def common_name(self, node: str) -> str:
-        """Node name at the router; numbered after a revocation."""
+        """Return the node's name at the router."""
         return common_name(node, self.nodes[node])
 
     @property
     def robots(self) -> list[str]:
-        """Robot names in order."""
+        """Robot names, ascending."""
         return sorted(n.removeprefix("robot-") for n in self.nodes if n.startswith("robot-"))
 
 
 def common_name(node: str, generation: int) -> str:
-    """Format `robot-r1`; its second generation is `robot-r1.2`."""
+    """Name a node's certificate: `robot-r1`; its second generation is `robot-r1.2`."""
     return node if generation == 1 else f"{node}.{generation}"
 
 
 def nodes_of(robots: Iterable[str]) -> list[str]:
-    """Nodes of a team with these robots."""
+    """Return the nodes of a team with these robots."""
     names = list(robots)
     return [*STANDING, *(f"{kind}-{name}" for name in names for kind in ("robot", "source"))]
 
 
 def is_node(text: str) -> bool:
-    """Whether this is a valid node name."""
+    """Return whether this is a valid node name."""
     kind, dash, name = text.partition("-")
     if not dash:
         return text in (*STANDING, REPLAY)
@@ -91,7 +91,7 @@ def load_roster(folder: Path) -> Roster:
 
 
 def roster_bytes(roster: Roster) -> bytes:
-    """Contents of the roster file."""
+    """Encode the roster file."""
     return msgspec.json.format(msgspec.json.encode(roster, order="deterministic"), indent=2) + b"\n"
 
 

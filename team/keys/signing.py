@@ -1,8 +1,8 @@
 """Signatures with a node's key: peers relay robots' messages, and all can verify them.
 
-ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member; verified
-with the node's certificate. A node may have had several certificates: renewals keep the generation,
-and the first after a revocation begins the next. Verification does not depend on the time.
+ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member. Renewals
+keep a certificate's generation; the first after a revocation begins the next. Verification does not
+depend on the time.
 """
 
 import re
@@ -52,13 +52,11 @@ class Signer:
         return self._key.sign(self._team.encode() + b"\0" + named, _ALGORITHM)
 
     def issued(self, node: str, certificate: bytes) -> Issued | str:
-        """Generation and end of an issued certificate of the node, or the reason why it is
-        invalid.
-        """
+        """Return generation and end of an issued certificate of the node, or why it is invalid."""
         return _issued(self._authority, self._team, node, certificate)
 
     def revoked(self, node: str) -> int:
-        """Last revoked generation of the node; 0: none."""
+        """Return the last revoked generation of the node; 0: none."""
         return self._revoked.get(node, 0)
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:

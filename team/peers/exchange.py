@@ -31,11 +31,11 @@ BATCH_BYTES = 64 * 2**10
 def make_request(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """Request the members of the summary's node that this replica lacks; None where there are none.
+    """Request the members of the summary's node that this replica lacks; None: there are none.
 
     not_now: (stream, sequence) requested recently from another peer. A stream with equal sequences
-    and different digests is requested whole: its robot has contradicted itself, and all peers keep
-    the smaller of two members.
+    and another digest is requested whole: its robot has contradicted itself, and all peers keep the
+    smaller member.
     """
     if summary.digest == replica.digest:
         return None
@@ -86,7 +86,7 @@ def make_request(
 
 
 def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
-    """Whether a summary exceeds the bounds of this team's set."""
+    """Return whether a summary exceeds the bounds of this team's set."""
     return (
         len(summary.holdings) > MOST_STREAMS * len(replica.robots)
         or len(summary.statements) > len(replica.robots) + MOST_MAPS
@@ -95,7 +95,7 @@ def is_oversized(replica: Replica, summary: m.SetSummary) -> bool:
 
 
 def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
-    """The (stream, sequence) of a request, as in `not_now`."""
+    """Yield the (stream, sequence) of a request, as in `not_now`."""
     for each in request.requested:
         stream = each.robot, each.incarnation
         yield stream, -2
@@ -106,7 +106,7 @@ def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 
 
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
-    """Whether members of a stream differ although their sequences are equal."""
+    """Return whether members of a stream differ although their sequences are equal."""
     stream = holding.robot, holding.incarnation
     mine = replica.announced_of(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
@@ -114,7 +114,7 @@ def _contradicts(replica: Replica, holding: m.Holding) -> bool:
 
 
 Sign = Callable[[Member], bytes]
-"""A member's signature by its author; empty where it has none."""
+"""Sign a member in its author's name; empty where that is impossible."""
 
 
 def make_answer(
@@ -122,7 +122,7 @@ def make_answer(
 ) -> list[m.Members]:
     """Answer a request in batches, statements first.
 
-    sign: where there are keys; members without a signature yet are left out.
+    sign: with keys; members without a signature are left out.
     """
     batches: list[list[Member]] = [[]]
     total = size = 0

@@ -1,8 +1,6 @@
 """A member of the team's set: a message's original bytes and its name in the set.
 
-Members are the inputs of a map: initial poses, submaps and their inter-robot measurements, orders
-(withdrawals, robots given up), verdicts on identities, saved maps and `Done`; and `Concluded`,
-which is no input.
+Members are the inputs of a map, and `Certificate` and `Concluded`, which are none.
 """
 
 import hashlib
@@ -18,16 +16,16 @@ STATED = (
     ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.SAVED_MAP, ch.CONCLUDED, ch.CERTIFICATE,
 )  # fmt: skip
 CHANNELS = (*STREAMED, *STATED)
-"""The channels whose messages are members."""
+"""Channels whose messages are members."""
 LARGEST_MEMBER = 4 * 2**20
-"""Most bytes of a member; a submap of a thousand landmarks has two million."""
+"""Most bytes of a member; a submap of 1000 landmarks has 2·10⁶."""
 LARGEST_SIGNATURE = 8192
 """Most bytes of a member's signature; an operator's includes its certificate."""
 
 
 @dataclass(frozen=True)
 class Member:
-    """One member; `signature` is its author's, empty where the team has no keys."""
+    """One member; `signature` is its author's, empty in a team without keys."""
 
     key: str
     payload: bytes
@@ -36,7 +34,7 @@ class Member:
 
     @cached_property
     def hash(self) -> bytes:
-        """32 bytes that identify the member by its key and its bytes."""
+        """32 bytes that identify key and payload."""
         named = len(self.key).to_bytes(2, "little") + self.key.encode() + self.payload
         return hashlib.blake2b(named, digest_size=32).digest()
 
@@ -46,7 +44,7 @@ class Member:
         return len(self.key) + len(self.payload) + len(self.signature)
 
     def as_sample(self, now_ns: int) -> Sample:
-        """The member as a sample that arrives now (wall clock [ns])."""
+        """Convert to a sample that arrives now (wall clock [ns])."""
         return Sample(self.key, self.payload, self.message.stamp_ns, now_ns, NO_COUNTER)
 
 
@@ -62,7 +60,7 @@ def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
 
 
 def about(message: m.Message) -> str:
-    """Robot, or saved map, to whose share of the set a member belongs."""
+    """Return the robot, or saved map, to whose share of the set a member belongs."""
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
     if isinstance(message, m.SavedMap):

@@ -1,8 +1,8 @@
-"""Replicate the team's set between peers: members in, members out; no I/O, no clock.
+"""Replicate the team's set between peers, over third robots, too.
 
-The node publishes a summary (`SetSummary`) when its set has changed or a node appears, requests
-members that it lacks, and answers requests. Members travel over third robots. The fold receives
-each stream's initial pose, then its submaps without a gap.
+The node publishes a summary when its set has changed or a node appears, requests members that it
+lacks, and answers requests. The fold receives each stream's initial pose, then its submaps without
+a gap.
 """
 
 from collections import Counter, defaultdict
@@ -34,7 +34,7 @@ class Given:
         self._bytes = 0
 
     def allows(self, now_s: float) -> bool:
-        """Whether more may be sent now."""
+        """Return whether more may be sent now."""
         if int(now_s) != self._second:
             self._second, self._bytes = int(now_s), 0
         return self._bytes < GIVEN_BYTES
@@ -45,7 +45,7 @@ class Given:
 
 
 def feed_order(message: m.Message) -> int:
-    """Rank of a statement in a fold's input: before the streams (negative) or after them."""
+    """Rank a statement in a fold's input: before the streams (negative) or after them."""
     match message:
         case m.Withdrawal() | m.Verdict() | m.SavedMap():
             return -1
@@ -56,10 +56,9 @@ def feed_order(message: m.Message) -> int:
 
 
 def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
-    """Yield members of streams that `fed` does not count yet: initial poses, then submaps by end
-    time, each after its inter-robot measurements.
+    """Yield members of streams beyond the counts `fed`: initial poses, then submaps by end time.
 
-    A fold in the order of time undoes nothing.
+    Each submap follows its inter-robot measurements. A fold in the order of time undoes nothing.
     """
     parcels: list[tuple[int, Stream, int]] = []
     for stream, share in sorted(replica.streams.items()):
@@ -138,7 +137,7 @@ class PeerNode:
     # Members.
 
     def take(self, member: Member, carrier: str) -> bool:
-        """Take a member from a node; returns whether it is new."""
+        """Take a member from a node; return whether it is new."""
         try:
             outcome = self.replica.add(member)
         except RefusedError as error:
@@ -159,9 +158,7 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """As `take`, for a sample on a member's key, which only its author may use; a certificate
-        must also be the authority's.
-        """
+        """Take a sample on a member's key as `take` does; a certificate must be the authority's."""
         try:
             member = member_of(sample.key, sample.payload)
         except (WireError, ValueError) as error:
@@ -175,7 +172,7 @@ class PeerNode:
         return self.take(member, carrier)
 
     def take_carried(self, carried: m.Members) -> list[Member]:
-        """Take members that another node carries; returns the new ones."""
+        """Take members that another node carries; return the new ones."""
         new_messages: list[Member] = []
         if carried.node not in self.known:
             self._refuse(f"members from {carried.node[:80]}, not in this team")
@@ -201,8 +198,9 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """Yield queued messages for the fold: operators' orders first, since it may end with a
-        stream's last member; `Done` messages last.
+        """Yield queued messages for the fold: operators' orders first, `Done` last.
+
+        Orders come first since the fold may end with a stream's last member.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)
@@ -264,7 +262,6 @@ class PeerNode:
         return out
 
     def _note_arrival(self, message: m.Message) -> None:
-        """Close the request of a received member."""
         match message:
             case m.InitialPose():
                 self._close(((message.robot, message.incarnation), -1))

@@ -1,15 +1,12 @@
 """Verify by signatures that a member carried by a third node is its author's.
 
-Every robot publishes its certificates, themselves members, and the signature of each of its members
-on its own key (`robot/r1/signature`). An operator leaves at once: it signs its orders
-(`operator/signature/r1`) with its certificate in front, for robots out of its reach.
+Every robot publishes its certificates, themselves members, and the signature of each of its
+members. An operator signs its orders with its certificate in front, for robots out of its reach.
 
 A member is proven by any certificate of its author that the authority issued, that is not revoked,
-and that had not expired at the member's stamp. That stamp is by the author's clock: a stolen key
-can sign with an earlier date until it is revoked. A certificate of a later generation proves that
-the earlier ones are revoked, since the authority issues it only then; a roster beside the own key
-names revocations without a successor. Certificates of revoked generations stay in the set, which is
-the same for all peers, and prove nothing.
+and that had not expired at the member's stamp, which is by the author's clock: a stolen key can
+sign with an earlier date until it is revoked. A certificate of a later generation proves that the
+earlier ones are revoked; a roster beside the own key names revocations without a successor.
 """
 
 from collections.abc import Iterator
@@ -25,7 +22,7 @@ MOST_SIGNATURES = 250_000
 LARGEST_OF_ROBOT = 80
 """Most bytes of a robot's signature: ECDSA over P-256 has 72 at most."""
 MOST_OF_OPERATOR = 10_000
-"""Most stored signatures of operators; each has a certificate in front."""
+"""Most stored signatures of operators."""
 OPERATOR = "operator"
 ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
 """Members that operators sign."""
@@ -41,17 +38,17 @@ class Signs(Protocol):
         """Sign these bytes."""
 
     def issued(self, node: str, certificate: bytes) -> Issued | str:
-        """The node's certificate as issued, or why it is not."""
+        """Return the node's certificate as issued, or why it is not."""
 
     def revoked(self, node: str) -> int:
-        """Last generation known to be revoked; 0: none."""
+        """Return the last generation known to be revoked; 0: none."""
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        """Whether a certificate's key has signed these bytes."""
+        """Return whether a certificate's key has signed these bytes."""
 
 
 class Proofs:
-    """The signatures of one peer, which decide on the members that it accepts."""
+    """Signatures of one peer, which decide on the members that it accepts."""
 
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
@@ -60,7 +57,7 @@ class Proofs:
         self._operator = 1
 
     def certificate(self) -> m.Certificate:
-        """The robot's own certificate, as a member."""
+        """Return the robot's own certificate, as a member."""
         return m.Certificate(stamp_ns=0, robot=self._robot, certificate=self._signer.certificate)
 
     def signed(self, member: Member) -> m.Signature:
@@ -85,7 +82,7 @@ class Proofs:
             signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:
-        """A member's signature; empty where missing, and for a certificate, signed by the
+        """Return a member's signature; empty if missing, and for a certificate, signed by the
         authority.
         """
         if isinstance(member.message, m.Certificate):
@@ -100,7 +97,7 @@ class Proofs:
         return member.signature or found
 
     def refusal(self, member: Member, replica: Replica) -> str | None:
-        """Why a carried member is rejected; None if accepted."""
+        """Return why a carried member is rejected; None if accepted."""
         robot, message = about(member.message), member.message
         if isinstance(message, m.Certificate):
             found = self._signer.issued(f"robot-{robot}", message.certificate)
@@ -157,12 +154,12 @@ class Proofs:
 
 
 def signed_by(member: Member) -> str:
-    """Node whose signature proves a member: its robot, or `operator`."""
+    """Return the node whose signature proves a member: its robot, or `operator`."""
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 
 def signed_order(signer: Signs, member: Member) -> m.Signature:
-    """An operator's signature of its order, its certificate in front."""
+    """Sign an operator's order, with its certificate in front."""
     certificate = signer.certificate
     proof = len(certificate).to_bytes(2, "little") + certificate + signer.sign(member.hash)
     message = member.message

@@ -1,8 +1,7 @@
 """One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
 Of two members of one name (a robot contradicts itself) the smaller hash stays, so all peers agree.
-The set accepts only known robots and possible incarnations and sequences, and limits the bytes per
-robot: none can fill another's disk.
+Bytes are limited per robot, so none can fill another's disk.
 """
 
 import hashlib
@@ -17,9 +16,7 @@ from teamslam.team.store import Stream
 from teamslam.team.wire import messages as m
 
 MOST_SEQUENCES = 200_000
-"""Most submaps per incarnation."""
 MOST_STREAMS = 64
-"""Most incarnations per robot."""
 MOST_STATEMENTS = 2 * MOST_STREAMS + 8
 """Most orders and `Done` messages about one robot."""
 MOST_VERDICTS = 4096
@@ -63,7 +60,7 @@ class StreamShare:
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """A complete submap after its inter-robot measurements, in canonical order.
+        """Return a complete submap after its inter-robot measurements, in canonical order.
 
         Surplus measurements are left out.
         """
@@ -211,11 +208,11 @@ class Replica:
     # Contents.
 
     def share_of(self, stream: Stream) -> StreamShare:
-        """Stored members of a stream."""
+        """Return the stored members of a stream."""
         return self.streams.get(stream) or StreamShare()
 
     def have(self, robot: str) -> Have:
-        """Stored share of a robot."""
+        """Return the stored share of a robot."""
         shares = [share for (name, _), share in self.streams.items() if name == robot]
         newest = max((share.newest_ns for share in shares), default=0)
         return Have(sum(len(share.complete) for share in shares), newest)
@@ -236,13 +233,13 @@ class Replica:
         return found
 
     def certificates_of(self, robot: str) -> Iterator[bytes]:
-        """Certificates of a robot: several where it was renewed."""
+        """Yield the certificates of a robot: several where it was renewed."""
         for member in self.statements.get(robot, {}).values():
             if isinstance(member.message, m.Certificate):
                 yield member.message.certificate
 
     def members(self) -> Iterator[Member]:
-        """Every member, in an order that a fold accepts."""
+        """Yield every member, in an order that a fold accepts."""
         for stream in sorted(self.streams):
             share = self.streams[stream]
             if share.start is not None:
@@ -258,7 +255,7 @@ class Replica:
     # Summaries.
 
     def holding(self, stream: Stream) -> m.Holding | None:
-        """A stream's holding for a summary; None where nothing can be requested."""
+        """Return a stream's holding for a summary; None where nothing can be requested."""
         share = self.share_of(stream)
         if share.start is None and not share.complete:
             return None
@@ -272,7 +269,7 @@ class Replica:
         )
 
     def _holding_of(self, stream: Stream) -> m.Holding | None:
-        """As `holding`, cached until a member of the stream arrives."""
+        """Return `holding`, cached until a member of the stream arrives."""
         holding = self._holdings.get(stream) or self.holding(stream)
         if holding is not None:
             self._holdings[stream] = holding
@@ -304,11 +301,11 @@ class Replica:
         )
 
     def announced_of(self, stream: Stream) -> m.Holding | None:
-        """A stream's holding in the summary."""
+        """Return a stream's holding in the summary."""
         return self._announcement.holdings.get(stream)
 
     def stated_of(self, robot: str) -> m.Statements | None:
-        """The summary of the statements about a robot."""
+        """Return the summary of the statements about a robot."""
         return self._announcement.statements.get(robot)
 
     @property
@@ -339,7 +336,7 @@ class _Announced(NamedTuple):
 
 
 def _stated(message: m.Message) -> tuple[str, int]:
-    """Name of a statement among those about its robot."""
+    """Name a statement among those about its robot."""
     match message:
         case m.Done():
             return "done", message.incarnation
@@ -362,16 +359,17 @@ def _stated(message: m.Message) -> tuple[str, int]:
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
-    """Order of two statements of one name; the greater stays: a later conclusion, else by the
-    bytes.
+    """Order two statements of one name; the greater stays: a later conclusion, else the smaller
+    hash.
     """
     serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
     return serial, bytes(255 - byte for byte in member.hash)
 
 
 def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
-    """First, last, first, last, … of the first MOST_INTERVALS intervals; `count`: gap-free from 0
-    on.
+    """Return first, last, first, last, … of the first MOST_INTERVALS intervals.
+
+    count: the sequences have no gap from 0 to count − 1.
     """
     ends: list[int] = [0, count - 1] if count else []
     for each in sorted(s for s in sequences if s >= count):

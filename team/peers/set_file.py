@@ -2,10 +2,10 @@
 
 Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A truncated last record is
-cut off when the file is opened. After a damaged record reading continues at the next one whose CRC
-fits; the file is then rewritten without the damage, which is reported. Lost members come from other
-peers or are computed again. A record is in the operating system's hands when `append` returns: a
-killed process loses nothing, a power failure the last seconds.
+cut off. After a damaged record reading continues at the next one whose CRC fits; the file is
+rewritten without the damage, which is reported, and the lost members are requested again. `append`
+leaves a record to the operating system: a killed process loses nothing, a power failure the last
+seconds.
 """
 
 import logging
@@ -28,7 +28,7 @@ MAGIC = b"tmsset1\n"
 RETRY_S = 5.0
 """Interval [s] between attempts to write after an error."""
 SHOWN = 3
-"""Number of gaps listed per stream."""
+"""Gaps listed per stream."""
 _HEAD = struct.Struct("<II")
 _BODY = b"\x93"
 """First byte of each body: an array of three."""
@@ -68,7 +68,7 @@ def records_in(content: bytes) -> Iterator[Record]:
 def _next_record(content: bytes, at: int) -> int | None:
     """Find the first intact record from `at` on.
 
-    A damaged record of sound length is skipped as a whole: apparent records within it are its
+    A damaged record of valid length is skipped as a whole: apparent records within it are its
     author's. Otherwise each body's first byte is tried.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
@@ -85,7 +85,7 @@ def _next_record(content: bytes, at: int) -> int | None:
 
 
 def _is_intact(content: bytes, at: int) -> bool:
-    """Whether a whole record with its CRC begins here."""
+    """Return whether a whole record with its CRC begins here."""
     begin = at + _HEAD.size
     if content[begin : begin + 1] != _BODY:
         return False
@@ -186,7 +186,7 @@ class SetFile:
 
 
 def _is_cut_off(content: bytes, at: int) -> bool:
-    """Whether the file ends within this record, as after a killed write."""
+    """Return whether the file ends within this record, as after a killed write."""
     if at + _HEAD.size > len(content):
         return any(content[at:]) or at >= len(content)
     length, _ = _HEAD.unpack_from(content, at)
@@ -194,14 +194,13 @@ def _is_cut_off(content: bytes, at: int) -> bool:
 
 
 def _is_foreign(content: bytes) -> bool:
-    """Whether a file's beginning is not ours; zeros remain after a power failure."""
+    """Return whether a file's beginning is not ours; zeros remain after a power failure."""
     begin = content[: len(MAGIC)]
     ours = all(here in (0, there) for here, there in zip(begin, MAGIC, strict=False))
     return any(content) and not (ours and any(begin))
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Replace a file atomically."""
     fresh = path.with_name(path.name + ".new")
     with fresh.open("wb") as file:
         file.write(content)

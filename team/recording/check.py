@@ -1,4 +1,4 @@
-"""Check that a log is whole, complete and valid; one line per finding."""
+"""Check that a log is whole, complete and valid."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -35,9 +35,7 @@ class Finding(NamedTuple):
 def check_log(log: Log) -> list[Finding]:
     """Find all defects of file, schemas, counters and messages.
 
-    Missing messages are detected by measurement and submap numbers, stream ends, key counters, and
-    the totals that processes publish at their end (`holes`). Memory: 16 bytes a message, and one
-    chunk.
+    Memory: 16 bytes a message, and one chunk.
     """
     found = _of_file(log)
     evidence = _evidence(log)
@@ -64,10 +62,7 @@ def check_log(log: Log) -> list[Finding]:
 
 
 def holes(log: Log) -> list[Finding]:
-    """Find missing and duplicate messages, and an unfinished recording.
-
-    Liveliness and the recorder's own messages have no counted key.
-    """
+    """Find missing and duplicate messages, and an unfinished recording."""
     evidence = _evidence(log)
     damaged = [] if log.complete else [Finding(FILE, UNFINISHED)]
     for chunk in read_undamaged(log):
@@ -83,9 +78,9 @@ def holes(log: Log) -> list[Finding]:
 class _Evidence:
     """Evidence about missing samples.
 
-    part: the log is a cut. repaired: it was made from an unfinished log. totals: by key, each
-    process's final number of publications, by the process's start. channels: those of `_READ` that
-    are there. plain: keys of other channels.
+    part: the log is a cut. repaired: it was unfinished. totals: by key, each process's final number
+    of publications, by its start. channels: those of `_READ` in the log. plain: keys of other
+    channels.
     """
 
     part: bool
@@ -105,7 +100,7 @@ class _Evidence:
             self._read(sample)
 
     def _read(self, sample: Sample) -> None:
-        """Register what channel and content of a sample prove, or that its key proves nothing."""
+        """Register the evidence in a sample's channel and content."""
         row = ch.channel_of(sample.key)
         if row is None or row[0] not in _READ:
             self.plain.add(sample.key)
@@ -125,7 +120,7 @@ class _Evidence:
                 self.totals[key][message.since_ns] = count
 
     def findings(self) -> Iterator[Finding]:
-        """Findings by key; for a cut only gaps between two messages of a publisher."""
+        """Yield findings by key; of a cut only gaps between two messages of a publisher."""
         for key in sorted(self.counters.keys() | self.totals.keys()):
             row = ch.channel_of(key)
             if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
@@ -159,7 +154,7 @@ _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
 """Channels published after the end of the streams."""
 _READ = {ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL, ch.TALLY, ch.STATUS}
-"""Channels whose presence or content is evidence beyond their counters and numbers."""
+"""Channels whose presence or content is evidence beyond their counters."""
 NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
 NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
@@ -193,5 +188,5 @@ def _unsound(sample: Sample) -> str | None:
 
 
 def _noted(log: Log, note: str) -> bool:
-    """Whether the metadata has this note, for this log or a merged one."""
+    """Return whether the metadata has this note, for this log or a merged one."""
     return any(name.partition("@")[0] == note for name in log.metadata)

@@ -1,9 +1,8 @@
 """Counters of one key: missing and duplicate publications of a log.
 
-A publisher counts its publications on a key from 0; a restarted process counts from 0 again. A life
-is the publications of one process. Counters do not name their life: it follows from the wall clock,
-or from order of arrival if the clock was set during the run. A reply has no counter (`NO_COUNTER`):
-it repeats an unknown publication.
+A publisher counts its publications on a key from 0, and from 0 again after a restart. A life is the
+publications of one process; it follows from the wall clock, or from the order of arrival if the
+clock was set during the run.
 """
 
 from array import array
@@ -19,7 +18,7 @@ from teamslam.team.wire.intervals import Interval, IntervalSet
 Life = Int64[np.ndarray, "_"]
 """Positions of one life's publications, by counter."""
 _LATEST = 2**63 - 1
-"""Largest wall clock [ns]: larger ones are from damaged or hostile logs."""
+"""Largest wall clock [ns]; later ones are from damaged or hostile logs."""
 
 
 class Counters:
@@ -74,9 +73,9 @@ class Counters:
 def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"]) -> list[Life]:
     """Split publications, in order of arrival, into lives of their publisher.
 
-    Two orders show lives: wall clock, where a step back or of zero begins one, and arrival. The
-    order with fewer lives is used, then with fewer gaps: a set clock adds lives and gaps to the
-    first, late arrivals to the second.
+    A life begins where the wall clock steps back or stands still, or by order of arrival. The order
+    with fewer lives is used, then with fewer gaps: a set clock adds lives and gaps to the first,
+    late arrivals to the second.
     """
     if not len(counters):
         return []
@@ -93,7 +92,7 @@ def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"
 
 
 def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
-    """Lives by arrival: a counter that the newest life already has belongs to an earlier life that
+    """Split by arrival: a counter that the newest life has belongs to the latest earlier life that
     lacks it, or begins the next.
     """
     present = [IntervalSet()]
@@ -142,7 +141,7 @@ def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[
 
 
 def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[Interval]:
-    """Missing intervals of one life's ascending counters."""
+    """Return the missing intervals of one life's ascending counters."""
     before = np.concatenate([counters[:1] - 1 if part else [-1], counters[:-1]])
     missing = counters > before + 1
     pairs = zip(before[missing] + 1, counters[missing] - 1, strict=True)

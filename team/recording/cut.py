@@ -25,11 +25,11 @@ def cut(
     to_s: float | None = None,
     channels: Collection[ch.Channel] | None = None,
 ) -> int:
-    """Write the samples of [from_s, to_s) on these channels to a new log; returns their number.
+    """Write the samples of [from_s, to_s) on these channels to a new log; return their number.
 
     Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts
     partition a log. Earlier messages of `STANDING` channels are included; metadata is copied with a
-    note of the cut. Raises `LogError`, before creating `out`, for an empty result or a damaged log;
+    note. Raises `LogError`, before creating `out`, for an empty result or a damaged log;
     `RecorderError` if `out` exists.
     """
     summary = summarise_log(log)

@@ -1,4 +1,4 @@
-"""Declared channels of a log: encoding and schema of each key."""
+"""Encoding and schema that a log declares for each key."""
 
 import json
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ class Declared(NamedTuple):
 
 
 def read_declarations(log: Log) -> dict[str, Declared]:
-    """Last declaration of each key; damaged parts are skipped."""
+    """Return the last declaration of each key; damaged parts are skipped."""
     found: dict[str, Declared] = {}
     for each in log.files:
         _declared_in(each.path, log.team, found)
@@ -60,9 +60,9 @@ def _declared_in(path: Path, team: str, found: dict[str, Declared]) -> None:
 
 
 def find_misdeclaration(of: Declared) -> str | None:
-    """Defect of a key's declaration, or None.
+    """Return the defect of a key's declaration, or None.
 
-    Later program versions may append fields: the shorter field list must be a prefix of the longer.
+    Later versions may append fields: the shorter field list must be a prefix of the longer.
     """
     row = channel_of(of.key)
     if row is None:
@@ -79,7 +79,7 @@ def find_misdeclaration(of: Declared) -> str | None:
 
 
 def _fields(text: bytes, kind: type[Message]) -> list[Any]:
-    """Field types of a schema in order; empty if it is not a schema of this message."""
+    """Return the field types of a schema in order; empty if it is not that of this message."""
     try:
         fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -88,7 +88,7 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
 
 
 def _declarations(path: Path) -> Iterator[Frame]:
-    """Schema and channel records, in chunks or in the index."""
+    """Yield schema and channel records, in chunks or in the index."""
     opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
     with path.open("rb") as file:
         try:

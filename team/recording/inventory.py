@@ -1,8 +1,8 @@
 """Numbered streams of a log: present and missing numbers.
 
 A source numbers measurements across all of its robot's sensor channels; the robot numbers submaps.
-`world/end` or each driver's head gives the total, `progress` and `done` a lower bound. So missing
-numbers are detected at a stream's end, too, and for a missing stream.
+`world/end` or each driver's head gives the total, `progress` and `done` a lower bound, so missing
+numbers are detected at a stream's end, too.
 """
 
 from array import array
@@ -36,8 +36,7 @@ class _Run:
 class Received:
     """Received counters of each key that its publisher caches, by publishing process.
 
-    A restarted process counts its publications from 0 again. Consecutive samples form a run; a gap
-    filled later is another run.
+    Consecutive samples of a process form a run; a gap filled later is another run.
     """
 
     def __init__(self) -> None:
@@ -60,15 +59,14 @@ class Received:
             runs.append(_Run(counter, counter + 1, wall_ns, wall_ns))
 
     def of_process(self, key: str, since_ns: int) -> tuple[int, int]:
-        """Number of samples of the process that began then, and its next counter."""
+        """Return the number of samples of the process that began then, and its next counter."""
         runs = [run for run in self._runs.get(key, ()) if run.first_ns >= since_ns]
         return sum(run.end - run.first for run in runs), max((run.end for run in runs), default=0)
 
     def lacking(self, tally: m.Tally, awaited: set[str]) -> dict[str, int]:
-        """Keys of a process with missing samples, each with the number received.
+        """Return the keys of a process with missing samples, each with the number received.
 
-        awaited: keys whose publisher may still have samples. Other keys need only the newest
-        sample.
+        awaited: keys whose publisher may still have samples; other keys need only the newest.
         """
         found = {}
         for key, count in zip(tally.keys, tally.counts, strict=True):
@@ -89,7 +87,7 @@ MISSING = "missing: "
 """Prefix of the recorder's last note, which lists missing messages."""
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])
-"""Channels without numbers, sent as replies, whose repetitions are recognised by their content."""
+"""Channels without numbers, sent as replies; repetitions are recognised by their content."""
 _TOTALS = (ch.ROBOT_PROGRESS, ch.ROBOT_DONE, ch.END, ch.HEAD, ch.ROBOT_HEAD)
 """Channels whose messages name totals."""
 _Role = Literal["measurements", "submaps", "reply", "totals", ""]
@@ -118,11 +116,11 @@ class Numbered:
 
     @property
     def whole(self) -> int:
-        """First missing number: all smaller ones are present."""
+        """First missing number."""
         return len(self._sums)
 
     def take(self, number: int, payload: bytes) -> bool:
-        """Add a payload; returns False if present with the same content."""
+        """Add a payload; return False if present with the same content."""
         found, sums, beyond = crc32(payload), self._sums, self._beyond
         whole = len(sums)
         there = sums[number] if number < whole else beyond.get(number)
@@ -172,7 +170,7 @@ class Inventory:
         self.take(sample)
 
     def is_new(self, sample: Sample) -> bool:
-        """Add a sample; returns False if this log or an earlier part has it."""
+        """Add a sample; return False if this log or an earlier part has it."""
         self.received.take(sample)
         if self.has_earlier_parts:
             name = _name(sample)
@@ -182,7 +180,7 @@ class Inventory:
         return self.take(sample)
 
     def take(self, sample: Sample) -> bool:
-        """Add a sample; returns False if its stream has it."""
+        """Add a sample; return False if its stream has it."""
         role, robot = _role_of(sample.key)
         if role == "measurements" or role == "submaps":
             named = numbered_in(sample.payload)
@@ -224,7 +222,7 @@ class Inventory:
         self._of("measurements", of.robot, of.incarnation).note_number(of.measurements - 1)
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
-        """Present measurements and submaps by (robot, incarnation)."""
+        """Count present measurements and submaps by (robot, incarnation)."""
         found: dict[tuple[str, int], tuple[int, int]] = {}
         for (kind, robot, incarnation), each in self.streams.items():
             measurements, submaps = found.get((robot, incarnation), (0, 0))
@@ -240,12 +238,12 @@ class Inventory:
         }
 
     def span(self, stream: NumberedStream) -> tuple[int, int]:
-        """First and last missing number of an incomplete stream."""
+        """Return the first and last missing number of an incomplete stream."""
         missing = self.streams[stream].missing
         return missing[0][0], missing[-1][1]
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """Missing numbers, and numbers with different contents: key and description."""
+        """Yield missing numbers, and numbers with different contents: key and description."""
         for (kind, robot, incarnation), found in sorted(self.streams.items()):
             key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
             of = f"of {incarnation_named(incarnation)}"
@@ -261,7 +259,7 @@ def _name(sample: Sample) -> int:
 
 
 def incarnation_named(incarnation: int) -> str:
-    """Incarnation as text."""
+    """Name an incarnation."""
     return f"incarnation {incarnation}"
 
 
@@ -270,13 +268,13 @@ SHOWN = 3
 
 
 def intervals(of: list[tuple[int, int]]) -> str:
-    """Number intervals as text."""
+    """List intervals as text."""
     named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in of[:SHOWN])
     return named + (f" and {len(of) - SHOWN} more gaps" if len(of) > SHOWN else "")
 
 
 class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """The first fields of a numbered message; the others are skipped."""
+    """The first fields of a numbered message."""
 
     tag: str
     stamp_ns: int
@@ -289,10 +287,7 @@ _DECODER = msgspec.msgpack.Decoder(_Head)
 
 
 def numbered_in(payload: bytes) -> _Head | None:
-    """Incarnation and number of a message [tag, stamp, robot, incarnation, number, …], or None.
-
-    An undecodable payload is recorded unchanged, and reported by the message's reader.
-    """
+    """Return the head of a numbered message, or None if the payload does not decode."""
     try:
         return _DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -301,7 +296,7 @@ def numbered_in(payload: bytes) -> _Head | None:
 
 @lru_cache(maxsize=16_384)
 def _role_of(key: str) -> tuple[_Role, str]:
-    """Role of a key in the inventory, and its robot."""
+    """Return the role of a key in the inventory, and its robot."""
     found = ch.channel_of(key)
     if found is None:
         return "", ""

@@ -26,10 +26,10 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
     """Write each sample once to a new log `out`, in order of team time.
 
     Equal stamps keep the order of logs and files. Samples of equal key, counter, wall clock and
-    payload are one publication, as is a restarted robot's repeated configuration. Measurements,
-    submaps and inter-robot measurements are identified by content, since one recorder may have
-    requested them. All samples are in memory at once. Raises `LogError`, before creating `out`, for
-    logs of different teams or a damaged one; `RecorderError` if `out` exists.
+    payload are one publication; measurements, submaps and inter-robot measurements are compared by
+    content, since one recorder may have requested them. All samples are in memory at once. Raises
+    `LogError`, before creating `out`, for logs of different teams or a damaged one; `RecorderError`
+    if `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:
@@ -44,8 +44,9 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
 
 
 def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
-    """Entries on which all logs agree; the others as `name@file`, or `name@1:file` for equal file
-    names.
+    """Merge metadata: entries on which all logs agree, the others as `name@file`.
+
+    With equal file names: `name@1:file`.
     """
     files = [log.path.name for log in logs]
     if len(set(files)) < len(files):

@@ -38,9 +38,9 @@ class OwnLog:
             _LOG.error("its own log is not written any more: %s", error)
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Known measurements of a robot missing from the log: incarnation, first, last number.
+        """Return the missing intervals of a robot's measurements (incarnation, first, last).
 
-        A killed process loses unflushed measurements that its robot may have used and will not
+        A killed process loses unflushed measurements, which its robot may have used and will not
         request again.
         """
         if self.failed:

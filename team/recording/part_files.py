@@ -11,18 +11,16 @@ from teamslam.team.recording.opening import LogFile, open_file
 from teamslam.team.recording.records import LogError
 
 LOG_ID = "log_id"
-"""Metadata name of the identifier shared by all parts."""
 JOINED = "joined"
-"""Metadata name of the last part joined into a log."""
 
 
 def part_of(path: Path, number: int) -> Path:
-    """Path of a part; the first is the log itself."""
+    """Return the path of a part; the first is the log itself."""
     return path if number == 1 else path.with_name(f"{path.stem}.part{number}{path.suffix}")
 
 
 def parts_of(path: Path) -> list[Path]:
-    """Existing files of a log in order, without joined parts and parts of another log."""
+    """Return the files of a log in order, without joined parts and parts of another log."""
     numbered = _numbered_parts(path)
     opened = {number: open_part(part) for number, part in numbered.items()}
     first = next((log for log in opened.values() if log is not None), None)
@@ -35,13 +33,13 @@ def parts_of(path: Path) -> list[Path]:
 
 
 def next_number(path: Path) -> int:
-    """Number of the next part, above all earlier ones."""
+    """Return the number of the next part, above all earlier ones."""
     numbered = _numbered_parts(path)
     return max((_joined(open_part(path)), *numbered)) + 1 if numbered else 1
 
 
 def joined_leftovers(path: Path) -> list[Path]:
-    """Leftover files of joined parts."""
+    """Return the leftover files of joined parts."""
     first = open_part(path)
     return [
         part
@@ -51,9 +49,9 @@ def joined_leftovers(path: Path) -> list[Path]:
 
 
 def _numbered_parts(path: Path) -> dict[int, Path]:
-    """Files named like the log or its parts, by number.
+    """Return the files named like the log or its parts, by number.
 
-    None without a first file: the parts belong to another, moved log.
+    Empty without a first file: the parts belong to another, moved log.
     """
     if not path.exists():
         return {}
@@ -67,13 +65,13 @@ def _numbered_parts(path: Path) -> dict[int, Path]:
 
 
 def _joined(log: LogFile | None) -> int:
-    """Number of the last part in a log's first file."""
+    """Return the number of the last part in a log's first file."""
     number = "" if log is None else log.metadata.get(JOINED, "")
     return int(number) if number.isascii() and number.isdigit() else 1
 
 
 def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
-    """Whether a part belongs to the first file's log; an empty one may.
+    """Return whether a part belongs to the first file's log; an empty one may.
 
     Logs of earlier versions have no LOG_ID: their team and scenario are compared.
     """

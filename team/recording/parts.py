@@ -1,9 +1,8 @@
 """A log in parts: a restarted recorder continues in a further file.
 
-Readers treat `log.mcap`, `log.part2.mcap`, … as one log (`teamslam.team.recording.reader`). At the
-end of a run they are joined into `log.mcap` in order of arrival, unless the disk is full. The
-joined log replaces the first part in one step, so a crash at any time neither loses nor repeats
-samples, and joining can restart.
+At the end of a run the parts are joined into `log.mcap` in order of arrival, unless the disk is
+full. The joined log replaces the first part in one step, so a crash at any time neither loses nor
+repeats samples, and joining can restart.
 """
 
 import os
@@ -46,7 +45,7 @@ def check_continues(
     same_run: bool = False,
     ends: Sequence[Channel] = (FINAL_MAP,),
 ) -> bool:
-    """Whether the run of the log continues; False: it has ended and only `join` remains.
+    """Return whether the run of the log continues; False: it has ended and only `join` remains.
 
     The same run has the same team and scenario and wrote within the hour, or before the wall clock
     was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
@@ -80,7 +79,7 @@ def check_continues(
 
 
 def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
-    """Whether a log was finished after a map that ends its team."""
+    """Return whether a log was finished after a map that ends its team."""
     with suppress(LogError):
         if log.complete:
             chunks = log.chunks(ends)
@@ -89,7 +88,7 @@ def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
 
 
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
-    """Recorder for the next part, and inventory of the earlier ones.
+    """Open a recorder for the next part; return it with the inventory of the earlier ones.
 
     Raises `RecorderError` for a full disk or an uncreatable file.
     """
@@ -112,7 +111,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
 
 
 def inventory_of(parts: Sequence[Path]) -> Inventory:
-    """Inventory of these parts without damaged chunks."""
+    """Return the inventory of these parts without damaged chunks."""
     inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
         file = open_part(part)
@@ -124,10 +123,9 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join(path: Path) -> list[Path]:
-    """Join a log's parts; returns the remaining files, one on success.
+    """Join a log's parts; return the remaining files, one on success.
 
-    Undamaged chunks are copied in order of arrival. A full disk changes nothing. After a crash,
-    joining resumes without repeating parts.
+    Undamaged chunks are copied in order of arrival. A full disk changes nothing.
     """
     for each in joined_leftovers(path):
         each.unlink()

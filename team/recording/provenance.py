@@ -14,7 +14,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "eclipse-zenoh", "msgpack", "mcap")
 
 
 def provenance() -> dict[str, str]:
-    """Versions, processor, core and estimation of this process for a log's metadata."""
+    """Return versions, processor, core and estimation of this process for a log's metadata."""
     versions = {f"version.{package}": version(package) for package in _PACKAGES}
     return {
         **versions,
@@ -30,7 +30,7 @@ def provenance() -> dict[str, str]:
 
 
 def estimation_digest() -> str:
-    """SHA-256 of all `team/estimation` sources in path order; 16 hex digits."""
+    """Return 16 hex digits of the SHA-256 of all `team/estimation` sources in path order."""
     digest = hashlib.sha256()
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
@@ -39,7 +39,7 @@ def estimation_digest() -> str:
 
 
 def arithmetic() -> str:
-    """Platform on which the bits depend, besides program and libraries.
+    """Return the platform on which the bits depend, besides program and libraries.
 
     The C library's logarithm affects the tails of NumPy's normal numbers.
     """
@@ -47,7 +47,7 @@ def arithmetic() -> str:
 
 
 def git_commit() -> str:
-    """Commit of the running checkout, "+" if changed; else "unknown"."""
+    """Return the commit of the running checkout, "+" if changed; else "unknown"."""
     root = ESTIMATION.parents[1]
     if not (root / ".git").exists():
         return "unknown"
@@ -63,7 +63,7 @@ def git_commit() -> str:
 
 
 def _processor() -> str:
-    """Name of the processor; that of its architecture where the system has no other."""
+    """Return the name of the processor; that of its architecture where the system has no other."""
     with suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8") as file:
         for line in file:
             name, _, value = line.partition(":")
@@ -73,7 +73,7 @@ def _processor() -> str:
 
 
 def version(package: str) -> str:
-    """Installed version of a package, or "unknown"."""
+    """Return the installed version of a package, or "unknown"."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

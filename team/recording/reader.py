@@ -35,7 +35,6 @@ from teamslam.team.wire.channels import VIEW, Channel, channel_of
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 
 IN_FOLDER = "log.mcap"
-"""The log in a run's folder."""
 _MESSAGE = struct.Struct("<HIQQ")
 _OF_MESSAGE = int(Opcode.MESSAGE)
 """Plain number: comparing enum members takes a tenth of the reading time."""
@@ -43,10 +42,10 @@ _OF_MESSAGE = int(Opcode.MESSAGE)
 
 @dataclass(frozen=True)
 class Log:
-    """A log on disk. `complete` is False if its last recorder did not finish.
+    """A log on disk.
 
-    `metadata`: provenance. `team`: the team's name. `files`: consecutive parts. An incomplete file
-    is read up to its last whole chunk. `reading` receives the share read in every pass.
+    complete: its last recorder finished; an incomplete file is read up to its last whole chunk.
+    metadata: provenance. files: consecutive parts. reading: receives the share read in every pass.
     """
 
     path: Path
@@ -57,7 +56,7 @@ class Log:
     reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
-        """Samples of the channels (None: all) in file order; raises `LogError`.
+        """Yield the samples of the channels (None: all) in file order; raises `LogError`.
 
         Counters are modulo 2³²; stamps before zero have their true value.
         """
@@ -77,7 +76,7 @@ class Log:
     def chunks(
         self, channels: Collection[Channel] | None = None
     ) -> Iterator[list[Sample] | DamagedChunkError]:
-        """Samples chunk by chunk, with an error in place of a damaged chunk."""
+        """Yield the samples chunk by chunk, with an error in place of a damaged chunk."""
         names = None if channels is None else {channel.name for channel in channels}
         sizes = [each.path.stat().st_size for each in self.files]
         before, whole = 0, max(sum(sizes), 1)
@@ -121,7 +120,7 @@ class Log:
     def samples_in(
         self, frame: Frame, keys: dict[int, str | None], names: set[str] | None = None
     ) -> list[Sample]:
-        """Samples of a chunk on these channels; its declarations are added to `keys`."""
+        """Return the samples of a chunk on these channels; add its declarations to `keys`."""
         samples, data, size = [], expand_chunk(frame.body), _MESSAGE.size
         unpack = _MESSAGE.unpack_from
         for opcode, start, end in locate_records(data):
@@ -149,7 +148,7 @@ class Log:
 
 
 def log_file(path: Path) -> Path:
-    """Path of a log, or of the log in a run's folder."""
+    """Return the path of a log, or of the log in a run's folder."""
     return path / IN_FOLDER if path.is_dir() else path
 
 
@@ -167,13 +166,13 @@ def open_log(path: str | Path) -> Log:
 
 
 def log_of(files: Sequence[LogFile]) -> Log:
-    """Log of consecutive files."""
+    """Return the log of consecutive files."""
     first, last = files[0], files[-1]
     return Log(first.path, first.team, last.complete, first.metadata, tuple(files))
 
 
 def _stamp_in(payload: bytes) -> int:
-    """Stamp of a message logged at zero: MCAP times cannot be negative."""
+    """Return the stamp of a message logged at zero: MCAP times cannot be negative."""
     unpacker = msgpack.Unpacker()
     unpacker.feed(payload[:128])  # tag and stamp are within
     try:

@@ -1,9 +1,9 @@
 """Write samples into an MCAP file with unchanged payload bytes.
 
-Channel: full key, encoding `msgpack`, JSON Schema of its message; views use the encoding and schema
-of their viewers. Log time: team time. Publish time: publisher's wall clock. Sequence: counter
-modulo 2³². MCAP times are unsigned: a stamp before zero is logged at zero, and the reader restores
-it from the payload. The metadata record "teamslam" describes run and program.
+Channel: full key, encoding `msgpack`, JSON Schema of its message; views use those of their viewers.
+Log time: team time. Publish time: publisher's wall clock. Sequence: counter modulo 2³². A stamp
+before zero is logged at zero, since MCAP times are unsigned; the reader restores it from the
+payload. The metadata record "teamslam" describes run and program.
 """
 
 import threading
@@ -90,7 +90,7 @@ class Recorder:
             self._queue.put(sample)
 
     def counts(self) -> dict[str, Count]:
-        """Messages and bytes written so far, by relative key."""
+        """Return messages and bytes written so far, by relative key."""
         return dict(self._counts)
 
     def waiting(self) -> int:
@@ -138,10 +138,7 @@ class Recorder:
                 flushed, unflushed = time.monotonic(), False
 
     def _bound_chunk(self, sample: Sample) -> None:
-        """End the chunk before it spans more than CHUNK_NS of wall time.
-
-        Late samples may make a chunk of CHUNK_LEAST messages span more.
-        """
+        """End the chunk before it spans more than CHUNK_NS of wall time."""
         first, last = self._span
         first, last = min(first, sample.wall_ns), max(last, sample.wall_ns)
         if self._in_chunk >= CHUNK_LEAST and last - first > CHUNK_NS:
@@ -170,8 +167,8 @@ class Recorder:
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _tag(self, sample: Sample) -> str:
-        """Tag of a message on a key with several types, each declared; an unknown tag counts as the
-        first type.
+        """Return the tag of a message on a key with several types; an unknown tag counts as the
+        first.
         """
         found = channel_of(sample.key)
         if found is None or not found[0].alternatives:

@@ -1,7 +1,6 @@
 """Read an MCAP file's records as untrusted input.
 
-Every length and chunk CRC is checked before use; a chunk that claims an impossible expanded size is
-refused.
+Every length and chunk CRC is checked before use.
 """
 
 import os
@@ -24,9 +23,7 @@ from teamslam.team.wire.codec import LARGEST_PAYLOAD
 LARGEST_CHUNK = LARGEST_PAYLOAD + 2 * 2**20
 """Largest expanded chunk [bytes]: the largest message behind an almost full chunk."""
 LARGEST_RATIO = 10_000
-"""Largest expansion ratio; a map of zeros reaches a thousand, a decompression bomb ten
-thousands.
-"""
+"""Largest expansion ratio; a map of zeros reaches 1,000, a decompression bomb tens of thousands."""
 MOST_RECORDS = 250_000
 """Most records of a chunk: a recorder's 1 MiB chunk has 34 000 of the smallest messages."""
 _FRAME = struct.Struct("<BQ")
@@ -69,14 +66,14 @@ class Frame(NamedTuple):
 
 
 def read_index(file: IO[bytes], path: Path) -> Iterator[Frame]:
-    """Records of the summary section, located by the footer (0: none)."""
+    """Yield the records of the summary section, located by the footer (0: none)."""
     file.seek(_FRAME.size - FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
     (start,) = struct.unpack("<Q", file.read(8))
     return read_frames(file, path, start) if start else iter(())
 
 
 def check_index(file: IO[bytes]) -> str | None:
-    """Defect of a complete file's index; None if its CRC fits.
+    """Return the defect of a complete file's index; None if its CRC fits.
 
     The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
     """
@@ -96,9 +93,9 @@ def check_index(file: IO[bytes]) -> str | None:
 
 
 def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
-    """Whole records of the file from `start`, up to a truncated one.
+    """Yield whole records of the file from `start`, up to a truncated one.
 
-    Invalid bytes mean that their length or the one before is damaged: reading continues at the next
+    After invalid bytes, whose length or the one before is damaged, reading continues at the next
     chunk found.
     """
     size = os.fstat(file.fileno()).st_size
@@ -124,7 +121,7 @@ def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> I
 
 
 def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
-    """Position of the next chunk record, recognised by its head."""
+    """Return the position of the next chunk record, recognised by its head."""
     file.seek(start)
     tail, begin, ahead = b"", start, _AHEAD
     while block := file.read(ahead):
@@ -144,16 +141,15 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
 
 
 def read_records(data: bytes) -> Iterator[Frame]:
-    """Records of an expanded chunk; raises ValueError if one exceeds it or there are too many.
-
-    The number is bounded because small records grow many times as Python objects.
+    """Yield the records of an expanded chunk; raises ValueError if one exceeds it or there are too
+    many.
     """
     for opcode, start, end in locate_records(data):
         yield Frame(start - FRAME_SIZE, opcode, data[start:end])
 
 
 def locate_records(data: bytes) -> list[tuple[int, int, int]]:
-    """Opcode, first and last byte of each record of an expanded chunk; raises as `read_records`."""
+    """Return opcode, first and last byte of each record; raises as `read_records`."""
     found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
     unpack, most = _FRAME.unpack_from, MOST_RECORDS

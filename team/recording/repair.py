@@ -1,6 +1,4 @@
-"""Copy the undamaged chunks of a damaged or unfinished log to a complete one; likewise another
-program's MCAP file, such as a ROS 2 bag whose recorder was killed.
-"""
+"""Copy the undamaged chunks of a damaged or unfinished log, or of a ROS 2 bag, to a new one."""
 
 import struct
 from collections.abc import Iterator
@@ -29,7 +27,7 @@ class Report(NamedTuple):
 
 
 def read_undamaged(log: Log) -> Iterator[list[Sample] | LogError]:
-    """Samples of every undamaged chunk; a damaged one yields its error."""
+    """Yield the samples of every undamaged chunk, and the error of a damaged one."""
     try:
         yield from log.chunks()
     except LogError as error:  # nothing further can be located
@@ -115,7 +113,7 @@ def repair_bag(path: Path, out: Path) -> BagReport:
 
 
 def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
-    """Records in order, including those in chunks; damage is noted in `damaged`."""
+    """Yield records in order, including those in chunks; damage is noted in `damaged`."""
     records = reader.records
     while True:
         try:

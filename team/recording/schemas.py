@@ -1,7 +1,7 @@
 """JSON Schemas of the messages, for any MCAP viewer.
 
 A schema describes the MessagePack array by position. Fields with `contentEncoding: base64` are
-MessagePack `bin` of little-endian numbers, see docs/wire.md.
+`bin` of little-endian numbers, see docs/wire.md.
 """
 
 import json
@@ -16,7 +16,7 @@ from teamslam.team.wire.views import json_schema, view_of
 
 
 def schema_of(message: type[Message]) -> bytes:
-    """JSON Schema of a message as UTF-8 bytes, deterministic."""
+    """Return the JSON Schema of a message as UTF-8 bytes, deterministic."""
     return json.dumps(msgspec.json.schema(message), sort_keys=True).encode()
 
 
@@ -30,7 +30,7 @@ class Declaration(NamedTuple):
 
 
 def declaration_of(key: str, tag: str = "") -> Declaration | None:
-    """Declaration of a relative key; None for a key without a row in the table.
+    """Return the declaration of a relative key; None for a key without a row in the table.
 
     tag: the message's, if the key has several types.
     """

@@ -51,11 +51,10 @@ from teamslam.team.wire.request_times import RequestTimes
 
 
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
-    """(delay [s] after the previous one, sample), in the given order, at `speed` × team time.
+    """Yield (delay [s] after the previous one, sample), in the given order, at `speed` × team time.
 
     delay = max(0, t − newest stamp so far)/speed: late samples and the first one are published at
-    once, and delays sum to the elapsed team time. Infinite speed has no delay. Raises ValueError
-    unless speed > 0.
+    once, and delays sum to the elapsed team time. Raises ValueError unless speed > 0.
     """
     if not speed > 0.0:
         raise ValueError(f"out of bounds: speed {speed} is not positive")
@@ -81,16 +80,16 @@ _LOG = logging.getLogger("teamslam")
 
 
 More = Callable[[], tuple[Recorder, Inventory]]
-"""Opens a further part of a log, with the earlier inventory. Raises `RecorderError`."""
+"""Open a further part of a log, with the earlier inventory. Raises `RecorderError`."""
 
 
 class RecordLoop:
     """Write each bus sample once, request missing ones, and report progress.
 
-    The log also receives the recorder's observations: `Liveliness` of the others, at the newest
-    team time, and its own status. inventory: of earlier parts. more: opens the next part after a
-    write error; without it the error is raised. peers: recording ends when each has concluded, or
-    was given up or withdrawn. The centre's final map ends any team.
+    The log also receives `Liveliness` of the others, at the newest team time, and the recorder's
+    status. inventory: of earlier parts. more: opens the next part after a write error; without it
+    the error is raised. peers: recording ends when each has concluded, or was given up or
+    withdrawn. The centre's final map ends any team.
     """
 
     def __init__(
@@ -352,7 +351,7 @@ def record(
     scenario: Sequence[Configuration] = (),
     peers: Collection[str] = (),
 ) -> int:
-    """Record until the final map is present and all nodes have left, or until `stop`; then close.
+    """Record until the final map is present and all nodes have left, or until `stop`.
 
     Returns the number of messages written. expected: nodes whose absence is a warning. inventory,
     more, peers: as `RecordLoop`. scenario: configurations logged for a team without a world. Raises
@@ -391,8 +390,7 @@ def record(
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
-    """Publish samples, bytes unchanged, at `speed` × team time until done or `stop`; returns their
-    number.
+    """Publish samples unchanged at `speed` × team time until done or `stop`; return their number.
 
     Due times are relative to the first sample, so delays do not accumulate.
     """

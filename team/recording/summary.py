@@ -14,7 +14,7 @@ FOREIGN = "(no channel)"
 
 @dataclass
 class KeySummary:
-    """Messages, payload bytes and team times [ns] of a key; first_ns ≤ last_ns."""
+    """Messages, payload bytes and team times [ns] of a key."""
 
     key: str
     channel: str
@@ -45,7 +45,7 @@ class Summary(NamedTuple):
     damaged: tuple[str, ...]
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Team time of the first and last measurement, else of any message.
+        """Return the team time of the first and last measurement, else of any message.
 
         Configurations are stamped zero, long before a data set's measurements.
         """

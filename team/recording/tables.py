@@ -1,9 +1,8 @@
-"""Export a log as tables, one per channel with a row per message: CSV, and Parquet for pandas,
-Polars, DuckDB and others.
+"""Export a log as tables, CSV or Parquet, one per channel with a row per message.
 
-Columns: key, counter, wall_ns, then the message's fields. In CSV arrays are exactly readable
-numbers with spaces between, in Parquet lists of numbers. Digests are hexadecimal, lists and tables
-of parts JSON. Parquet needs pyarrow (extra `parquet`), which is imported on call.
+Columns: key, counter, wall_ns, then the message's fields. Arrays are numbers with spaces between in
+CSV, exactly readable, lists in Parquet. Digests are hexadecimal, lists and tables of parts JSON.
+Parquet needs pyarrow (extra `parquet`).
 """
 
 import csv
@@ -55,7 +54,7 @@ class Exported:
     def messages(
         self, log: Log, channels: Collection[Channel] | None
     ) -> Iterator[tuple[Sample, Channel, Message]]:
-        """Valid messages of the channels (None: all), without views; others are counted."""
+        """Yield the valid messages of the channels (None: all), without views; count the others."""
         for sample in log.samples(channels):
             if channel_of(sample.key) is None:
                 continue
@@ -68,18 +67,18 @@ class Exported:
 
 
 def table_of(channel: Channel, message: Message) -> str:
-    """Table name: the channel's, or an alternative message's."""
+    """Return the table name: the channel's, or an alternative message's."""
     kind = type(message)
     return channel.name if kind is channel.message else tag_of(kind).partition("/")[0]
 
 
 def numbers_of(name: str, value: bytes) -> NDArray[Any]:
-    """Numbers in a field's bytes."""
+    """Return the numbers in a field's bytes."""
     return _ARRAYS.get(name, floats)(value, name)
 
 
 def type_of_numbers(name: str) -> str:
-    """NumPy type of a field's numbers."""
+    """Return the NumPy type of a field's numbers."""
     return str(numbers_of(name, b"").dtype)
 
 
@@ -118,7 +117,7 @@ GROUP_BYTES = 32 * 2**20
 
 
 class ParquetTable:
-    """One channel's Parquet file, collected by column and written by row group: memory is bounded.
+    """One channel's Parquet file, written by row group, so memory is bounded.
 
     Raises ImportError without pyarrow.
     """
@@ -187,7 +186,7 @@ def export_tables(
 
 
 def _arrow_type(pa: Any, name: str, kind: object) -> Any:
-    """Column type of a field, by the class under its annotation's bounds."""
+    """Return the column type of a field, by the class under its annotation's bounds."""
     of = getattr(kind, "__origin__", kind)
     if of is bytes and kind != Digest:
         return pa.list_(pa.from_numpy_dtype(type_of_numbers(name)))

@@ -29,7 +29,7 @@ class Tail:
     _keys: dict[int, str | None] = field(default_factory=dict)
 
     def more(self) -> list[Sample]:
-        """Newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
+        """Return newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
         if self.ended or (self.log is None and not self._opened()):
             return []
         assert self.log is not None
@@ -52,7 +52,7 @@ class Tail:
         return found
 
     def _opened(self) -> bool:
-        """Whether the log exists; its header is written at once."""
+        """Return whether the log exists; its header is written at once."""
         if not self.path.exists() or self.path.stat().st_size == 0:
             return False
         try:

@@ -1,8 +1,7 @@
 """Find processes that ended unannounced, so that messages may be missing.
 
 A process publishes the totals of its publications at its end (`Tally`). A killed process does not,
-and its last publications may never have left its machine, unnoticed by counters. Status counters
-start at 0, which separates the lives of a restarted process.
+and counters do not show its last publications if they never left its machine.
 """
 
 from collections import defaultdict
@@ -26,7 +25,7 @@ class LastWords:
     )
     """By node, in order of arrival: counter, wall clock [ns], team time [ns]."""
     _totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
-    """By node, status counts in its processes' final totals, by process start."""
+    """By node and process start, the number of statuses in the process's final totals."""
 
     def take_status(self, node: str, sample: Sample) -> None:
         """Add a node's status."""
@@ -41,7 +40,8 @@ class LastWords:
         self._totals[tally.node][tally.since_ns] = count
 
     def findings(self) -> Iterator[tuple[str, str]]:
-        """Keys and gaps in the record of their processes; empty if no process published totals.
+        """Yield keys and gaps in the record of their processes; none if no process published
+        totals.
 
         Logs of nodes in memory have no totals.
         """

@@ -1,1 +1,1 @@
-"""Messages of ROS 2 as measurements, with no ROS on our side; the one folder that has rosbags."""
+"""Convert ROS 2 messages to measurements, without ROS; the only folder that imports rosbags."""

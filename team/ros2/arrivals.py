@@ -1,11 +1,11 @@
-"""Buffers the messages of a live robot's topics for its driver, and count the lost ones.
+"""Buffer the messages of a live robot's topics for its driver, and count the lost ones.
 
 rmw_zenoh attaches to each publication its publisher's counter and name, in one of two forms:
 
-    "sequence_number" int64 "source_timestamp" int64 "source_gid" bytes     each text and the bytes
-    int64 int64 bytes                                                       behind their length
+  "sequence_number" int64 "source_timestamp" int64 "source_gid" bytes     each text and the bytes
+  int64 int64 bytes                                                       behind their length
 
-A number that is skipped is a message that was lost on its way. A bridge attaches none.
+A skipped number is a lost message. A bridge attaches none.
 """
 
 import struct
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 MOST_WAITING = 100_000
-"""Messages of a topic that wait; beyond them the oldest is dropped, and counted."""
+"""Most waiting messages of a topic; then the oldest is dropped, and counted."""
 MOST_PUBLISHERS = 256
 MOST_SKIPPED = 1_000_000
 """A counter that jumps farther has begun anew, or is no counter."""
@@ -25,7 +25,7 @@ _NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
 
 
 def number_of(attachment: bytes) -> tuple[bytes, int] | None:
-    """A publisher's name and the number of its message; None for anything else."""
+    """Return a publisher's name and the number of its message; None for anything else."""
     if len(attachment) == _NAMED.size:
         *fields, gid = _NAMED.unpack(attachment)
         return (gid, fields[1]) if tuple(fields[::2]) == _NAMES else None
@@ -36,13 +36,13 @@ def number_of(attachment: bytes) -> tuple[bytes, int] | None:
 
 
 def attachment(number: int, stamp_ns: int, gid: bytes) -> bytes:
-    """The attachment of our publication, in the second form; gid: 16 bytes."""
+    """Make the attachment of our publication, in the second form; gid: 16 bytes."""
     return struct.pack("<qqB16s", number, stamp_ns, len(gid), gid)
 
 
 @dataclass
 class Lost:
-    """Number of lost messages by topic; numbered: number of messages with a known counter."""
+    """Number of lost messages by topic; numbered: messages with a known counter."""
 
     count: Counter[str] = field(default_factory=Counter)
     numbered: Counter[str] = field(default_factory=Counter)
@@ -64,7 +64,7 @@ class Lost:
 
 
 class Arrived(NamedTuple):
-    """One message, and its time of arrival by this machine's monotonic clock [s]."""
+    """One message, and its time of arrival by the monotonic clock [s]."""
 
     kind: str
     payload: bytes
@@ -87,7 +87,7 @@ class Backlog:
         queue.append(Arrived(kind, payload, time.monotonic()))
 
     def next_of(self, topic: str) -> Arrived | None:
-        """The oldest message of a topic, which is taken out."""
+        """Remove and return the oldest message of a topic."""
         queue = self.waiting.get(topic)
         return queue.popleft() if queue else None
 

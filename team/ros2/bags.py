@@ -26,11 +26,11 @@ VERSION: Final = 9
 
 
 class BagError(ValueError):
-    """A bag that can not be read; the text names it and the remedy."""
+    """A bag that cannot be read; the text names it and the remedy."""
 
 
 class Topic(NamedTuple):
-    """A topic of a bag: its type, and how many messages it has."""
+    """A topic of a bag: its type, and its number of messages."""
 
     name: str
     kind: str
@@ -38,7 +38,7 @@ class Topic(NamedTuple):
 
 
 class RawMessage(NamedTuple):
-    """One message of a bag, not decoded."""
+    """One encoded message of a bag."""
 
     topic: str
     kind: str
@@ -59,12 +59,14 @@ class Bag:
 
     @property
     def topics(self) -> list[Topic]:
-        """All topics by name."""
+        """Topics by name."""
         found = [Topic(c.topic, c.msgtype, c.msgcount) for c in self._reader.connections]
         return sorted(found)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of these topics in order of arrival; raises BagError for a damaged bag."""
+        """Yield the messages of these topics in order of arrival; raises BagError for a damaged
+        bag.
+        """
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return
@@ -79,12 +81,12 @@ _FAULTS = (AnyReaderError, OSError, ValueError, KeyError, AssertionError)
 
 
 def is_bag(path: Path) -> bool:
-    """True for a file with the suffix of a bag, and for a folder that holds one."""
+    """Return whether a file has the suffix of a bag, or a folder contains one."""
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file() or bool(_parts(path))
 
 
 def _parts(path: Path) -> list[Path]:
-    """The files of a bag whose recorder was killed before it wrote metadata.yaml."""
+    """Return the files of a bag whose recorder was killed before it wrote metadata.yaml."""
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
     inside = sorted(path.iterdir())
@@ -93,7 +95,7 @@ def _parts(path: Path) -> list[Path]:
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """The bag; raises BagError."""
+    """Open a bag; raises BagError."""
     try:
         reader = AnyReader(_parts(path) or [path], default_typestore=types())
         reader.open()
@@ -120,7 +122,7 @@ class NewBag:
         self._connections: dict[str, Connection] = {}
 
     def write(self, topic: str, kind: str, stamp_ns: int, data: bytes, latched: bool) -> None:
-        """Write a message at a time [ns], which is both its log time and its receive time."""
+        """Write a message at a time [ns], both log time and receive time."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=types(), offered_qos_profiles=[_quality(latched)]

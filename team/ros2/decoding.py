@@ -1,4 +1,4 @@
-"""Decode a ROS 2 message (type, CDR bytes) into a frozen record; a pure function.
+"""Decode a ROS 2 message (type, CDR bytes) into a frozen record.
 
 Undecodable bytes, and numbers that are not finite, raise `DamagedError`.
 """
@@ -36,7 +36,7 @@ class OdometryRecord(NamedTuple):
 
 
 class SpeedRecord(NamedTuple):
-    """geometry_msgs/TwistStamped: speeds that hold until the next."""
+    """geometry_msgs/TwistStamped: speeds that hold until the next message."""
 
     stamp_ns: int
     frame: str
@@ -64,9 +64,9 @@ class Transform(NamedTuple):
 
 
 class Tag(NamedTuple):
-    """One detected tag: its name and its position; covariance: of (x, y, z), row by row.
+    """One detected tag: its name and its position; covariance: of (x, y, z), row-major.
 
-    kind: the class that the detector has given it, where that is not its name.
+    kind: its class by the detector, where that is not its name.
     """
 
     name: str
@@ -76,7 +76,7 @@ class Tag(NamedTuple):
 
 
 class TagsRecord(NamedTuple):
-    """The tags that a detector saw at one time, in `frame`."""
+    """The tags of one detection message, in `frame`."""
 
     stamp_ns: int
     frame: str
@@ -86,8 +86,7 @@ class TagsRecord(NamedTuple):
 class FixRecord(NamedTuple):
     """sensor_msgs/NavSatFix: latitude and longitude [deg] of the antenna, whose frame is `frame`.
 
-    degrees: None where the receiver reports no fix. covariance: (xx, xy, yy) [m²], x east and y
-    north; None where it is unknown.
+    degrees: None without a fix. covariance: (xx, xy, yy) [m²], x east and y north; None: unknown.
     """
 
     stamp_ns: int
@@ -110,7 +109,7 @@ FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryErr
 
 
 def decode(kind: str, data: bytes | memoryview, store: Typestore | None = None) -> Record:
-    """The record of a message of this type (`nav_msgs/msg/Odometry`); raises DamagedError.
+    """Decode a message of this type (`nav_msgs/msg/Odometry`); raises DamagedError.
 
     store: the types' definitions, if they are not ours. A type that READERS lacks is a KeyError.
     """
@@ -190,7 +189,7 @@ def _tags(message: Any, tags: Iterable[Tag], frame: str = "") -> TagsRecord:
 
 
 def _tag(name: object, pose: Any, covariance: Any = None) -> Tag:
-    """covariance: 36 numbers of (x, y, z, three angles); all 0: none is claimed."""
+    """covariance: 36 numbers of (x, y, z, three angles); all 0: none is stated."""
     block = None
     if covariance is not None:
         block = _finite(np.asarray(covariance).reshape(6, 6)[:3, :3].ravel())
@@ -198,7 +197,7 @@ def _tag(name: object, pose: Any, covariance: Any = None) -> Tag:
 
 
 def _vision(message: Any) -> TagsRecord:
-    """vision_msgs: a detection's id, else the class of its best hypothesis."""
+    """Read vision_msgs: a detection's id, else the class of its best hypothesis."""
     tags = []
     for each in message.detections:
         best = max(each.results, key=lambda r: r.hypothesis.score, default=None)
@@ -220,7 +219,7 @@ def _isaac(message: Any) -> TagsRecord:
 
 
 def _fix(message: Any) -> FixRecord:
-    """A fix; position_covariance: of (east, north, up), row by row; type 0: unknown."""
+    """position_covariance: of (east, north, up), row-major; type 0: unknown."""
     stamp_ns, frame = _stamp_ns(message.header), message.header.frame_id.lstrip("/")
     if message.status.status < 0:
         return FixRecord(stamp_ns, frame, None, None)
@@ -254,4 +253,3 @@ READERS: Mapping[str, Callable[[Any], Record]] = {
         m, [_tag(each.id, each.pose.pose, each.pose.covariance) for each in m.markers]
     ),
 }
-"""The reader of each message type."""

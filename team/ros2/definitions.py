@@ -37,12 +37,12 @@ DETECTORS = {
     ),
     "aruco_msgs/msg/MarkerArray": _HEADER + "aruco_msgs/Marker[] markers",
 }
-"""Fields of detectors' messages, which no distribution brings."""
+"""Fields of detectors' messages, which no distribution contains."""
 
 
 @cache
 def types() -> Typestore:
-    """All types; a bag that brings definitions of its own is read by those."""
+    """Return all types; a bag's own definitions have precedence."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     found = {}
     for name, text in DETECTORS.items():

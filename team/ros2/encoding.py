@@ -1,4 +1,4 @@
-"""Builds ROS 2 messages of planar poses and landmarks, and encodes them as CDR.
+"""Build ROS 2 messages of planar poses and landmarks, and encode them as CDR.
 
 Covariances are those of (x, y, θ) in the frame of the header; z, roll and pitch are exactly zero.
 """
@@ -15,7 +15,6 @@ from teamslam.team.shapes import Float
 SIGMAS = 2.0
 """Radius of the ellipses in standard deviations: 86 % of a landmark's probability in the plane."""
 HEIGHT_M = 0.1
-"""Height of a landmark's marker [m]."""
 LEAST_AXIS_M = 0.02
 """Least length of an ellipse's axis [m], so that an accurate landmark is visible."""
 _ADD, _DELETE_ALL = 0, 3
@@ -30,7 +29,7 @@ class Names:
     """Topics and frames of one robot.
 
     namespace: begins the robot's topics, as `/alpha`. tf: topic of the transforms. map_frame,
-    odometry_frame, base_frame: frames as in REP 105.
+    odometry_frame, base_frame: as in REP 105.
     """
 
     namespace: str
@@ -40,15 +39,15 @@ class Names:
     base_frame: str = "base_link"
 
     def topic(self, name: str) -> str:
-        """A topic of the robot."""
+        """Return a topic of the robot."""
         return f"{self.namespace.rstrip('/')}/{name}"
 
 
 def names_of(robot: str, odometry: str, odometry_frame: str, base_frame: str) -> Names:
-    """The names of a robot whose odometry comes on this topic.
+    """Choose the names of a robot whose odometry comes on this topic.
 
-    Its topics are beside the odometry's; on the root they are in the namespace of its name. Frames
-    without a prefix in a namespace would be those of every robot, so their transforms are on the
+    Its topics are beside the odometry's; on the root they are in the namespace of its name.
+    Unprefixed frames in a namespace would be those of every robot, so their transforms are on the
     namespace's own `tf`.
     """
     space = "/" + "/".join(odometry.strip("/").split("/")[:-1])
@@ -59,18 +58,18 @@ def names_of(robot: str, odometry: str, odometry_frame: str, base_frame: str) ->
 
 
 def encode(message: Any) -> bytes:
-    """The CDR encoding, little-endian, of a message built by this module."""
+    """Encode a message built by this module as CDR, little-endian."""
     return bytes(types().serialize_cdr(message, message.__msgtype__))
 
 
 def compose(a: Pose, b: Pose) -> Pose:
-    """A ∘ b: pose b, given in the frame of pose a, in the frame of a."""
+    """Compose two poses, a ∘ b: b, given in the frame of a, in the frame of a."""
     c, s = float(np.cos(a[2])), float(np.sin(a[2]))
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], _wrapped(a[2] + b[2])
 
 
 def inverse(a: Pose) -> Pose:
-    """a⁻¹."""
+    """Invert a pose, a⁻¹."""
     c, s = float(np.cos(a[2])), float(np.sin(a[2]))
     return -c * a[0] - s * a[1], s * a[0] - c * a[1], _wrapped(-a[2])
 
@@ -118,7 +117,7 @@ def planar_pose(pose: Pose, z: float = 0.0) -> Any:
 
 
 def covariance_6x6(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "36"]:
-    """A covariance of (x, y) or (x, y, θ) as that of (x, y, z, roll, pitch, yaw), row-major."""
+    """Expand a covariance of (x, y) or (x, y, θ) to (x, y, z, roll, pitch, yaw), row-major."""
     rows = np.array([0, 1, 5][: len(P)])
     whole = np.zeros((6, 6))
     whole[np.ix_(rows, rows)] = P
@@ -175,7 +174,7 @@ def path(stamp_ns: int, frame: str, poses: Iterable[tuple[int, Pose]]) -> Any:
 
 
 def ellipse(P: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
-    """Lengths of the axes [m] of the SIGMAS ellipse, and the direction [rad] of the first one."""
+    """Return the axes' lengths [m] of the SIGMAS ellipse, and the first one's direction [rad]."""
     values, vectors = np.linalg.eigh(P)
     minor, major = (2.0 * SIGMAS * np.sqrt(np.maximum(values, 0.0))).tolist()
     return major, minor, float(np.arctan2(vectors[1, 1], vectors[0, 1]))

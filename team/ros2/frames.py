@@ -9,11 +9,11 @@ from teamslam.team.ros2.decoding import Quaternion, Transform, Vector
 from teamslam.team.shapes import Float
 
 DEEPEST = 32
-"""Transforms between a sensor and its base at the most."""
+"""Most transforms between a sensor and its base."""
 
 
 def rotation_matrix(q: Quaternion) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix of a quaternion (x, y, z, w) of any length above 0."""
+    """Convert a quaternion (x, y, z, w) of any positive length to a rotation matrix."""
     x, y, z, w = np.array(q) / np.linalg.norm(q)
     return np.array(
         [
@@ -25,7 +25,7 @@ def rotation_matrix(q: Quaternion) -> Float[np.ndarray, "3 3"]:
 
 
 def heading(q: Quaternion) -> float:
-    """The yaw of a rotation, in (−π, π]."""
+    """Return the yaw of a rotation, in (−π, π]."""
     x, y, z, w = q
     if x == 0.0 and y == 0.0:
         turned = 2.0 * atan2(z, w)
@@ -43,10 +43,11 @@ SAME_PLACE = 1e-3
 
 @dataclass(frozen=True)
 class Mount:
-    """A sensor's frame → the plane of the robot's sensor: ahead and left, 2 × 3, then a shift.
+    """Map a sensor's frame to the plane of the robot's sensor: (ahead, left) by 2 × 3, then a
+    shift.
 
-    pose: of the robot's sensor on the base; place: where this sensor is, which is the same unless
-    the robot has another sensor that was seen before (`seen_from`).
+    pose: of the robot's sensor on the base. place: of this sensor, the same unless the robot has
+    another sensor (`seen_from`).
     """
 
     pose: Place
@@ -55,14 +56,14 @@ class Mount:
     shift: tuple[float, float] = (0.0, 0.0)
 
     def point(self, position: Vector) -> tuple[float, float]:
-        """Coordinates (ahead, left) in the plane of a position in the sensor's frame."""
+        """Map a position in the sensor's frame to (ahead, left)."""
         if self.plane is BODY and self.shift == (0.0, 0.0):
             return position[0], position[1]
         ahead, left = self.plane @ np.array(position)
         return float(ahead) + self.shift[0], float(left) + self.shift[1]
 
     def seen_from(self, first: "Mount") -> "Mount":
-        """The same sensor, whose points are given from the place of another one."""
+        """Return the same sensor with its points given from another one's place."""
         if self.place == first.pose:
             return self
         (x, y, yaw), (ox, oy, other) = self.place, first.pose
@@ -72,7 +73,7 @@ class Mount:
         return Mount(first.pose, np.array([[c, -s], [s, c]]) @ self.plane, self.place, shift)
 
     def covariance(self, block: tuple[float, ...]) -> tuple[float, float, float]:
-        """Covariance (xx, xy, yy) in the plane from that of (x, y, z)."""
+        """Map a covariance of (x, y, z) to (xx, xy, yy) in the plane."""
         c = self.plane @ np.array(block).reshape(3, 3) @ self.plane.T
         return float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
 
@@ -80,12 +81,12 @@ class Mount:
 BODY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """A frame with x ahead and y left."""
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-"""A camera's, with z ahead and x right."""
+"""A camera's frame, with z ahead and x right."""
 
 
 @dataclass
 class Frames:
-    """The transforms that do not change: each frame's pose in its parent.
+    """Static transforms: each frame's pose in its parent.
 
     moving: the parents of frames whose transforms may change.
     """
@@ -98,7 +99,7 @@ class Frames:
         self.parents[transform.child] = transform
 
     def above(self, frame: str) -> list[str]:
-        """The frame and its ancestors, by transforms of both kinds."""
+        """Return the frame and its ancestors, by transforms of both kinds."""
         found = [frame]
         while len(found) < DEEPEST:
             parent = self.parents[frame].parent if frame in self.parents else self.moving.get(frame)
@@ -110,9 +111,9 @@ class Frames:
     def base_from(
         self, frame: str, base: str
     ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
-        """Rotation and translation from a frame to the base; None where no chain leads there.
+        """Return rotation and translation from a frame to the base; None without a chain.
 
-        The chain goes up to the base, or to an ancestor that both have: base_from_frame =
+        The chain goes up to the base, or to a common ancestor: base_from_frame =
         ancestor_from_base⁻¹ ancestor_from_frame.
         """
         ours, theirs = self._ancestors(frame), self._ancestors(base)
@@ -127,7 +128,9 @@ class Frames:
     def _ancestors(
         self, frame: str
     ) -> dict[str, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-        """The frame and its ancestors, each with the rotation and translation from the frame."""
+        """Return the frame and its ancestors, each with the rotation and translation from the
+        frame.
+        """
         rotation, moved = np.eye(3), np.zeros(3)
         found = {frame: (rotation, moved)}
         while frame in self.parents and len(found) < DEEPEST:
@@ -139,7 +142,7 @@ class Frames:
         return found
 
     def mount(self, frame: str, base: str) -> Mount | None:
-        """Mount of the sensor with this frame; a frame whose z axis is level is a camera's."""
+        """Return the mount of the sensor with this frame; with a level z axis it is a camera's."""
         found = self.base_from(frame, base)
         if found is None:
             return None
@@ -155,7 +158,7 @@ class Frames:
 
 
 def misplaced(here: Place, configured: Place) -> list[str]:
-    """A warning where the frames have the sensor elsewhere than the robot's scenario has it."""
+    """Warn if the frames and the scenario place the sensor differently."""
     turned = remainder(here[2] - configured[2], 2.0 * pi)
     apart = here[0] - configured[0], here[1] - configured[1], turned
     if max(map(abs, apart)) < SAME_PLACE:
@@ -169,7 +172,7 @@ def misplaced(here: Place, configured: Place) -> list[str]:
 
 
 def misplaced_antenna(here: tuple[float, float], configured: tuple[float, float]) -> list[str]:
-    """A warning where the frames have the antenna elsewhere than the robot's scenario has it."""
+    """Warn if the frames and the scenario place the antenna differently."""
     if max(abs(a - b) for a, b in zip(here, configured, strict=True)) < SAME_PLACE:
         return []
     place, other = (", ".join(f"{value:.4g}" for value in each) for each in (here, configured))

@@ -12,19 +12,19 @@ RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
 ESCAPED = "%"
-"""The character for / in the liveliness tokens of rmw_zenoh."""
+"""Stands for / in the liveliness tokens of rmw_zenoh."""
 STATIC = "tf_static"
 MOVING = "tf"
 
 
 def expressions(topics: Iterable[str], domain: int) -> list[str]:
-    """Key expressions to subscribe to, of both kinds."""
+    """Return the key expressions of topics, of both kinds."""
     names = [topic.strip("/") for topic in topics]
     return [*names, *(f"{domain}/{name}/*/*" for name in names)]
 
 
 def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
-    """Topic and type from a key of rmw_zenoh; None for any other key."""
+    """Return topic and type of a key of rmw_zenoh; None for any other key."""
     parts = key.split("/")
     if len(parts) < 4 or parts[0] != str(domain):
         return None
@@ -33,7 +33,7 @@ def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
 
 
 def of_token(key: str) -> tuple[str, str] | None:
-    """Topic and type from the key of a bridge's liveliness token; None for any other key."""
+    """Return topic and type of a bridge's liveliness token; None for any other key."""
     parts = key.split("/")
     if len(parts) < 6 or parts[2:4] != ["@ros2_lv", "MP"]:
         return None
@@ -41,12 +41,12 @@ def of_token(key: str) -> tuple[str, str] | None:
 
 
 def static_topics(odometry: str) -> set[str]:
-    """The topics of a robot's static transforms: /tf_static, and those in its namespaces."""
+    """Return /tf_static and its equivalents in a robot's namespaces."""
     return _in_spaces(odometry, STATIC)
 
 
 def moving_topics(odometry: str) -> set[str]:
-    """The topics of a robot's other transforms: /tf, and those in its namespaces."""
+    """Return /tf and its equivalents in a robot's namespaces."""
     return _in_spaces(odometry, MOVING)
 
 
@@ -56,7 +56,7 @@ def _in_spaces(odometry: str, name: str) -> set[str]:
 
 
 class Publication(NamedTuple):
-    """The keys of one topic that we publish, and the liveliness tokens that announce it.
+    """Keys of one topic that we publish, and the liveliness tokens that announce it.
 
     rmw, bridge: keys for subscribers by rmw_zenoh and behind zenoh-bridge-ros2dds.
     """
@@ -77,14 +77,15 @@ def publication(
     session: str,
     entity: int,
 ) -> Publication:
-    """The keys and tokens of a topic of the node `node` (without namespace) in a Zenoh session.
+    """Return keys and tokens of a topic of the node `node` (without namespace) in a Zenoh session.
 
     rmw_zenoh, docs/design.md: <domain>/<topic>/<type>/<hash>, and the tokens
-    @ros2_lv/<domain>/<session>/<node>/<entity>/{NN,MP}/<enclave>/<namespace>/<node>[/<topic>/<type>
-    /<hash>/<QoS>] with the QoS as reliability:durability:history,depth:deadline:lifespan:liveliness
-    (empty: default). zenoh-plugin-ros2dds: <topic>, and @/<session>/@ros2_lv/MP/<topic>/<type>/
-    <keyless>:<reliability>:<durability>:<history>,<depth>:<user data>. Every topic is reliable;
-    a latched one is transient local with a depth of 1, another one volatile with a depth of 10.
+    @ros2_lv/<domain>/<session>/<node>/<entity>/{NN,MP}/<enclave>/<namespace>/<node>[/<topic>/<type>/<hash>/<QoS>]
+    with the QoS as reliability:durability:history,depth:deadline:lifespan:liveliness (empty:
+    default). zenoh-plugin-ros2dds: <topic>, and
+    @/<session>/@ros2_lv/MP/<topic>/<type>/<keyless>:<reliability>:<durability>:<history>,<depth>:<user
+    data>. Every topic is reliable; a latched one is transient local with a depth of 1, another one
+    volatile with a depth of 10.
     """
     name = topic.strip("/")
     package, _, short = kind.partition("/msg/")

@@ -6,16 +6,14 @@ from teamslam.team.ros2.frames import Frames
 from teamslam.team.ros2.topics import RobotTopics
 
 MOST_FRAMES = 10_000
-"""Frames that are kept at the most."""
 
 
 class Owners:
-    """The robot from whose base each frame hangs.
+    """The robot to whose base each frame is attached.
 
-    trees: the transforms that each robot's topics have. A frame is a robot's if `frames` lists it;
-    else if the first of all robots' base and odometry frames above it is this robot's, or if its
-    transform to this robot's base is rigid. A base or odometry frame that two robots have decides
-    nothing.
+    trees: the transforms on each robot's topics. A frame is a robot's if `frames` lists it; else if
+    the first of all robots' base and odometry frames above it is this robot's, or if its transform
+    to this robot's base is rigid. A base or odometry frame of two robots decides nothing.
     """
 
     def __init__(self, robots: Mapping[str, RobotTopics], trees: Mapping[str, Frames]) -> None:
@@ -28,7 +26,7 @@ class Owners:
         self.shared = frozenset(topic for topic in listed if listed.count(topic) > 1)
 
     def add_odometry(self, robot: str, frame: str, child: str) -> None:
-        """Add the frames of a message of a robot's odometry: `child`'s pose in `frame`."""
+        """Add the frames of a robot's odometry message: `child`'s pose in `frame`."""
         child, frame = child.lstrip("/"), frame.lstrip("/")
         if child not in self._bases[robot] or frame not in self._origins[robot]:
             self._bases[robot].add(child)
@@ -45,11 +43,11 @@ class Owners:
                     self._found.clear()
 
     def forget(self) -> None:
-        """Decide anew: a tree has changed."""
+        """Clear the decisions after a change of a tree."""
         self._found.clear()
 
     def owner(self, frame: str) -> str | None:
-        """The robot that a frame belongs to; None where that is not decided."""
+        """Return the robot of a frame; None: undecided."""
         if frame not in self._found:
             if len(self._found) >= MOST_FRAMES:
                 self._found.clear()
@@ -69,7 +67,7 @@ class Owners:
         return any(tree.base_from(frame, base) is not None for base in bases)
 
     def _only(self, frames: Mapping[str, set[str]]) -> dict[str, str]:
-        """The robot of each frame that one robot alone has."""
+        """Return the robot of each frame that only one robot has."""
         found: dict[str, list[str]] = {}
         for name, each in frames.items():
             for frame in each - {""}:
@@ -77,7 +75,7 @@ class Owners:
         return {frame: names[0] for frame, names in found.items() if len(names) == 1}
 
     def question(self, robot: str, frames: Iterable[str]) -> str:
-        """The text about detections in frames that are not decided, with the remedy."""
+        """Describe detections in undecided frames, with the remedy."""
         named = ", ".join(frame or "(without a name)" for frame in sorted(frames))
         bases = "; ".join(
             f"{name}: {' or '.join(sorted(each))}" for name, each in self._bases.items()

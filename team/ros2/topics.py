@@ -1,4 +1,4 @@
-"""The topics of each robot's odometry, detections, fixes and truth, from a table of a TOML file."""
+"""The topics of each robot's odometry, detections, fixes and truth, from a TOML file."""
 
 import tomllib
 from pathlib import Path
@@ -13,24 +13,24 @@ RobotName = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 
 
 class TopicsError(ValueError):
-    """A file of topics that can not be used; the text names file, place and remedy."""
+    """An unusable file of topics; the text names file, place and remedy."""
 
 
 class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The topics of one robot.
 
-    odometry: nav_msgs/Odometry, of which `use` takes the pose or the speeds (twist), which hold
-    until the next message; geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
+    odometry: nav_msgs/Odometry, whose pose or speeds (twist, valid until the next message) are
+    chosen by `use`; geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
     odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
     child frames are tags. fixes: sensor_msgs/NavSatFix, the antenna's position. truth:
     nav_msgs/Odometry or a pose, for the evaluation.
-    teammates: the tags that robots carry, by the tag's number; landmarks: numbers of tags that are
-    called otherwise; frames: those of its detections, where transforms do not tell whose they are;
-    antenna: its place (ahead, left) on the base, of tf_static if absent;
-    names: whether the id (the class where it is empty) or the class names a
-    detection of vision_msgs. mount: the sensor's pose (x, y, yaw) on the base and
-    optical: whether its frame is a camera's (z ahead, x right); both are of tf_static if absent.
-    types: of topics that come over a bridge which does not tell them.
+
+    teammates: robots by the number of the tag that they carry. landmarks: numbers of tags with
+    other names. frames: those of its detections, where transforms do not assign them. names:
+    whether id (if empty, class) or class names a detection of vision_msgs. By default from
+    tf_static: antenna: its place (ahead, left) on the base; mount: the sensor's pose (x, y, yaw) on
+    the base; optical: its frame is a camera's (z ahead, x right). types: of topics over a bridge
+    that does not announce them.
     """
 
     odometry: str = ""

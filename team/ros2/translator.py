@@ -1,4 +1,4 @@
-"""Translate a robot's ROS 2 messages into its measurements, of a bag and live alike."""
+"""Translate a robot's ROS 2 messages, of a bag or live, into its measurements."""
 
 import re
 from collections import Counter
@@ -23,14 +23,14 @@ from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
 
 TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")
-"""A tag's name: its number, with its family before it (tag36h11:7) or alone."""
+"""A tag's name: its number, alone or after its family (tag36h11:7)."""
 
 NO_DATUM = (
     "a fix, since there is no datum: give [datum] with latitude_deg and longitude_deg in the file "
     "of topics, the same for all robots"
 )
 MOST_NAMED = 20
-"""Frames that are not decided are told apart up to this number."""
+"""Most undecided frames that are named."""
 
 
 class Pose(NamedTuple):
@@ -54,7 +54,7 @@ class Speeds(NamedTuple):
 class Seen(NamedTuple):
     """Landmarks (numbers) or teammates (names) at points (ahead, left) of the sensor.
 
-    covariances: (xx, xy, yy) of each; empty where the detector claims none.
+    covariances: (xx, xy, yy) of each; empty: none are stated.
     """
 
     stamp_ns: int
@@ -76,7 +76,7 @@ Measured = Pose | Speeds | Seen | Position
 
 
 class Translator:
-    """Takes one robot's messages in order of arrival; `dropped` counts those left out, by reason.
+    """Takes one robot's messages in order of arrival; counts those dropped, by reason.
 
     mounts: the sensors' mounts by frame, each from its first detection on. antenna: its place
     (ahead, left) on the base from the first fix on. robot, owners: its name among those that share
@@ -107,7 +107,7 @@ class Translator:
         self._guessed: set[str] = set()
 
     def take(self, topic: str, record: Record) -> list[Measured]:
-        """The measurements of one message of a topic."""
+        """Return the measurements of one message of a topic."""
         topics = self.topics
         found: list[Measured] = []
         if topic == topics.odometry:
@@ -123,11 +123,11 @@ class Translator:
         return found
 
     def links(self, record: TransformsRecord) -> list[tuple[str, str]]:
-        """The (parent, child) of transforms that are no tags'."""
+        """Return the (parent, child) of transforms that are no tags'."""
         return [(t.parent, t.child) for t in record.transforms if not self._is_tag(t)]
 
     def take_static(self, record: TransformsRecord) -> None:
-        """Static transforms; a sensor whose place was not known is looked for again."""
+        """Take static transforms; a guessed mount is determined again."""
         for transform in record.transforms:
             self.frames.take(transform)
         self.owners.forget()
@@ -185,7 +185,7 @@ class Translator:
         return [Position(record.stamp_ns, x, y, record.covariance)]
 
     def _antenna_at(self, frame: str) -> tuple[float, float]:
-        """Place (ahead, left) of the antenna's frame on the base."""
+        """Return the place (ahead, left) of the antenna's frame on the base."""
         topics = self.topics
         if topics.antenna is not None:
             return topics.antenna
@@ -220,11 +220,11 @@ class Translator:
         return transform.child in self.topics.landmarks or bool(TAG.match(transform.child))
 
     def _is_ours(self, frame: str, shared: bool | None) -> bool:
-        """Whether detections in a frame are this robot's.
+        """Return whether detections in a frame are this robot's.
 
-        shared: whether other robots have the topic; None: it has transforms, which may be of robots
-        that the file of topics does not have. If the file has several
-        frames, a frame that hangs from no base is undecided.
+        shared: whether other robots have the topic; None: it has transforms, perhaps of robots that
+        the file of topics lacks. With several frames in the file, a frame that is attached to no
+        base is undecided.
         """
         owner = self.owners.owner(frame)
         if owner == self.robot:
@@ -247,7 +247,7 @@ class Translator:
 
     @property
     def undecided(self) -> set[str]:
-        """The frames whose detections nothing assigns to a robot, and which are left out."""
+        """Frames that nothing assigns to a robot, whose detections are dropped."""
         alone = len(self._unclaimed) == 1 and not (self._is_shared or self._some_decided)
         return set() if alone else self._unclaimed
 
@@ -257,7 +257,7 @@ class Translator:
         return self._some_decided
 
     def question(self) -> str:
-        """The text about the frames that are not decided, with the remedy; empty without any."""
+        """Describe the undecided frames, with the remedy; empty without any."""
         frames = {frame for frame in self._unclaimed if self.owners.owner(frame) is None}
         return self.owners.question(self.robot, frames) if frames and self.undecided else ""
 
@@ -292,7 +292,7 @@ class Translator:
         return found
 
     def _name(self, tag: Tag) -> str:
-        """The name that the file of topics asks for."""
+        """Return the name that the file of topics asks for."""
         if not tag.kind or self.topics.names == "class":
             return tag.kind or tag.name
         if not self._two_names and self._number(tag.name) != self._number(tag.kind) is not None:

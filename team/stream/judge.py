@@ -26,9 +26,7 @@ class StreamJudge:
         self._jumped_ns: int | None = None
 
     def odometry(self, interval: OdometryInterval) -> Rejection | None:
-        """Why an interval is refused: for `Rejection.SPEED` only its motion, otherwise all of
-        it.
-        """
+        """Return why an interval is refused: for `Rejection.SPEED` only its motion is."""
         stamp_ns, duration_ns, moved = interval.end_ns, interval.duration_ns, interval.moved
         if duration_ns == 0:
             return Rejection.NO_TIME
@@ -54,11 +52,11 @@ class StreamJudge:
         return None if sensible else Rejection.SPEED
 
     def time(self, stamp_ns: int) -> Rejection | None:
-        """Why a measurement at this time is refused."""
+        """Return why a measurement at this time is refused."""
         is_ahead = self._now_ns is not None and stamp_ns - self._now_ns > self._jump_ns
         return Rejection.TIME if is_ahead else None
 
     def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Mask of the ranges within the bounds."""
+        """Mask the ranges within the bounds."""
         within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
         return within
