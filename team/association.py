@@ -15,9 +15,8 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Thresholds for merging landmarks without identities; lengths in metres.
 
     LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
-    empirical, chosen with DLR and Victoria Park in view (docs/notes/association-with-undo.md).
-    `tight`, `same` and `slack` are reduced where a map's landmarks stand closer
-    (`teamslam.team.estimation.association.density`).
+    empirical (docs/notes/association-with-undo.md). `tight`, `same` and `slack` are reduced where a
+    map's landmarks stand closer (`estimation.association.density`).
     """
 
     gate: Positive = GATE
@@ -73,8 +72,7 @@ SCALE_M = 0.03
 def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
     """Scale the lengths of the default profile by a sensor's error at the far end of its view.
 
-    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m. In units of it all sensors need the
-    same thresholds.
+    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m.
     """
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)

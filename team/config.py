@@ -60,8 +60,8 @@ Alphas = tuple[NonNegative, NonNegative, NonNegative, NonNegative, NonNegative, 
 class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Motion in one odometry interval, and its noise.
 
-    Odometry that reports a motion on SE(2) is an arc with a lateral part, for every kind; a
-    covariance that comes with it replaces the noise below.
+    A motion on SE(2) reported by odometry is an arc with a lateral part, for every kind; its
+    covariance replaces the noise below.
     """
 
     kind: Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"] = "velocity"
@@ -276,9 +276,9 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Prior scales of the errors shared by all submaps of a robot.
 
-    The prior is Student's t of one degree of freedom: most robots are as well calibrated as the
-    scale, and one that is not may be off by any amount. bearing [rad]; clock_offset [s];
-    range_offset [m]; range_scale, forward_scale: shares of the range and of the distance driven.
+    The prior is Student's t of one degree of freedom: a robot may be off by any amount. bearing
+    [rad]; clock_offset [s]; range_offset [m]; range_scale, forward_scale: shares of the range and
+    of the distance driven.
     """
 
     bearing: Positive = 0.002
@@ -317,8 +317,8 @@ class Gnss(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A receiver of absolute positions (fixes), in the frame of the survey.
 
     antenna: (ahead [m], left [m]) on the robot. delay_s: a fix stamped t is the antenna's position
-    at t − delay_s; the motion at t is taken as constant over the delay. sigma_m: standard deviation
-    of a fix without a covariance, of an error that is independent from one pose node to the next.
+    at t − delay_s. sigma_m: standard deviation of a fix without a covariance, independent from one
+    pose node to the next.
     """
 
     antenna: tuple[float, float] = (0.0, 0.0)

@@ -1,9 +1,8 @@
 """The fault boundary around a node sets messages aside whose handling raises.
 
-Shells, teams in memory and reruns pass messages to their nodes through it, so all of them have the
-same results. A message that raised is published as `Fault`, counted, and ignored when it is
-delivered again; the node continues with the messages of its `set_aside`. An interrupt or an exit
-ends the process.
+Shells, teams in memory and reruns pass messages to their nodes through it, so all have the same
+results. Such a message is published as `Fault`, counted, and ignored when it is delivered again;
+the node continues with the messages of its `set_aside`. An interrupt or an exit ends the process.
 """
 
 import hashlib
@@ -34,7 +33,7 @@ class Handler(Protocol):
     """A handler of messages."""
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Handle one message; returns the answers."""
+        """Handle one message; return the answers."""
 
 
 @runtime_checkable
@@ -50,7 +49,7 @@ class Guarded(Protocol):
     """A handler that refuses messages that contradict its team."""
 
     def refusal(self, message: m.Message) -> str | None:
-        """The reason to refuse a message; None: accepted."""
+        """Return the reason to refuse a message; None: accepted."""
 
 
 @runtime_checkable
@@ -65,9 +64,8 @@ class Recovers(Protocol):
 class Boundary:
     """Pass messages to one node, and count refused messages and exceptions.
 
-    name: name of the node. faults: number of exceptions. refused: number of refused messages. last,
-    last_refused: description of the newest of each. aside: messages that are not handled again, by
-    key and digest.
+    last, last_refused: description of the newest of each. aside: messages that are not handled
+    again, by key and digest.
     """
 
     name: str
@@ -78,7 +76,7 @@ class Boundary:
     aside: set[tuple[str, bytes]] = field(default_factory=set)
 
     def take(self, node: Handler, sample: Sample) -> list[Outgoing]:
-        """Decode a sample and let the node handle it; returns the answers."""
+        """Decode a sample and let the node handle it; return the answers."""
         message = self.let_in(sample, lambda: opened(sample)[2])
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
@@ -91,7 +89,7 @@ class Boundary:
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
-        """Decode a sample; returns its message, or the messages to publish if it is invalid."""
+        """Decode a sample; return its message, or the messages to publish if it is invalid."""
         try:
             return open_()
         except WireError as error:
@@ -103,7 +101,7 @@ class Boundary:
     def hand(
         self, node: Handler, message: m.Message, sample: Sample | None = None
     ) -> list[Outgoing]:
-        """Let the node handle a message; returns the answers, or the fault and the replacement.
+        """Let the node handle a message; return the answers, or the fault and the replacement.
 
         sample: the message as it arrived; None: it is encoded only if its bytes are needed.
         """
@@ -123,7 +121,7 @@ class Boundary:
     def _set_aside(
         self, node: Handler, message: m.Message, sample: Sample, error: Exception
     ) -> list[Outgoing]:
-        """The fault of an exception, and the node's messages in place of its answer."""
+        """Return the fault of an exception, and the node's messages in place of its answer."""
         tag = m.tag_of(type(message))
         out = [self.note(error, sample, tag)]
         self.aside.add(_name(sample))
@@ -141,7 +139,7 @@ class Boundary:
         LOG.warning("%s: dropped %s (%d so far)", self.name, self.last_refused, self.refused)
 
     def note(self, error: Exception, sample: Sample, tag: str) -> Outgoing:
-        """Count and log a fault; returns its message. Re-raises KeyboardInterrupt."""
+        """Count and log a fault; return its message. Re-raises KeyboardInterrupt."""
         if _is_interrupt(error):
             raise KeyboardInterrupt from error
         self.faults += 1
@@ -215,7 +213,7 @@ def place_of(trace: TracebackType | None) -> str:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Whether an exception is an interrupt, or an interrupt caused it."""
+    """Return whether an exception is, or was caused by, an interrupt."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -1,9 +1,8 @@
 """Refuse messages that are valid but contradict the team.
 
 A stranger or a broken robot may send unknown robots, unreachable incarnations and counters, or
-stamps that are years off. The boundary (`teamslam.team.containment`) counts the reason and shows it
-in the node's status; the recorder keeps every message. The bounds are so wide that no order of
-arrival makes a true message fail.
+stamps that are years off. The bounds are so wide that no order of arrival makes a true message
+fail.
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,7 +36,7 @@ class Door:
         self._robots |= {robot}
 
     def refusal(self, message: m.Message) -> str | None:
-        """The reason to refuse a message; None: accepted."""
+        """Return the reason to refuse a message; None: accepted."""
         strangers = sorted(set(_robots(message)) - self._robots)
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
@@ -64,7 +63,7 @@ class Door:
 
 
 def another_time(stamp_ns: int, began_ns: int) -> str | None:
-    """The reason to refuse a stamp of a stream that began at this time; None: accepted."""
+    """Return the reason to refuse a stamp of a stream that began at this time; None: accepted."""
     after_ns = stamp_ns - began_ns
     if -EARLY_NS <= after_ns <= LATE_NS:
         return None
@@ -72,7 +71,7 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 
 
 def absurd(message: m.Message) -> str | None:
-    """The reason to refuse a message with an unreachable count; None: accepted."""
+    """Return the reason to refuse a message with an unreachable count; None: accepted."""
     if (
         m.is_measurement(message)  # most messages are
         and message.incarnation <= MOST_LIVES
@@ -89,7 +88,7 @@ def absurd(message: m.Message) -> str | None:
 
 
 def _robots(message: m.Message) -> Iterator[str]:
-    """The robots that a message claims for the team."""
+    """Yield the robots that a message claims for the team."""
     match message:
         case m.SightingFactor():
             yield message.robot

@@ -33,12 +33,10 @@ os.register_at_fork(after_in_child=_forked)
 class EndQuery:
     """Query the router for the samples that end the team of this process.
 
-    A restarted, stopped or disconnected process receives the end in this way. An end that is older
-    than the process belongs to another run, unless SINCE states an earlier start of the run, or an
-    earlier process of this node took part in that run and ended without a `Tally`.
-
-    ends: channels on which the team ends: the centre's final map, or, without a centre, each
-    robot's own. robot: the robot of interest on the robots' channels; "*": all.
+    An end that is older than the process belongs to another run, unless SINCE states an earlier
+    start of the run, or an earlier process of this node took part in that run and ended without a
+    `Tally`. ends: channels on which the team ends: the centre's final map, or, without a centre,
+    each robot's own. robot: the robot of interest on the robots' channels; "*": all.
     """
 
     def __init__(
@@ -58,7 +56,7 @@ class EndQuery:
         self._began = _STARTED
 
     def missed(self) -> list[Sample]:
-        """The samples that end the team, as their authors published them; queries every FINAL_S."""
+        """Return the samples that end the team, as published; query every FINAL_S."""
         now = time.monotonic()
         if now < self._due:
             return []
@@ -76,7 +74,6 @@ class EndQuery:
         return [sample for reply in replies for sample in self._ending(reply)]
 
     def _ending(self, reply: bytes) -> list[Sample]:
-        """The sample in a reply, if it was requested."""
         try:
             sample = replied(KEPT, "", reply, 0)
         except WireError as error:

@@ -12,17 +12,16 @@ _OURS = re.compile(rf"{US}\[([^\]]+)\]")
 
 
 def install_command(extra: str) -> str:
-    """The command that installs the packages of an extra into the running Python's environment.
+    """Return the command that installs the packages of an extra for the running Python.
 
-    It names the packages, not us: it works in a clone, and from an installed package. Where we are
-    not installed at all, it is for the folder of the clone.
+    It names the packages, not us, to work in a clone and from an installed package.
     """
     packages = [*dict.fromkeys(_packages(extra))] or [f".[{extra}]"]
     return f"{shlex.quote(sys.executable)} -m pip install {' '.join(map(shlex.quote, packages))}"
 
 
 def _packages(extra: str) -> Iterator[str]:
-    """The requirements of an extra, those of the extras that it contains first."""
+    """Yield the requirements of an extra, those of contained extras first."""
     try:
         stated = requires(US) or []
     except PackageNotFoundError:

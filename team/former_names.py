@@ -1,6 +1,4 @@
-"""Former names of settings, with which the scenarios and configurations in logs of that time are
-still read.
-"""
+"""Former names of settings, by which old logs are still read."""
 
 from typing import Any
 
@@ -11,16 +9,16 @@ FIELDS = {
     "landmarks_told": "landmark_form",
     "look_at_start": "observe_at_start",
 }
-"""The former name and today's, of fields of `world` and `central`."""
+"""Fields of `world` and `central`: the former name and today's."""
 GONE = {
     "robust_c": "the join is robust without it: leave it out (under `batch`: batch_robust_c)",
     "outlier_share": "windows reject outliers without it: leave it out",
 }
-"""Settings of `central` and `front_end` that scenario files of that time have, with the remedy."""
+"""Removed settings of `central` and `front_end` in old scenario files, with the remedy."""
 SHARES = ("garbage", "outlier_share")
 """Fields of a robot's `front_end` that have no successor."""
 VALUES = {("outlier_kind", "reading"): "measurement"}
-"""Values that had another name, by today's name of their field."""
+"""Renamed values, by today's name of their field."""
 
 
 def with_current_names(value: Any) -> Any:

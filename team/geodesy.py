@@ -1,12 +1,11 @@
 """Convert between latitude and longitude (WGS84) and the local tangent plane of a datum.
 
-    p(φ, λ) = ((N + h) cos φ cos λ, (N + h) cos φ sin λ, (N (1 − e²) + h) sin φ)
-    N       = a / √(1 − e² sin² φ)
-    (east, north) = E (p(φ, λ) − p(φ₀, λ₀)),  E: the east and north axes at (φ₀, λ₀)
+  p(φ, λ) = ((N + h) cos φ cos λ, (N + h) cos φ sin λ, (N (1 − e²) + h) sin φ)
+  N       = a / √(1 − e² sin² φ)
+  (east, north) = E (p(φ, λ) − p(φ₀, λ₀)),  E: the east and north axes at (φ₀, λ₀)
 
-All points are taken at the datum's height h above the ellipsoid. A height that is wrong by 100 m
-scales the plane by 1.6·10⁻⁵. The plane shortens a distance d from the datum by d³ / 6a²: 4 mm at
-10 km.
+All points have the datum's height h above the ellipsoid; an error of 100 m scales the plane by
+1.6·10⁻⁵. The plane shortens a distance d from the datum by d³ / 6a²: 4 mm at 10 km.
 """
 
 from typing import Annotated
@@ -26,7 +25,7 @@ CONVERGED_M = 1e-6
 
 
 class Datum(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The origin of a local tangent plane on WGS84: x points east, y north.
+    """Origin of a local tangent plane on WGS84: x points east, y north.
 
     height_m: above the ellipsoid.
     """
@@ -37,7 +36,7 @@ class Datum(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _earth_centred(angles: Float[np.ndarray, "n 2"], height_m: float) -> Float[np.ndarray, "n 3"]:
-    """Earth-centred coordinates p [m] of points at (latitude, longitude) [rad]."""
+    """Compute earth-centred coordinates p [m] of points at (latitude, longitude) [rad]."""
     latitude, longitude = angles.T
     s, c = np.sin(latitude), np.cos(latitude)
     N = A_M / np.sqrt(1.0 - E2 * s * s)
@@ -62,8 +61,7 @@ def local_from_geodetic(
 def geodetic_from_local(datum: Datum, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Map (east, north) [m] from the datum to (latitude, longitude) [deg].
 
-    Solves `local_from_geodetic` by Newton's method with the radii of curvature of the meridian and
-    of the parallel. Raises ValueError for points too far away to be on the plane.
+    Newton's method on `local_from_geodetic`. Raises ValueError for points too far away.
     """
     found = np.tile([datum.latitude_deg, datum.longitude_deg], (len(points), 1))
     for _ in range(ROUNDS):

@@ -1,10 +1,8 @@
 """The estimators as a library of functions on arrays, without processes or network.
 
 `from teamslam import …` provides every name listed here. The changelog announces a change of a name
-or its meaning one version ahead.
-
-Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points with
-ids, measured by range [m] and bearing [rad].
+or its meaning one version ahead. Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in
+(−π, π]. Landmarks are points with ids, measured by range [m] and bearing [rad].
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -83,9 +81,8 @@ _INCARNATION = 1
 class Keyframe:
     """The motion since the last keyframe, and the landmarks measured at its end.
 
-    increment: odometry (`increment_of`, `Increment.then`).
-    ids:       ids of the n landmarks; one may occur twice.
-    ranges:    [m], bearings: [rad], as reported by the sensor.
+    increment: odometry (`increment_of`, `Increment.then`). ids: of the n landmarks; one may occur
+    twice. ranges [m], bearings [rad]: as reported by the sensor.
     """
 
     increment: Increment
@@ -114,10 +111,9 @@ class InitialPose:
 class JoinedMap:
     """The team's map.
 
-    landmarks:    means and joint covariance in the common frame.
-    trajectories: each robot's poses at the ends of its submaps, in that frame.
-    chi2, dof:    agreement of the submaps: chi2/dof is about 1 for right models.
-    apart:        robots whose submaps are not in the map, each with the reason.
+    landmarks: means and joint covariance in the common frame. trajectories: each robot's poses at
+    the ends of its submaps. chi2, dof: chi2/dof is about 1 for right models. apart: robots whose
+    submaps are not in the map, each with the reason.
     """
 
     landmarks: LandmarkMap
@@ -131,10 +127,9 @@ class JoinedMap:
 class BatchMap:
     """The least-squares solution over all measurements at once: the batch reference.
 
-    landmarks:    means and joint covariance in the common frame.
-    trajectories: each robot's poses at its start and at its keyframes.
-    chi2, dof:    fit of all measurements: chi2/dof is about 1 for right models.
-    converged:    whether the iterations reached the solution.
+    landmarks: means and joint covariance in the common frame. trajectories: each robot's poses at
+    its start and at its keyframes. chi2, dof: chi2/dof is about 1 for right models. converged:
+    whether the iterations reached the solution.
     """
 
     landmarks: LandmarkMap
@@ -158,6 +153,7 @@ def fastslam_step(
     They are resampled first if their effective number is below `resample_below` times their number.
     proposal: "fastslam2" draws poses given the measurements, "fastslam1" from the odometry alone.
     Raises NotACovarianceError if the increment's covariance is not positive semi-definite.
+
     Montemerlo 2003; Thrun et al. 2005, chapter 13.
     """
     taken = keyframe.calibrated(sensor)
@@ -180,11 +176,12 @@ def submap_of(
     generator: np.random.Generator,
     front_end: FrontEnd | None = None,
 ) -> LocalMap:
-    """Run one window of Hybrid-SLAM; returns the Gaussian over (end pose, landmarks).
+    """Run one window of Hybrid-SLAM; return the Gaussian over (end pose, landmarks).
 
-    The frame is the pose at which the first keyframe's motion begins. The submap depends on its
-    arguments alone, so submaps of consecutive windows are independent. front_end: its rules for
-    closing a window are not used. Raises NotACovarianceError for a degenerate window.
+    The frame is the pose at which the first keyframe's motion begins. Submaps of consecutive
+    windows are independent. front_end: its rules for closing a window are not used. Raises
+    NotACovarianceError for a degenerate window.
+
     Brooks and Bailey 2009, HybridSLAM.
     """
     window = windows.open_window(front_end or FrontEnd(), sensor)
@@ -263,6 +260,7 @@ def batch_map(
 
     robust_c: scale of the Cauchy loss on √χ² of a landmark measurement; None: plain least squares.
     Raises ValueError for a robot without an initial pose.
+
     Dellaert and Kaess 2006, Square root SAM.
     """
     solve = loaded("teamslam.sim.studies.batch_map:solved_map", "batch_map")
@@ -272,17 +270,14 @@ def batch_map(
 def submap_in(payload: bytes) -> tuple[str, int, LocalMap]:
     """Decode (robot, sequence, submap) from a message on a key `team/…/robot/…/submap`.
 
-    Raises WireError with the reason for any other bytes.
+    Raises WireError for any other bytes.
     """
     message = decoded(payload, m.Submap)
     return message.robot, message.sequence, translate.local_map_of(message)
 
 
 def submaps_in(log: Log | Path | str) -> dict[str, list[LocalMap]]:
-    """Read each robot's submaps in their order from a log: those of its first incarnation.
-
-    Raises LogError for a file that is no log.
-    """
+    """Read each robot's submaps of its first incarnation from a log. Raises LogError."""
     opened = log if isinstance(log, Log) else open_log(log)
     found: dict[str, dict[int, LocalMap]] = {}
     for sample in opened.samples([ch.SUBMAP]):

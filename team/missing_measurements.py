@@ -52,7 +52,7 @@ class MissingMeasurements:
                 self.ask(each)
 
     def ask(self, requested: m.MeasurementsRequest) -> int:
-        """Send one request; returns the number of measurements that the node has received."""
+        """Send one request; return the number of measurements received."""
         try:
             replies = self._shell.bus.ask(
                 ch.MEASUREMENTS, requested.robot, requested, ASK_TIMEOUT_S

@@ -1,4 +1,4 @@
-"""Where poses of odometry begin anew, so that their difference is no motion."""
+"""Bounds by which a jump of odometry poses is a reset, not a motion."""
 
 RESET_M, RESET_TIMES, USUAL_M_S, LEAST_STEPS = 0.5, 20.0, 0.25, 10
 """A reset of odometry poses: least length [m], speed beside the usual one, which is taken to be as

@@ -1,7 +1,7 @@
-"""The table of estimators and fusion rules, one row each, and which estimator may feed which rule.
+"""The table of estimators and fusion rules, and which estimator may feed which rule.
 
-A row names its class as `package.module:name`, found by `teamslam.team.registry` when it is chosen,
-so the methods for comparison can be left out of an installation.
+A row names its class as `package.module:name`, loaded when it is chosen (`team.registry`), so the
+methods for comparison can be left out of an installation.
 """
 
 from collections.abc import Mapping
@@ -15,9 +15,7 @@ maps. measurements: the sensor channels; the robots' estimators are then for the
 
 class EstimatorRow(NamedTuple):
     """made_by: a `teamslam.sim.studies.robots.estimator.Factory`; of `hybrid` its mapper. feeds:
-    rules, beside those that name it.
-
-    needs_map: it is given a prior map.
+    rules, beside those that name it. needs_map: it is given a prior map.
     """
 
     made_by: str
@@ -27,9 +25,7 @@ class EstimatorRow(NamedTuple):
 
 class RuleRow(NamedTuple):
     """made_by: a `teamslam.central.node.CentralNode`. takes: its estimators, beside those that name
-    it.
-
-    feedback: the robots absorb its map again, in lockstep.
+    it. feedback: the robots absorb its map again, in lockstep.
     """
 
     made_by: str
@@ -88,20 +84,18 @@ PAIRS: Mapping[tuple[str, str], Channel] = MappingProxyType(
         if estimator in RULES[rule].takes or rule in row.feeds
     }
 )
-"""(estimator, rule) → the inputs of the centre. Any other pair has no meaning: only
-`hybrid` makes submaps and can absorb a joint map, the thesis' estimator can absorb one per axis,
-and a robot that only localises has no map to fuse."""
+"""(estimator, rule) → the inputs of the centre. Only `hybrid` makes submaps and can absorb a joint
+map, the thesis' estimator can absorb one per axis, and a robot that only localises has no map.
+"""
 FEEDBACK = frozenset(rule for rule, row in RULES.items() if row.feedback)
-"""The rules whose map the robots absorb again, in lockstep."""
 NEEDS_MAP = frozenset(name for name, row in ESTIMATORS.items() if row.needs_map)
-"""The estimators that are given a prior map."""
 
 
 def rules_for(estimator: str) -> list[str]:
-    """The rules that an estimator can feed."""
+    """Return the rules that an estimator can feed."""
     return [rule for each, rule in PAIRS if each == estimator]
 
 
 def named_pairs() -> str:
-    """The valid pairs as a user writes them: `hybrid + join, …`."""
+    """Format the valid pairs as `hybrid + join, …`."""
     return ", ".join(f"{estimator} + {rule}" for estimator, rule in PAIRS)

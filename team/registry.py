@@ -10,7 +10,7 @@ class NotInstalledError(Exception):
 
 
 def is_installed(place: str) -> bool:
-    """Whether the module of `package.module:name` is installed, without importing it."""
+    """Return whether the module of `package.module:name` is installed, without importing it."""
     module = place.partition(":")[0]
     package, _, _ = module.rpartition(".")
     try:
@@ -20,7 +20,7 @@ def is_installed(place: str) -> bool:
 
 
 def absence(place: str, what: str) -> str | None:
-    """The reason why `what` is not available; None: it is installed."""
+    """Return the reason why `what` is not available; None: it is installed."""
     if is_installed(place):
         return None
     return f"{what} is not installed: {place.partition(':')[0]} is not here"

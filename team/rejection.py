@@ -4,9 +4,8 @@ from enum import StrEnum
 
 
 class Rejection(StrEnum):
-    """A reason for rejection, as spelt by the ledger, `Done` and `teamslam verify-ledger`.
-
-    The ledger counts by `disposition`. A measurement without a rejection was used.
+    """A reason to reject a measurement, as spelt by the ledger, `Done` and `teamslam
+    verify-ledger`.
     """
 
     OLDER = "older than the odometry"
@@ -28,10 +27,9 @@ class Rejection(StrEnum):
     NO_TEAMMATES = "sightings and fixes are not used by this estimator"
     NO_NODES = "sightings and fixes need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"
-    """No pose node is near the time of the inter-robot measurement."""
     LATE = "counted in a window that ends before its stamp"
     UNSOLVED = "its window has no solution"
-    """The window has no solution; its submap has the odometry's motion alone."""
+    """The submap has the odometry's motion alone."""
     SET_ASIDE = "its handling raised"
 
     @property

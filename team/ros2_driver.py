@@ -286,7 +286,7 @@ class Ros2Driver:
 
     @property
     def mounts(self) -> list[tuple[float, float, float]]:
-        """Assumed poses of the sensor (x [m], y [m], yaw [rad]); empty before the first detection."""
+        """Assumed poses of the sensor (x [m], y [m], yaw [rad]); empty before a detection."""
         return list(dict.fromkeys(mount.pose for mount in self._translator.mounts.values()))
 
     def _note(self, reason: str, detail: str = "") -> None:

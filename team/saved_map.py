@@ -1,8 +1,4 @@
-"""A saved map as a file, and as a submap of the team's set.
-
-The file is one message (`teamslam.team.wire.messages.SavedMap`), checked when it is read as on the
-wire.
-"""
+"""A saved map as a file, and as a submap of the team's set."""
 
 import math
 import re
@@ -54,8 +50,8 @@ def write_map(path: Path, saved: m.SavedMap) -> None:
 def submap_of(saved: m.SavedMap) -> m.Submap:
     """Make the submap of a saved map: landmarks only, before the team's time.
 
-    Its end pose lies at its start, with a small covariance of its own, which no landmark and no
-    other submap depends on. All its unnamed landmarks count as seen at once: no two are one.
+    Its end pose lies at its start, with a small covariance of its own. All its unnamed landmarks
+    count as seen at once: no two are one.
     """
     n = 2 * len(ids(saved.ids, "ids"))
     submap = member_of(
@@ -131,8 +127,10 @@ def map_name(text: str) -> str:
 
 
 def map_figures(saved: m.SavedMap) -> dict[str, Any]:
-    """Figures of a saved map for people and JSON: provenance, the robots' own errors, and each
-    landmark with its own standard deviations, the shared errors taken as zero.
+    """Return figures of a saved map for people and JSON.
+
+    Provenance, the robots' own errors, and each landmark with its standard deviations, the shared
+    errors taken as zero.
     """
     numbers = ids(saved.ids, "ids").tolist()
     points = floats(saved.means, "means").reshape(-1, 2).tolist()

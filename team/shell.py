@@ -61,8 +61,8 @@ REMIND_S = 10.0
 WAIT_S = 0.05
 """Time [s] that a shell waits for input before it turns to its other duties."""
 RECORDER_S = 30.0
-"""Time [s] for which a finished process stays for an absent recorder, or for one that makes no
-progress."""
+"""Time [s] for which a finished process stays for a recorder that is absent or makes no progress.
+"""
 BACK_S = 1.5
 """Time [s] in which a returned recorder fetches missed messages from the publishers' caches."""
 RECORDER = "recorder"
@@ -86,7 +86,7 @@ class Node(Protocol):
         """Return the node's first messages."""
 
     def handle(self, message: Message, now_ns: int) -> list[Outgoing]:
-        """Handle one message; returns the answers."""
+        """Handle one message; return the answers."""
 
     def status(self) -> Status:
         """Return the node's status."""
@@ -120,8 +120,8 @@ def lacking(final: FusedMap) -> str:
 class Shell:
     """Run one node on one bus; ends: channels on which the node's team ends.
 
-    A refused message is counted, logged with the reason and dropped. A message whose handling
-    raises is set aside (`teamslam.team.containment`), and the node continues.
+    A refused message is counted, logged and dropped. A message whose handling raises is set aside
+    (`teamslam.team.containment`).
     """
 
     def __init__(
@@ -159,10 +159,7 @@ class Shell:
         self._stale = False
 
     def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
-        """Publish `refresh()` after input, while no more waits, for at most `share` of the time.
-
-        A fresh result is worth most, so it is not delayed until the next regular one.
-        """
+        """Publish `refresh()` after input, while no more waits, for at most `share` of the time."""
         self._refresh, self._spare_time = refresh, SpareTime(share)
 
     def receive(self) -> list[Sample]:
@@ -196,10 +193,7 @@ class Shell:
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish a node's messages in order; a failed publication is a fault.
-
-        Requests are sent as queries; their replies arrive like other samples.
-        """
+        """Publish a node's messages in order, and send its requests; a failure is a fault."""
         for outgoing in out:
             try:
                 if outgoing.channel in QUERIES:
@@ -293,8 +287,8 @@ class Shell:
         """Wait until a recorder has reported all messages that this process published.
 
         Only the publisher can repeat its messages. The wait ends if no recorder is present for
-        RECORDER_S, or if a present one makes no progress for RECORDER_S after a report. lacks:
-        whether the recorder lacks anything else. take: handles other samples meanwhile.
+        RECORDER_S, or if it makes no progress for RECORDER_S. lacks: whether the recorder lacks
+        anything else. take: handles other samples meanwhile.
         """
         if self._recorder_is_there is None:
             return
@@ -321,7 +315,6 @@ class Shell:
                 take([sample for sample in samples if sample.key != RECORDED.key(self._name)])
 
     def _is_recorded(self, lacks: Callable[[], bool]) -> bool:
-        """Whether the recorder has all messages of this process."""
         if not self._recorder_is_there or lacks():
             return False
         if self._totals is not None:
@@ -400,9 +393,9 @@ def process(
 ) -> Iterator[threading.Event]:
     """Run a process of a team until SIGTERM, SIGINT or its parent's death.
 
-    A process stopped before its work is done exits with 128 + the signal's number; an `endless`
-    one exits with 0. The kernel ends it LAST_S after the first signal; a `patient` process, which
-    has to deliver its data, after the second one.
+    A process stopped before its work is done exits with 128 + the signal's number; an `endless` one
+    with 0. The kernel ends it LAST_S after the first signal; a `patient` process, which has to
+    deliver its data, after the second one.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()

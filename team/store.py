@@ -1,10 +1,8 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
 
-The set holds submaps, the inter-robot measurements from them, initial poses, orders that withdraw a
-robot, an operator's verdicts on landmarks, and saved maps of earlier days. A submap is complete
-when all inter-robot measurements that it announces are stored. Admission enforces law 1: a submap
-whose measurements overlap another's, or that differs from a stored one of the same name, is refused
-with the reason. Centre, peers and verification use the same class.
+A submap is complete when all inter-robot measurements that it announces are stored. Admission
+enforces law 1: a submap whose measurements overlap another's, or that differs from a stored one of
+the same name, is refused with the reason.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,9 +43,7 @@ class StoredStream:
             self.chain.append(submap)
 
     def processed(self, count: int) -> int:
-        """`count`, or more if the next submap was refused: then all later ones count, since none
-        can enter the map.
-        """
+        """Return `count`, or more if the next submap was refused: no later one enters the map."""
         if count not in self.refused:
             return count
         return max(*self.refused, *self.submaps, count) + 1
@@ -60,9 +56,8 @@ class SubmapStore:
     """The members of the team's set, each in one place.
 
     chains: the submaps available to a map, of streams with an initial pose; they grow in place.
-    maps: the saved maps of earlier days, by name. withdrawals: an operator's first order on each
-    withdrawn robot. verdicts: those in force, with their landmarks in order. refused: number of
-    refused members.
+    maps: saved maps, by name. withdrawals: the first order on each withdrawn robot. verdicts: those
+    in force, with their landmarks in order. refused: number of refused members.
     """
 
     def __init__(self) -> None:
@@ -104,7 +99,7 @@ class SubmapStore:
         self._note_chain(key)
 
     def add_submap(self, submap: m.Submap) -> str | None:
-        """Add a submap; return the reason if it is refused. A stored submap is accepted again."""
+        """Add a submap; return the reason if it is refused."""
         return self._settle(submap, self._refusal_of_submap(submap))
 
     def add_sighting(self, sighting: m.SightingFactor) -> str | None:
@@ -123,9 +118,8 @@ class SubmapStore:
     def add_map(self, saved: m.SavedMap) -> str | None:
         """Add a saved map as a stream of one submap; return the reason if it is refused.
 
-        Its start is unknown, or the origin if its frame is the survey's.
-
-        Law 1: two maps with a stream in common would count its measurements twice.
+        Its start is unknown, or the origin if its frame is the survey's. Two maps with a stream in
+        common would count its measurements twice (law 1).
         """
         for other in self.maps.values():
             if other.name != saved.name and {*other.sets} & {*saved.sets}:
@@ -176,8 +170,7 @@ class SubmapStore:
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
         """Store a submap, or return the reason for its refusal.
 
-        Law 1: each measurement is used once. The measurements of the nearest submaps in sequence
-        bound those of this one.
+        The measurements of the nearest submaps in sequence bound those of this one (law 1).
         """
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
@@ -231,18 +224,18 @@ class SubmapStore:
     # Contents.
 
     def chain(self, stream: Stream) -> Sequence[m.Submap]:
-        """The complete submaps of a stream from sequence 0 on; the sequence grows with the set."""
+        """Return the complete submaps of a stream from sequence 0 on; they grow with the set."""
         return self.streams.get(stream, _EMPTY).chain
 
     def start(self, stream: Stream) -> m.InitialPose:
-        """The initial pose of a stream of `chains`."""
+        """Return the initial pose of a stream of `chains`."""
         start = self.streams[stream].start
         assert start is not None
         return start
 
     @property
     def newcomers(self) -> set[Stream]:
-        """The streams that have begun at an unknown pose and have no submap yet."""
+        """Streams that have begun at an unknown pose and have no submap yet."""
         return {
             key
             for key, stream in self.streams.items()
@@ -250,18 +243,18 @@ class SubmapStore:
         }
 
     def sightings(self, submap: m.Submap) -> list[m.SightingFactor]:
-        """The inter-robot measurements from a submap, by stamp and teammate."""
+        """Return the inter-robot measurements from a submap, by stamp and teammate."""
         stream = self.streams.get((submap.robot, submap.incarnation), _EMPTY)
         found = stream.sightings.get(submap.sequence, {})
         return [found[key] for key in sorted(found)]
 
     def acknowledged(self, stream: Stream) -> int:
-        """Number of submaps of a stream that its robot need not send again: stored or refused."""
+        """Count the submaps of a stream that its robot need not send again: stored or refused."""
         found = self.streams.get(stream, _EMPTY)
         return found.processed(len(found.chain))
 
     def processed(self, stream: Stream) -> int:
-        """Number of submaps of a stream that a map can have, or will never have."""
+        """Count the submaps of a stream that a map can have, or will never have."""
         found = self.streams.get(stream, _EMPTY)
         return found.processed(0 if found.start is None else len(found.chain))
 
@@ -281,7 +274,7 @@ class SubmapStore:
         return len(self.verdicts | self._revoked) + len(self._revoked)
 
     def missing(self) -> tuple[m.VersionEntry, ...]:
-        """The first missing submap of each stream with later ones."""
+        """Return the first missing submap of each stream with later ones."""
         gaps = []
         for robot, incarnation in sorted(self._with_gap):
             stream = self.streams[robot, incarnation]
@@ -293,8 +286,7 @@ class SubmapStore:
         return tuple(gaps)
 
     def messages_of(self, robot: str) -> Iterator[m.Message]:
-        """Iterate over the messages from which a robot's next process continues, latest incarnation
-        first.
+        """Yield the messages from which a robot's next process continues, latest incarnation first.
 
         These are the initial pose, the chain and the inter-robot measurements from it.
         """

@@ -45,9 +45,7 @@ def frame_name(robot: str, incarnation: int) -> str:
 
 
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
-    """Read the initial pose and its covariance; pose None: unknown; covariance None: exactly
-    known.
-    """
+    """Read the initial pose (None: unknown) and its covariance (None: exactly known)."""
     pose = floats(message.pose, "pose").copy() if message.pose else None
     covariance = (
         floats(message.covariance, "covariance").reshape(3, 3).copy()
@@ -68,7 +66,7 @@ def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
 
 
 def scan_of(message: m.AnyScan | m.Detections) -> Scan:
-    """Read the observed landmarks, in the machine's byte order; points become range and bearing.
+    """Read the observed landmarks; points become range and bearing.
 
     Detections without identities have the numbers 2³¹ + their index in the message, until their
     window associates them.
@@ -89,10 +87,7 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
 
 
 def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
-    """Compute a measurement's team time [ns]; for an odometry interval that of its end.
-
-    An interval that the odometry's clock stamps t ends at t + clock_offset_s.
-    """
+    """Compute a measurement's team time [ns]; for an odometry interval that of its end."""
     offset_s = clock_offset_s if isinstance(message, m.AnyOdometry) else 0.0
     return message.stamp_ns + round(offset_s * 1e9)
 
@@ -118,7 +113,7 @@ def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval
 def detections_of(
     message: m.Sightings,
 ) -> tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Read (teammates, ranges [m], bearings [rad]) in the machine's byte order."""
+    """Read (teammates, ranges [m], bearings [rad])."""
     return (
         message.teammates,
         floats(message.ranges, "ranges").astype(np.float64),
@@ -137,9 +132,7 @@ def submap_message(
     sightings: int = 0,
     gated: int = 0,
 ) -> m.Submap:
-    """Make the message of a local map, with the names of its inputs and the numbers of its
-    inter-robot measurements and gated landmarks.
-    """
+    """Make the message of a local map."""
     return m.Submap(
         stamp_ns=span_ns[1],
         robot=robot,
@@ -168,7 +161,7 @@ def submap_message(
 
 
 def local_map_of(message: m.Submap) -> LocalMap:
-    """The local map in a submap message."""
+    """Read the local map of a submap message."""
     mean = floats(message.mean, "mean").astype(np.float64)
     return LocalMap(
         ids(message.ids, "ids").astype(np.uint32),
@@ -274,7 +267,7 @@ def pose_message(
 ) -> m.PoseEstimate:
     """Make the message of a pose; its covariance is made exactly symmetric.
 
-    frame: named as in `FusedMap.frame`; in_team_frame: whether it is the team's.
+    frame: as in `FusedMap.frame`; in_team_frame: whether it is the team's.
     """
     rows = covariance.tolist()  # so few numbers are added sooner one by one
     symmetric = [0.5 * (rows[i][j] + rows[j][i]) for i in range(3) for j in range(3)]
@@ -302,7 +295,7 @@ def block_bytes(blocks: Float[np.ndarray, "L 2 2"]) -> bytes:
 
 
 def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
-    """The 2 × 2 diagonal blocks of a joint landmark covariance."""
+    """Return the 2 × 2 diagonal blocks of a joint landmark covariance."""
     n = len(covariance) // 2
     grid = covariance.reshape(n, 2, n, 2)
     return grid[np.arange(n), :, np.arange(n), :]
@@ -314,7 +307,7 @@ def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
 
 
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
-    """The joint 2L × 2L covariance; block-diagonal where the message contains blocks only."""
+    """Return the joint 2L × 2L covariance; block-diagonal where the message has blocks only."""
     n = len(ids(message.ids, "ids"))
     values = floats(message.covariance, "covariance")
     if message.joint:
@@ -326,7 +319,7 @@ def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
 
 
 def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray, "L 2 2"]:
-    """The 2 × 2 covariance of each landmark."""
+    """Return the 2 × 2 covariance of each landmark."""
     return landmark_blocks(message.covariance, len(message.ids) // 4, joint=message.joint)
 
 
@@ -338,8 +331,8 @@ NAMED = 10
 def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
     """Reduce the map to a form that every receiver accepts; describe the omissions.
 
-    A joint covariance that is not positive definite by rounding is replaced by the landmarks' own
-    ones; a landmark with an invalid own covariance, or a mean that is not finite, is omitted.
+    A joint covariance that is not positive definite by rounding is replaced by the landmarks' own;
+    a landmark with an invalid covariance or mean is omitted.
     """
     warnings = []
     if message.joint and unsound(message) is not None:
@@ -371,7 +364,7 @@ def _with_sound_landmarks(message: LandmarkMap) -> tuple[LandmarkMap, list[int]]
 def landmarks_of(
     message: m.MapEstimate | m.FusedMap | m.TruthLandmarks | m.KnownMap,
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Identities and positions [m] of a map message."""
+    """Read identities and positions [m] of a map message."""
     if isinstance(message, m.TruthLandmarks | m.KnownMap):
         values = message.positions
     else:
@@ -395,9 +388,7 @@ def prior_message(
     received: int = 0,
     withdrawn: int = 0,
 ) -> m.Prior:
-    """Make the message of a robot's prior: the joint marginal of its last fused end pose and the
-    landmarks in the team's frame, with the members of the set that it contains.
-    """
+    """Make the message of a robot's prior, in the team's frame."""
     return m.Prior(
         stamp_ns=stamp_ns,
         robot=robot,
@@ -423,7 +414,7 @@ def prior_message(
 
 
 def prior_of(message: m.Prior) -> RobotPrior:
-    """Read the prior for the robot's conditioning; one of landmarks alone has the pose zero."""
+    """Read the prior; one of landmarks alone has the pose zero."""
     mean = floats(message.mean, "mean").astype(np.float64)
     covariance = unpacked(floats(message.covariance, "covariance"), len(mean))
     if not message.in_team_frame:
@@ -441,9 +432,7 @@ def landmark_prior_message(
     landmarks: LandmarkGaussian,
     frame: Stream | None,
 ) -> m.Prior:
-    """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one in
-    the robot's own.
-    """
+    """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one."""
     of_team = frame is not None and len(landmarks.ids) > 0
     return m.Prior(
         stamp_ns=fused.stamp_ns,

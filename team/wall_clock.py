@@ -1,7 +1,6 @@
 """Detect a step of the wall clock, as on a computer whose clock has no battery.
 
-Such a computer starts in the past until it reaches a time server. The ages of files that were
-written before the step are wrong by it.
+Such a computer starts in the past; the ages of files written before the step are wrong by it.
 """
 
 import time
@@ -15,7 +14,7 @@ STEP_S = 60.0
 
 
 def wall_clock() -> dict[str, str]:
-    """The boot's id, and the wall clock minus the time since boot [s]; empty: not available."""
+    """Return the boot's id, and wall clock minus time since boot [s]; empty: unavailable."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
         offset_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
@@ -25,7 +24,7 @@ def wall_clock() -> dict[str, str]:
 
 
 def was_set_since(then: Mapping[str, str]) -> bool:
-    """Whether the wall clock was set since `wall_clock` returned `then`, in the same boot."""
+    """Return whether the wall clock was set since `then`, in the same boot."""
     now = wall_clock()
     if not now or then.get(BOOT) != now[BOOT]:
         return False

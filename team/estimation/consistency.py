@@ -1,4 +1,4 @@
-"""Consistency tests of covariances: normalised squared errors and their intervals.
+"""Consistency of covariances: normalised squared errors and their intervals.
 
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.
 """
@@ -24,18 +24,14 @@ FEW = 600
 def state_error(
     estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's wrapped to (−π, π]."""
+    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
     error: Float[np.ndarray, " n"] = estimate - truth
     error[2] += 2.0 * np.pi * np.floor((np.pi - error[2]) / (2.0 * np.pi))
     return error
 
 
 def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> float:
-    """Compute the normalised estimation error squared, eᵀ P⁻¹ e: χ² with n degrees of freedom, mean
-    n.
-
-    Raises NotACovarianceError if P is not a covariance.
-    """
+    """Compute eᵀ P⁻¹ e, χ² with n degrees of freedom. Raises NotACovarianceError."""
     L = cholesky_factor(covariance, "an estimation error")
     whitened = dense.forward(L, error)
     return float(dense.product(whitened, whitened))
@@ -46,7 +42,7 @@ def chi2_limit(dof: int, tail: float) -> float:
     """Compute the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
     Rounded to twelve digits. For few degrees of freedom by bisection of the finite sum (Abramowitz
-    & Stegun 26.4.4 and 26.4.5), for more by the core.
+    & Stegun 26.4.4 and 26.4.5).
     """
     if dof > FEW:
         return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
@@ -88,7 +84,7 @@ def chi2_quantile(
 def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float]:
     """Compute the two-sided interval of the mean over `runs` of NEES/dof with this probability.
 
-    The sum of `runs` independent χ² of `dof` degrees of freedom is χ² with dof·runs of them.
+    The sum of the runs is χ² with dof·runs degrees of freedom.
     """
     tail = 0.5 * (1.0 - probability)
     total = dof * runs
@@ -103,10 +99,10 @@ def coverage(
 
 
 class Scale(NamedTuple):
-    """The factor that the covariances need to agree with the observed errors.
+    """Factor that the covariances need to agree with the observed errors.
 
-    value: 1 for correct covariances; 2: they are half as large as the errors require.
-    log_sigma: about one standard deviation of its logarithm.
+    value: 1 for correct covariances; 2: they are half as large as required. log_sigma: about one
+    standard deviation of its logarithm.
     """
 
     value: float
@@ -118,13 +114,10 @@ def covariance_scale(
     dof: Float[np.ndarray, " K"],
     medians: Float[np.ndarray, " K"] | None = None,
 ) -> Scale | None:
-    """Estimate the scale s such that half of the terms, by degrees of freedom, lie below s times
-    their median.
+    """Estimate the scale s of terms s χ²(dof): the weighted median of squared_k / median χ²(dof_k).
 
-    Each term is s χ² with dof degrees of freedom, so median_k(squared_k / median χ²(dof_k)) is s.
-    It changes with all covariances alike and is insensitive to a few outliers, however large. Terms
-    with less than one degree of freedom are left out; None where none is left. medians: median
-    χ²(dof) of each term, if available.
+    It is insensitive to a few outliers, however large. Terms with less than one degree of freedom
+    are left out; None where none is left. medians: of χ²(dof), if available.
     """
     judged = dof >= 1.0
     if not judged.any():

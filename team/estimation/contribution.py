@@ -1,4 +1,4 @@
-"""The contents of the team's map: submaps with their place in the set, and initial poses."""
+"""Contents of the team's map: submaps with their place in the set, and initial poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -28,18 +28,18 @@ RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
         "range_scale": 1,
     }
 )
-"""The power of a landmark's range with which each bias moves it; -1: it moves none."""
+"""Power of a landmark's range with which each bias moves it; −1: it moves none."""
 UNIX_S = 1e9
 """Team times from here on [s] are Unix times (2001)."""
 
 
 def is_map(stream: Stream) -> bool:
-    """Whether a stream is the saved map of an earlier day."""
+    """Return whether a stream is the saved map of an earlier day."""
     return stream[0].startswith(MAP)
 
 
 SURVEYED: Stream = (SURVEY, 0)
-"""The stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
+"""Stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
 
 
 STATION: Stream = (GNSS, 0)
@@ -47,7 +47,7 @@ STATION: Stream = (GNSS, 0)
 
 
 def is_absolute(stream: Stream) -> bool:
-    """Whether a stream is of absolute positions: the surveyed landmarks or the fixes' station."""
+    """Return whether a stream has absolute positions."""
     return stream in (SURVEYED, STATION)
 
 
@@ -58,8 +58,7 @@ PART = 1 << 64
 def part_of(stream: Stream, first: int) -> Stream:
     """Name the part of a stream from submap `first` on, after a cut (`continuity`).
 
-    A fold treats it as an incarnation of its own: the stream is broken there. Submaps keep their
-    sequence numbers.
+    A fold treats it as an incarnation of its own. Submaps keep their sequence numbers.
     """
     return stream[0], stream[1] % PART + first * PART
 
@@ -70,7 +69,7 @@ def whole_of(stream: Stream) -> Stream:
 
 
 def first_of(stream: Stream) -> int:
-    """Sequence number of the first submap of a stream or part."""
+    """Return the sequence number of the first submap of a stream or part."""
     return stream[1] // PART
 
 
@@ -88,7 +87,7 @@ def named(stream: Stream) -> str:
 
 
 def moment(stamp_ns: int) -> str:
-    """Word a team time: seconds, or the time of day (UTC) if it is Unix time."""
+    """Format a team time: seconds, or the time of day (UTC) if it is Unix time."""
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.1f} s"
@@ -96,10 +95,7 @@ def moment(stamp_ns: int) -> str:
 
 
 class Observation(NamedTuple):
-    """The landmarks of a submap for data association, without its measurements.
-
-    unnamed, spacings, distinct: see `LocalMap`.
-    """
+    """The landmarks of a submap for data association; fields as in `LocalMap`."""
 
     stream: Stream
     sequence: int
@@ -110,7 +106,7 @@ class Observation(NamedTuple):
 
 
 class RobotBias(NamedTuple):
-    """An error of one robot, by its name, on the days of a saved map."""
+    """An error of one robot on the days of a saved map."""
 
     robot: str
     bias: Bias
@@ -118,13 +114,12 @@ class RobotBias(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OwnBiases:
-    """Errors o of single robots in a saved map: jointly with its landmarks x, given the errors b
-    that all robots share,
+    """Errors o of single robots in a saved map: given the errors b that all robots share,
 
-        o ~ N(mean + Gᵀ b, covariance),   cov(o, x) = cross.
+      o ~ N(mean + Gᵀ b, covariance),   cov(o, landmarks) = cross.
 
-    errors: ascending. by_common: G, a row for each of the map's `biases`. The map's measurements
-    alone, without the priors of (b, o), have the likelihood N(likeliest, evidence⁻¹) of (b, o).
+    errors: ascending. by_common: G, a row for each of the map's `biases`. Without the priors of (b,
+    o), the map's measurements have the likelihood N(likeliest, evidence⁻¹) of (b, o).
     """
 
     errors: tuple[RobotBias, ...] = ()
@@ -141,8 +136,10 @@ class OwnBiases:
         return information(self.covariance, "the robots' own errors in a saved map")
 
     def given(self, local: LocalMap) -> tuple[LocalMap, Float[np.ndarray, "K m"]]:
-        """Condition the saved map's submap on the errors: x | o, b ~ N(x̄ + Sᵀ o + …, P − crossᵀ S)
-        with S = covariance⁻¹ cross; return it at o = 0, and S over its mean.
+        """Condition the saved map's submap x on the errors: x | o, b ~ N(x̄ + Sᵀ o + …, P − crossᵀ
+        S).
+
+        Returns it at o = 0, and S = covariance⁻¹ cross over its mean.
         """
         poses = len(local.mean) - self.cross.shape[1]
         rows = np.hstack(
@@ -169,8 +166,8 @@ NO_OWN = OwnBiases()
 class Contribution:
     """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0.
 
-    A saved map is a submap, too, with landmarks only: its end pose is at its start. own, by_own:
-    the errors of single robots in it, and ∂mean/∂o of `local`, which is given at o = 0.
+    A saved map is a submap with landmarks only. own, by_own: the errors of single robots in it, and
+    ∂mean/∂o of `local`, which is given at o = 0.
     """
 
     robot: str
@@ -193,13 +190,13 @@ class Contribution:
 
     @cached_property
     def observation(self) -> Observation:
-        """The submap's landmarks for data association."""
+        """Landmarks for data association."""
         of = self.local
         return Observation(self.stream, self.sequence, of.ids, of.unnamed, of.spacings, of.distinct)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "n n"]:
-        """P⁻¹ of the submap. Raises NotACovarianceError that names the submap."""
+        """P⁻¹. Raises NotACovarianceError that names the submap."""
         return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
 
     @cached_property
@@ -208,9 +205,7 @@ class Contribution:
     ) -> dict[
         tuple[Bias | int | RobotBias, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]
     ]:
-        """Sensitivity and factor by the errors of a graph, as the last graph with them has both
-        (`submap_graph.Joined`).
-        """
+        """Sensitivity and factor by the errors of the last graph with them (`Joined`)."""
         return {}
 
     @cached_property
@@ -232,10 +227,7 @@ class Contribution:
 
 @dataclass(frozen=True, eq=False)
 class InitialPoseFactor:
-    """A stream's initial pose in the common frame: exact (covariance None) or N(pose, covariance).
-
-    The covariance is of (x [m], y [m], theta [rad]) in the common frame.
-    """
+    """A stream's initial pose in the common frame: N(pose, covariance), exact if None."""
 
     robot: str
     incarnation: int
@@ -249,7 +241,7 @@ class InitialPoseFactor:
 
     @cached_property
     def information(self) -> Float[np.ndarray, "3 3"] | None:
-        """P⁻¹, None for an exact initial pose."""
+        """P⁻¹; None for an exact pose."""
         if self.covariance is None:
             return None
         return information(self.covariance, f"the start of {named(self.stream)}")

@@ -1,8 +1,7 @@
 """Products and solutions of dense matrices with the same bits on every processor.
 
-A BLAS uses other kernels, with other orders of sums, on other processors. Here an entry of a
-product is one sum in the order of its index, whatever the shapes; parallel lanes hold different
-entries. Arrays of three and more axes are stacks of matrices, as in NumPy.
+An entry of a product is one sum in the order of its index; a BLAS orders sums by processor. Arrays
+of three and more axes are stacks of matrices, as in NumPy.
 """
 
 from teamslam.team.core import (

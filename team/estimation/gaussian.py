@@ -14,7 +14,7 @@ Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
 
 SMALL = 128
-"""Largest matrix whose triangle's places are kept."""
+"""Largest matrix whose triangle's indices are cached."""
 
 
 class PoseGaussian(NamedTuple):
@@ -25,7 +25,7 @@ class PoseGaussian(NamedTuple):
 
 
 class LandmarkGaussian(NamedTuple):
-    """The joint Gaussian of the landmarks by ascending id: (x₁, y₁, x₂, …) in the map frame [m]."""
+    """Joint Gaussian of the landmarks by ascending id: (x₁, y₁, x₂, …) in the map frame [m]."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
@@ -36,7 +36,7 @@ NO_LANDMARKS = LandmarkGaussian(np.empty(0, np.uint32), np.empty((0, 2)), np.emp
 
 
 class NotACovarianceError(ValueError):
-    """A matrix used as a covariance is not finite, not symmetric or not positive definite."""
+    """A covariance is not finite, not symmetric or not positive definite."""
 
     def __init__(self, what: str, why: str) -> None:
         super().__init__(f"the covariance of {what} is {why}")
@@ -59,10 +59,10 @@ class CoreErrors:
 
 
 def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
-    """Lower L with L Lᵀ = covariance; `what` names the matrix in the error if there is none.
+    """Compute the lower L with L Lᵀ = covariance; `what` names the matrix in the error.
 
-    Symmetry is judged by the diagonal's scale, and so is rank: a pivot that is no more than n ε of
-    its diagonal entry is what rounding leaves of a singular matrix.
+    Symmetry and rank are relative to the diagonal: a pivot of at most n ε of its diagonal entry is
+    the rounding of a singular matrix.
     """
     factor, fault = core.factor_or_fault(covariance)
     if fault:
@@ -74,23 +74,19 @@ FAULTS = ("", "not finite", "not positive definite", "not symmetric")
 
 
 def deviation(variance: float) -> float:
-    """The standard deviation of a variance; 0 of one that rounding has made negative.
-
-    Selected inversion subtracts numbers of the size of the largest variance: the smallest ones may
-    come out below zero.
-    """
+    """Return the standard deviation of a variance; 0 if rounding has made it negative."""
     return math.sqrt(variance) if variance > 0.0 else 0.0
 
 
 def information(covariance: Matrix, what: str) -> Matrix:
-    """P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
+    """Compute P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
     if not len(covariance):
         return np.zeros((0, 0))
     return dense.inverse_of_factored(cholesky_factor(covariance, what))
 
 
 def upper_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Rows and columns of the upper triangle of an n × n matrix, row by row; not to be changed."""
+    """Return rows and columns of the upper triangle of an n × n matrix, row-major, read-only."""
     return _small_triangle(n) if n <= SMALL else np.triu_indices(n)
 
 
@@ -100,12 +96,12 @@ def _small_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, 
 
 
 def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:
-    """The upper triangle row by row: n(n+1)/2 numbers."""
+    """Pack the upper triangle, row-major: n(n+1)/2 numbers."""
     return np.ascontiguousarray(covariance[upper_triangle(len(covariance))])
 
 
 def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
-    """The symmetric n × n matrix of a packed upper triangle."""
+    """Expand a packed upper triangle to a symmetric n × n matrix."""
     rows, columns = upper_triangle(n)
     matrix = np.empty((n, n))
     matrix[rows, columns] = matrix[columns, rows] = triangle + 0.0  # a zero is positive
@@ -113,12 +109,10 @@ def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
 
 
 def curved(pose: PoseGaussian) -> PoseGaussian:
-    """The covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ = (f, l, φ) ~ N(0, S), to second order.
+    """Compute the covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ ~ N(0, S), to second order.
 
-    A robot with an uncertain heading lies on an arc, not in an ellipse: its position is (f, l) +
-    φ/2 (−l, f) to second order, which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the variance of
-    f, and so on (moments of a Gaussian; Isserlis 1918). Far from where the heading was known this
-    exceeds σ_f². The mean stays the most likely pose.
+    The position is (f, l) + φ/2 (−l, f), which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the
+    variance of f, and so on (Isserlis 1918). The mean stays the most likely pose.
     """
     return PoseGaussian(
         pose.mean, core.curved_covariance(float(pose.mean[2]), np.asarray(pose.covariance))

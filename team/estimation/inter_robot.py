@@ -1,11 +1,9 @@
-"""A teammate seen from a pose node: a range-bearing factor between two pose nodes of two robots.
+"""A teammate seen from a pose node: a range-bearing factor between pose nodes of two robots.
 
-A fix of a robot's position (GNSS) is one, too: the station S, a pose that is known exactly and far
-away, measures the antenna, a point of the robot at its pose node.
-
-The observed point is carried to the observer's pose node by the observer's odometry T ∘ Exp(xi), xi
-~ N(0, C): p' = T Exp(xi) p to an earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance
-grows by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
+A fix of a robot's position (GNSS) is one, too: the station, an exact pose far away, measures the
+antenna. The observer's odometry T ∘ Exp(xi), xi ~ N(0, C), carries the observed point to the pose
+node: p' = T Exp(xi) p to an earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance grows
+by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
 """
 
 from collections.abc import Sequence
@@ -25,20 +23,19 @@ from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
 from teamslam.team.shapes import Float
 
 STATION_POSE = np.array([0.0, -1e5, 0.0])
-"""Pose of the station in the frame of the survey: so far away that (range, bearing) is linear."""
+"""Pose of the station in the survey's frame: so far away that (range, bearing) is linear."""
 BASE = np.zeros(2)
 SightingKey: TypeAlias = tuple[int, str, int, str]
-"""(stamp, robot, incarnation, teammate): an inter-robot measurement's place in the order."""
+"""(stamp, robot, incarnation, teammate): place in the canonical order."""
 
 
 @dataclass(frozen=True, eq=False)
 class InterRobotFactor:
-    """An inter-robot measurement from the pose node at stamp_ns of submap `sequence` of (robot,
-    incarnation).
+    """An inter-robot measurement from the pose node at stamp_ns of submap `sequence`.
 
     measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
-    covariance: of the measurement, [m², m·rad, rad²]. A fix has the teammate GNSS and is measured
-    from the station; point: the antenna in the frame of the robot's pose node [m].
+    covariance: [m², m·rad, rad²]. A fix has the teammate GNSS and is measured from the station;
+    point: the antenna in the frame of the robot's pose node [m].
     """
 
     robot: str
@@ -57,17 +54,17 @@ class InterRobotFactor:
 
     @property
     def stream(self) -> Stream:
-        """(robot, incarnation) of the observer, or of the robot that a fix places."""
+        """(robot, incarnation) of the observer, or of the robot of a fix."""
         return (self.robot, self.incarnation)
 
     @property
     def key(self) -> SightingKey:
-        """Place in the canonical order: (stamp, robot, incarnation, teammate)."""
+        """Place in the canonical order."""
         return (self.stamp_ns, self.robot, self.incarnation, self.teammate)
 
     @cached_property
     def information(self) -> Float[np.ndarray, "2 2"]:
-        """The inverse covariance. Raises NotACovarianceError that names the measurement."""
+        """Inverse covariance. Raises NotACovarianceError that names the measurement."""
         what = f"a sighting of {self.teammate} by {named(self.stream)}"
         return information(self.covariance, what)
 
@@ -92,10 +89,10 @@ class CarriedPoint(NamedTuple):
 
 def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) -> CarriedPoint:
     """Locate a teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the
-    node's time.
+    node.
 
-    Its covariance is the sum of the sensor's variances along and across the ray, that of the
-    marker's position on the teammate (marker_sigma) and that of the drift.
+    Its covariance is the sum of the sensor's, that of the marker on the teammate (marker_sigma) and
+    that of the drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = core.squared(sensor.marker_sigma) + drift * drift
@@ -105,7 +102,7 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
 
 
 def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
-    """Transform a point that the sensor sees into the frame of the base that carries the sensor."""
+    """Transform a point from the sensor's frame to that of the base."""
     turn = _turn(float(mount[2]))
     return CarriedPoint(
         transformed(mount, seen.point), dense.product(dense.product(turn, seen.covariance), turn.T)
@@ -113,9 +110,7 @@ def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
 
 
 def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
-    """Carry the point back to an earlier node, from which the observer has moved by
-    node_from_here.
-    """
+    """Carry the point back to an earlier node, from which the observer has moved."""
     T = node_from_here.mean
     turn = _turn(float(T[2]))
     J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
@@ -126,7 +121,7 @@ def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
 
 
 def carry_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
-    """Carry the point on to a later node, to which the observer moves by here_from_node."""
+    """Carry the point on to a later node, to which the observer moves."""
     T = inverse(here_from_node.mean)
     point = transformed(T, seen.point)
     turn = _turn(float(T[2]))
@@ -145,11 +140,10 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 def reduced(
     carried: Sequence[CarriedPoint],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Reduce several measurements of a teammate from one node to one (range, bearing) and its
-    covariance.
+    """Reduce several measurements of a teammate from one node to one (range, bearing).
 
-    The median of each, bearings relative to the first one; the covariance is the mean of theirs, as
-    for one measurement: a camera repeats its error on a marker from one moment to the next.
+    The median of each; the covariance is the mean of theirs, as for one measurement, since a camera
+    repeats its error on a marker.
     """
     ranges = [max(core.hypot(*each.point), NEAREST_M) for each in carried]
     bearings = [core.atan2(each.point[1], each.point[0]) for each in carried]

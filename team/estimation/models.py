@@ -1,7 +1,7 @@
 """The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
 
-Both are textbook models (Thrun, Burgard and Fox 2005, sections 5.3 and 6.6) with the motion noise
-in the tangent space of the motion's end, so that motions compose.
+Thrun, Burgard and Fox 2005, sections 5.3 and 6.6, with the motion noise in the tangent space of the
+motion's end, so that motions compose.
 """
 
 import math
@@ -34,8 +34,8 @@ __all__ = [
 class Increment(msgspec.Struct, frozen=True, gc=False):
     """b_from_b': truth = mean ∘ Exp(xi), xi ~ N(0, covariance) in (forward, left, turn).
 
-    mean:       (x [m], y [m], theta [rad]).
-    covariance: symmetric positive semi-definite, of any rank, [m², m·rad, rad²].
+    mean: (x [m], y [m], theta [rad]). covariance: symmetric positive semi-definite, of any rank,
+    [m², m·rad, rad²].
     """
 
     mean: Pose
@@ -43,11 +43,11 @@ class Increment(msgspec.Struct, frozen=True, gc=False):
 
     @classmethod
     def identity(cls) -> Self:
-        """Standing still, exactly."""
+        """Stand still, exactly."""
         return cls(np.zeros(3), np.zeros((3, 3)))
 
     def then(self, other: "Increment") -> "Increment":
-        """mean₁ ∘ mean₂ with covariance Ad C₁ Adᵀ + C₂, Ad = Ad(mean₂⁻¹)."""
+        """Compose: mean₁ ∘ mean₂ with covariance Ad C₁ Adᵀ + C₂, Ad = Ad(mean₂⁻¹)."""
         return Increment(
             *core.compose_motions(self.mean, self.covariance, other.mean, other.covariance)
         )
@@ -87,8 +87,7 @@ def _densities(noise: MotionNoise) -> tuple[float, float, float]:
 def increment_of(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Increment:
-    """Compute the motion of one odometry interval: `forward` [m/s] and `yaw_rate` [rad/s] held for
-    `duration_s`.
+    """Compute the motion of `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
 
     The equations are in `core.MotionModel.increment`.
     """
@@ -122,10 +121,10 @@ Scanned = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarra
 def scanned(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Scanned:
-    """Mark raw measurements in [min_range, max_range] and in the field of view, and correct them.
+    """Correct raw measurements, and mark those in [min_range, max_range] and in the field of view.
 
-    Not finite measurements, those whose corrected range is not positive, and depths beyond OFF_AXIS
-    are not marked.
+    Not marked: those not finite, of a corrected range that is not positive, and depths beyond
+    OFF_AXIS.
     """
     return calibration_of(sensor).correct(ranges, bearings)
 
@@ -141,7 +140,7 @@ def corrected(
 
 
 class Noise(NamedTuple):
-    """Variances of a measurement, and the share of each that is white: the rest is constant."""
+    """Variances of a measurement, and the white share of each: the rest is constant."""
 
     range_variance: float
     range_per_m2: float
@@ -151,7 +150,7 @@ class Noise(NamedTuple):
 
 
 def noise_of(sensor: Sensor) -> Noise:
-    """The variances of a sensor and their white shares, as the kernels take them."""
+    """Return the variances of a sensor and their white shares."""
     return Noise(
         core.squared(sensor.range_sigma),
         core.squared(sensor.range_sigma_per_m),

@@ -1,9 +1,8 @@
 """A sensor mounted off the origin of the robot's base.
 
-Within a window poses and motions are the sensor's, so that a measurement is range and bearing from
-the pose. For a motion T of the base the sensor at m moves by m⁻¹ ∘ T ∘ m. At the window's end the
-poses become the base's, particle by particle: with S the sensor's pose since the window's start,
-the base's is m ∘ S ∘ m⁻¹, and a point p in the frame of the sensor's start is m p in the base's.
+Within a window poses and motions are the sensor's. For a motion T of the base the sensor at m moves
+by m⁻¹ ∘ T ∘ m; at the window's end the base's pose is m ∘ S ∘ m⁻¹ with S the sensor's, and a point
+p in the frame of the sensor's start is m p in the base's.
 """
 
 import numpy as np
@@ -21,7 +20,7 @@ def of_sensor(step: Increment, mount: Pose) -> Increment:
 
 
 def of_base(step: Increment, mount: Pose) -> Increment:
-    """Convert a motion of the sensor to the base's, the inverse of `of_sensor`."""
+    """Convert a motion of the sensor to the base's."""
     return of_sensor(step, inverse(mount))
 
 

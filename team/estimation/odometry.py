@@ -1,8 +1,4 @@
-"""One interval of odometry, and any part of it as a Gaussian on SE(2).
-
-Odometry reports mean speeds (`models.increment_of`), a car's wheel speed and steering angle, or a
-motion on SE(2) with a part to the left, with or without a covariance of its own.
-"""
+"""One interval of odometry, and any part of it as a Gaussian on SE(2)."""
 
 import math
 from typing import NamedTuple
@@ -21,7 +17,7 @@ from teamslam.team.shapes import Float
 class Moved(NamedTuple):
     """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]) of the interval.
 
-    covariance: the source's own covariance of the error, in the tangent space of the motion's end.
+    covariance: the source's own, of the error in the tangent space of the motion's end.
     """
 
     twist: Pose
@@ -31,7 +27,7 @@ class Moved(NamedTuple):
 class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
     """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
-    moved: the motion, where the odometry reports one; the speeds are then those of its twist.
+    moved: a reported motion; the speeds are then those of its twist.
     """
 
     end_ns: int
@@ -72,8 +68,8 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
     """Compute (forward [m/s], yaw rate [rad/s]) of a car from its wheel and steering encoders.
 
     With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
-    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). Two NaN where the
-    model is not a car's, or the wheel is at the centre of the turn.
+    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). NaN where the model is
+    not a car's, or the wheel is at the centre of the turn.
     """
     if motion.kind != "ackermann" or motion.wheel_base is None:
         return math.nan, math.nan
@@ -86,5 +82,5 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
 
 
 def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
-    """Convert a motion whose end, seen in its start, is `increment` (x, y, theta), |theta| ≤ π."""
+    """Convert a motion whose end in the frame of its start is `increment`, |theta| ≤ π."""
     return Moved(logarithm(increment), covariance)

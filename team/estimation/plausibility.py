@@ -1,7 +1,7 @@
-"""Check values against physically sensible bounds, and describe violations.
+"""Check values against physical bounds; a refusal is a value with its reason.
 
 The wire checks the form of a message; this module checks whether it can be true of a robot on the
-ground. A refusal is a value with its reason, not an error of the program.
+ground.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
-    """Give the reason why a submap is refused, if any."""
+    """Return the reason to refuse a submap, if any."""
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
     angles = _angles_of(local)
@@ -37,8 +37,7 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
 def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
     """Raise the submap's covariance P to P + F where P − F is not positive definite.
 
-    F = diag(least²) for coordinates [m] and headings [rad]. Where each pose and each landmark has
-    an error of its own that is not smaller, P − F is a covariance, and P is unchanged to the bit.
+    F = diag(least²) for coordinates [m] and headings [rad].
     """
     angles = _angles_of(local)
     sigmas = np.where(angles, least[1], least[0])
@@ -58,7 +57,7 @@ def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
 
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
-    """Give the reason why an inter-robot measurement is refused, if any."""
+    """Return the reason to refuse an inter-robot measurement, if any."""
     if sighting.is_fix:
         distance_m = sighting.measurement[:1]
         why = _far(distance_m, bounds.coordinate_m, "of the station")
@@ -71,7 +70,7 @@ def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
 
 
 def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
-    """Give the reason why an initial pose is refused, if any."""
+    """Return the reason to refuse an initial pose, if any."""
     if abs(start.pose[2]) > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(start.pose[:2], bounds.coordinate_m, "of the origin")
@@ -81,7 +80,7 @@ def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
 
 
 def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
-    """Give the reason why a prior (x, y, θ, x₁, y₁, …) is refused, if any.
+    """Return the reason to refuse a prior (x, y, θ, x₁, y₁, …), if any.
 
     A variance of zero is a known constant; the agreement of many submaps allows any small one.
     """
@@ -94,13 +93,13 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
 
 
 def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
-    """Whether the covariance of a motion on SE(2) is within the bounds."""
+    """Return whether the covariance of a motion on SE(2) is within the bounds."""
     most = np.array([bounds.sigma_m[1], bounds.sigma_m[1], bounds.sigma_rad[1]])
     return bool((np.sqrt(np.diag(covariance)) <= most).all())
 
 
 def are_landmarks(covariance: Matrix) -> bool:
-    """Whether a joint covariance of points is finite and each point's own block is a covariance."""
+    """Return whether a joint covariance is finite and each point's own block is a covariance."""
     if not np.isfinite(covariance).all():
         return False
     variances = covariance.diagonal()

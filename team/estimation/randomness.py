@@ -11,13 +11,13 @@ def random_numbers(seed: int, robot: str, incarnation: int, sequence: int) -> co
     """Make the counter-based random numbers (Philox 4x64) of one window of one robot.
 
     The key is the BLAKE2b digest of (seed, robot, incarnation, sequence), so streams of different
-    windows are independent, and none depends on the draws of another.
+    windows are independent.
     """
     return core.Random(_key(seed, robot, incarnation, sequence))
 
 
 def generator(seed: int, robot: str, incarnation: int, sequence: int) -> "np.random.Generator":
-    """Make NumPy's generator of the key of `random_numbers`, whose normal numbers are NumPy's."""
+    """Make NumPy's generator of the key of `random_numbers`."""
     key = int.from_bytes(_key(seed, robot, incarnation, sequence), "little")
     return np.random.Generator(np.random.Philox(key=key))
 

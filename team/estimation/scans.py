@@ -2,9 +2,8 @@
 
 `own` has a row for each measurement: of length 0 where none has a covariance, else (rr [m²], rb
 [m·rad], bb [rad²], form). form POLAR: the covariance of range and bearing. form POINT: that of a
-point in the sensor's frame with Gaussian noise in the plane, converted to first order: diag(1, 1/r)
-S diag(1, 1/r), S along and across the measured bearing, from which S can be recovered exactly. form
-SENSOR: the sensor's noise, at the predicted range.
+point in the sensor's frame, to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the
+measured bearing. form SENSOR: the sensor's noise, at the predicted range.
 """
 
 from typing import NamedTuple
@@ -84,9 +83,7 @@ def calibrated(own: Own, sensor: Sensor) -> Own:
 
 
 def together(parts: list[tuple[int, Own]]) -> Own:
-    """Join the rows of several scans, given by count and rows; form SENSOR where only some have
-    covariances.
-    """
+    """Join the rows of several scans, given by count and rows; SENSOR if only some have rows."""
     if not any(own.size for _, own in parts):
         return unclaimed(sum(count for count, _ in parts))
     sensors = np.array([0.0, 0.0, 0.0, SENSOR])

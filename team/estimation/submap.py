@@ -1,6 +1,4 @@
-"""The submap that a robot sends: one Gaussian over poses and landmarks in the submap's own
-frame.
-"""
+"""The submap that a robot sends: one Gaussian over poses and landmarks in its own frame."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,9 +18,9 @@ NO_COLUMNS = np.empty((0, 0))
 class Unnamed:
     """Observations of a window's U unnamed landmarks, by ascending number.
 
-    counts: number of measurements of each, at least 1. seen: the window's keyframes with detections
-    that observed it; two landmarks that one keyframe observed are distinct. classes: ln P(its
-    reported classes | class) of each, up to a constant; without columns where none is reported.
+    counts: number of measurements of each, at least 1. seen: keyframes that observed it; two
+    landmarks in one keyframe are distinct. classes: ln P(its reported classes | class) of each, up
+    to a constant; without columns where none is reported.
     """
 
     counts: UInt32[np.ndarray, " U"]
@@ -31,7 +29,7 @@ class Unnamed:
 
     @cached_property
     def views(self) -> tuple[Int64[np.ndarray, " _"], ...]:
-        """The largest sets of at least three landmarks that one keyframe saw, ascending."""
+        """Largest sets of at least three landmarks that one keyframe saw, ascending."""
         seen = np.unique(self.seen.astype(np.float64), axis=1)
         count = seen.sum(axis=0)
         inside = seen.T @ seen == count[:, None]
@@ -41,9 +39,7 @@ class Unnamed:
 
 
 class Slipped(NamedTuple):
-    """A slip of about (forward, left, turn) that the odometry missed before the keyframe at
-    stamp_ns.
-    """
+    """A slip of (forward, left, turn) that the odometry missed before the keyframe at stamp_ns."""
 
     stamp_ns: int
     by: Float[np.ndarray, "3"]
@@ -51,7 +47,7 @@ class Slipped(NamedTuple):
 
 @dataclass(frozen=True)
 class Became:
-    """The outcomes of a window's detections without identities.
+    """Outcomes of a window's detections without identities.
 
     stamps: of M scans [ns]; counts: number of detections of each. By detection: rows, its index in
     its scan's message; landmarks, its number in the submap, 0 for none; clutter, whether it is a
@@ -89,9 +85,8 @@ class LocalMap:
     covariance: symmetric positive definite, [m², m·rad, rad²]. node_stamps: team time of the K pose
     nodes [ns], strictly ascending. biases, sensitivity: errors b that the robot's submaps share,
     ascending, and a row S = ∂mean/∂b of each. curvature: rows D = ∂²mean/∂b², zero but for the
-    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the unnamed landmarks, those
-    from number 2³¹ on. The start pose is exactly zero with zero uncertainty: the submap contains
-    no information from outside the window.
+    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the landmarks from number 2³¹
+    on. The start pose is exactly zero: the submap contains no information from outside the window.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -130,8 +125,9 @@ class LocalMap:
 
     @property
     def distinct(self) -> Bool[np.ndarray, "L L"]:
-        """Pairs of landmarks, by index in `ids`, that cannot be one: two that one keyframe
-        observed, and all pairs with a named landmark. None where all are named.
+        """Pairs of landmarks, by index in `ids`, that cannot be one; none where all are named.
+
+        Two that one keyframe observed, and all pairs with a named landmark.
         """
         unnamed = self.ids >= UNNAMED
         together = np.full((len(self.ids), len(self.ids)), bool(unnamed.any()))
@@ -146,7 +142,7 @@ class LocalMap:
 
     @property
     def named(self) -> "LocalMap":
-        """The marginal without the unnamed landmarks, whose numbers hold in this window only."""
+        """The marginal without the unnamed landmarks."""
         if not len(self.ids) or self.ids[-1] < UNNAMED:
             return self
         named = int(np.searchsorted(self.ids, UNNAMED))
@@ -163,7 +159,7 @@ class LocalMap:
 
     @property
     def motion(self) -> "LocalMap":
-        """The marginal over the end pose alone."""
+        """The marginal over the end pose."""
         return LocalMap(self.ids[:0], self.mean[:3], self.covariance[:3, :3])
 
     @property

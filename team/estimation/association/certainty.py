@@ -5,12 +5,11 @@ unmapped one, or clutter. For a landmark j in view with probability v_j and dete
 probability P_D, the odds of "z is of landmark j" against "z is of something else and j was missed"
 are
 
-    ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)).
+  ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)),
 
-ρ is the number of detections per square metre of a view, ρ_out that of the detections in no
-landmark, and V_j = π γ √|S_j| the volume of the gate γ: a landmark in the gate of another one may
-be part of it. The marginals over all joint associations of the scan follow by belief propagation
-(Williams and Lau 2014, IEEE TAES 50(4)).
+with ρ detections per square metre of a view, ρ_out those in no landmark, and V_j = π γ √|S_j| the
+volume of the gate γ: a landmark in another one's gate may be part of it. The marginals over all
+joint associations follow by belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
 """
 
 from dataclasses import dataclass
@@ -69,8 +68,8 @@ class FieldOfView:
 
 
 def estimate_view(scans: Scans) -> FieldOfView:
-    """Estimate the sector filled by the window's detections, before its widening by their noise,
-    and their density in it.
+    """Estimate the sector filled by the detections, before its widening by their noise, and their
+    density.
     """
     ranges = core.hypot(scans.points[:, 0], scans.points[:, 1])
     bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])

@@ -2,9 +2,8 @@
 
 A landmark has ln P(reports | class c) for each of C classes, up to a constant: the sum of its
 detections' rows, each a column of the detector's confusion matrix. With p(c) ∝ P(reports | c) for
-classes that are equally frequent, the log-likelihood ratio of one landmark against two is
-
-    ln ( Σ_c p₁(c) p₂(c) C ).
+equally frequent classes, the log-likelihood ratio of one landmark against two is ln(Σ_c p₁(c) p₂(c)
+C).
 """
 
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ CONTRADICTED = 3.0
 
 
 def compare_classes(one: Classes, two: Classes) -> Float[np.ndarray, " n"]:
-    """Log-likelihood ratio of one landmark against two, row by row."""
+    """Compute the log-likelihood ratio of one landmark against two, row by row."""
     p, q = (core.exp(each - each.max(axis=1, keepdims=True)) for each in (one, two))
     common = (p * q).sum(axis=1) / (p.sum(axis=1) * q.sum(axis=1))
     return np.asarray(core.log(common * one.shape[1]))

@@ -1,7 +1,6 @@
 """Clustering: the association of one closed window's detections to landmarks.
 
-Track, smooth, associate again, merge, drop. The association uses no map and no other window, so
-that submaps stay independent. All particles of a window share it.
+It uses no map and no other window, so that submaps stay independent. All particles share it.
 """
 
 import math
@@ -27,7 +26,7 @@ from teamslam.team.shapes import Bool, Float, Int64
 RARE = 0.05
 """Significance level of the test for clutter."""
 ROUNDS = 5
-"""Most iterations of the share of clutter; it comes to rest in two or three."""
+"""Most iterations of the share of clutter."""
 UNSEEN = 100.0
 """Looks at a place of clutter with one match, before the window's own are counted."""
 HIDDEN = 0.1
@@ -38,10 +37,10 @@ HIDDEN = 0.1
 class WindowAssociation:
     """The landmark of each detection of a window.
 
-    landmark_of: by detection, in [0, L); UNASSIGNED for one that is left out. names: the identity
-    of each landmark, UNASSIGNED without one; sorted by name, then by first detection. counts:
-    number of detections of each landmark. seen: the keyframes that saw it. slips: of the odometry.
-    clutter: for each detection left out, whether its place was observed again without finding it.
+    landmark_of: by detection, in [0, L), or UNASSIGNED. names: the identity of each landmark, or
+    UNASSIGNED; sorted by name, then by first detection. counts: number of detections of each
+    landmark. seen: its keyframes. slips: of the odometry. clutter: of each detection left out,
+    whether its place was observed again without finding it.
     """
 
     landmark_of: Int64[np.ndarray, " N"]
@@ -56,9 +55,8 @@ class WindowAssociation:
 class Clusters:
     """The detections of a window, each of one landmark, before doubtful ones are left out.
 
-    landmark_of: by detection. names: of each landmark, UNASSIGNED without one. window: smoothed
-    under this association. slips: of the odometry; `scans` has larger covariances of the motions
-    that slipped.
+    window: smoothed under this association. slips: of the odometry; `scans` has larger covariances
+    of the motions that slipped.
     """
 
     scans: Scans
@@ -69,9 +67,7 @@ class Clusters:
 
 
 def cluster_window(scans: Scans, settings: AssociationSettings) -> Clusters:
-    """Track, smooth, associate again and merge. Raises LinAlgError where the window has no
-    solution.
-    """
+    """Track, smooth, associate again and merge. Raises LinAlgError without a solution."""
     first = track_window(scans, settings)
     scans = _inflate_slips(scans, first.slips)
     landmark_of, names = first.landmark_of, np.array(first.names, np.int64)
@@ -84,7 +80,7 @@ def cluster_window(scans: Scans, settings: AssociationSettings) -> Clusters:
 
 
 def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssociation:
-    """Associate the detections of a window. Raises LinAlgError where the window has no solution."""
+    """Associate the detections of a window. Raises LinAlgError without a solution."""
     found = cluster_window(scans, settings)
     scans, names, window = found.scans, found.names, found.window
     landmark_of = _drop_uncertain(scans, found.landmark_of, window, settings)
@@ -243,15 +239,14 @@ def _mark_confirmed(
 ) -> Bool[np.ndarray, " L"]:
     """Mark the landmarks with an identity, and those that are likelier real than clutter.
 
-    Behind its first detection, a real landmark is detected at each look with the probability p of
-    the sensor, and a place of clutter matches by chance with q. With c detections and m misses the
-    log odds that it is real are
+    After its first detection, a real landmark is detected at each look with the probability p of
+    the sensor, a place of clutter matches with q. With c detections and m misses the log odds that
+    it is real, the score by which trackers confirm a track, are
 
-        (c − 1) log(p/q) + m log((1 − p)/(1 − q)) + log(real ones/places of clutter),
+      (c − 1) log(p/q) + m log((1 − p)/(1 − q)) + log(real ones/places of clutter).
 
-    the score by which trackers confirm a track. The misses before the first detection together
-    count at most log HIDDEN, as do those behind the last one. q and the last term are those of the
-    window's unconfirmed places.
+    The misses before the first detection together count at most log HIDDEN, as do those after the
+    last one. q and the last term are those of the window's unconfirmed places.
     """
     named, p = names != UNASSIGNED, settings.detection_probability
     seen = _mark_seen(scans, landmark_of, len(names))

@@ -1,13 +1,11 @@
 """The local density λ of landmarks, and the lengths that follow from their spacing.
 
-Landmarks observed by one keyframe are distinct. Their distances give the density of further
-landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13). In groups
-of landmarks it is far above the map's mean density: a pair whose difference is as uncertain as the
-spacing within a group may be either of its members. Neighbours that hide each other in one keyframe
-are counted in the map, among the landmarks of several submaps.
-
-The distances also bound the lengths of a profile: two landmarks farther apart than their neighbours
-are not one landmark that was split.
+The distances of landmarks that one keyframe observed, which are distinct, give the density of
+further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13).
+In groups of landmarks it is far above the map's mean: a pair whose difference is as uncertain as
+the spacing within a group may be either of its members. Neighbours that hide each other in one
+keyframe are counted in the map, among the landmarks of several submaps. The distances also bound
+the lengths of a profile.
 """
 
 from collections.abc import Iterable
@@ -32,7 +30,7 @@ Spacings = Float[np.ndarray, "U U"]
 
 
 class LandmarkDensity:
-    """The spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
+    """Spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
     spacings: of each submap (`LocalMap.spacings`). confirmed: positions [m] of the landmarks that
     several submaps have observed.
@@ -56,7 +54,7 @@ class LandmarkDensity:
         return np.sort(found[np.isfinite(found)])
 
     def around_landmarks(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Density [1/m²] of further landmarks within each radius [m] of a landmark, in single
+        """Compute the density [1/m²] of further landmarks within each radius [m] in single
         keyframes.
 
         (ordered pairs within R + 1) / (n π R²): half a pair is assumed beside those observed.
@@ -73,10 +71,9 @@ class LandmarkDensity:
         return np.sort(core.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
 
     def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Density [1/m²] of the map's landmarks: (2 pairs + 1) / (n π R²) of n landmarks.
+        """Compute the density [1/m²] of the n landmarks of the map, (2 pairs + 1) / (n π R²).
 
-        Duplicates that are not merged yet count as neighbours, so the density is too large, never
-        too small, while association is incomplete.
+        Duplicates that are not merged yet count as neighbours, so that it is never too small.
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (

@@ -2,11 +2,12 @@
 
 Both test the squared Mahalanobis distance d² = dᵀS⁻¹d of a difference d with covariance S against
 χ² of two degrees of freedom (individual compatibility; Neira and Tardós 2001, IEEE T-RA 17(6)).
+
 A pair of landmarks of a joint Gaussian also has a log-likelihood ratio of "one landmark" against
 "two". With S the joint covariance of their difference plus the slack s₀², and λ expected landmarks
 per square metre,
 
-    LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ,
+  LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ,
 
 plus the evidence of their classes (`classes`), if any.
 """
@@ -26,9 +27,7 @@ from teamslam.team.shapes import Bool, Float, Int64
 Indices = Int64[np.ndarray, " _"]
 
 LEAST_DETERMINANT = 1e-32
-"""Lower bound of |S| [m⁴]: that of the smallest standard deviation accepted, 1e-8 m
-(`teamslam.team.config.Bounds.sigma_m`).
-"""
+"""Lower bound of |S| [m⁴]: the smallest accepted standard deviation is 1e-8 m."""
 SPLIT = 1.0
 """Additional log-likelihood ratio for a pair of one window, which seldom splits a landmark."""
 
@@ -54,10 +53,9 @@ def match_scan(
     """Match the detections of a scan with landmarks; UNASSIGNED without a match.
 
     An unnamed detection matches unnamed landmarks in its gate; a named one matches the landmark of
-    this name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|.
-
-    points, covariances: of the detections, in the robot's frame [m, m²]. predicted: the landmarks'
-    positions in that frame, with their covariances.
+    this name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|. points, covariances: of the
+    detections, in the robot's frame [m, m²]. predicted: the landmarks' positions in that frame,
+    with their covariances.
     """
     seen, spread = predicted
     S = spread[None] + settings.variance_factor * covariances[:, None]
@@ -72,8 +70,8 @@ def match_best_first(
 ) -> Int64[np.ndarray, " n"]:
     """Assign a landmark to each detection of a scan; UNASSIGNED where no allowed one is left.
 
-    The allowed pair of least cost is assigned first, then the next one whose detection and landmark
-    are both free. Equal costs are assigned in their order.
+    The allowed pair of least cost comes first, then the next one whose detection and landmark are
+    both free. Equal costs keep their order.
     """
     found = np.full(len(allowed), UNASSIGNED)
     rows, columns = np.nonzero(allowed)
@@ -90,11 +88,10 @@ class Joint(NamedTuple):
 
     mean: positions [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: pairs that cannot be one
     landmark, symmetric: observed in one scan, named differently, or declared to be two by an
-    operator. density: their local density; None: that of the profile. unseen: for the landmarks of
-    one map, the probability that all windows that saw each of them missed another one beside it;
-    the density of the profile is then an upper bound of the map's own. apart_in_window: pairs that
-    one submap has as two landmarks, symmetric; None: not recorded. classes: evidence of their
-    classes (`classes`); None: none.
+    operator. density: local; None: that of the profile. unseen: for the landmarks of one map, the
+    probability that all windows that saw each of them missed another one beside it; the density of
+    the profile is then an upper bound. apart_in_window: pairs that one submap has as two landmarks,
+    symmetric; None: not recorded. classes: evidence of their classes; None: none.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -121,7 +118,7 @@ class Joint(NamedTuple):
         )
 
     def compare_classes(self, first: Indices, second: Indices) -> Float[np.ndarray, " k"]:
-        """Log-likelihood ratio of each pair by its classes; zero without classes."""
+        """Compute the log-likelihood ratio of each pair by its classes; zero without classes."""
         if self.classes is None:
             return np.zeros(len(first))
         return compare_classes(self.classes[first], self.classes[second])
@@ -188,8 +185,9 @@ def gate_pairs(
     profile: AssociationProfile,
     most_sd: float = np.inf,
 ) -> tuple[Indices, Indices, Float[np.ndarray, " k"]]:
-    """Select the pairs that can be one landmark: within the gate, with a standard deviation of the
-    difference of at most `most_sd` [m], not apart, and of compatible classes; return them with it.
+    """Select the pairs that can be one landmark; return them with the standard deviation [m].
+
+    They are within the gate, of at most `most_sd` [m], not apart, and of compatible classes.
     """
     at = evaluate_pairs(joint, first, second, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
@@ -204,7 +202,7 @@ def required_llr(
     sd: Float[np.ndarray, " k"],
     profile: AssociationProfile,
 ) -> Float[np.ndarray, " k"]:
-    """Log-likelihood ratio for which each pair is merged without a rival.
+    """Return the log-likelihood ratio for which each pair is merged without a rival.
 
     It is larger where the standard deviation is large, and by SPLIT where one submap has both.
     """

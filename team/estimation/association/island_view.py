@@ -1,13 +1,14 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
-Every submap adds its unnamed landmarks to the map as landmarks of their own. The steps of a tick:
-*tracking* against the last submaps of the same robot; *near*, landmarks of older submaps where the
-standard deviation of the difference is small, submap by submap; *sweep*, landmarks that were split.
-Closures and merges of islands follow (`closure`).
+Every submap adds its unnamed landmarks to the map as landmarks of their own. The steps: *tracking*
+against the last submaps of the same robot; *near*, landmarks of older submaps where the standard
+deviation of the difference is small, submap by submap; *sweep*, landmarks that were split. Closures
+and merges of islands follow (`closure`).
 
-The landmarks of one submap are distinct. Unmerged fragments of one landmark are candidates for each
-other, and the assignments to all of them at once do not agree on any. So the landmarks of a submap
-are assigned to those of one other submap at a time, with landmarks certainly different from these.
+The landmarks of one submap are distinct, but unmerged fragments of one landmark are candidates for
+each other, and the assignments to all of them at once do not agree on any. So the landmarks of a
+submap are assigned to those of one other submap at a time, with landmarks certainly different from
+these.
 """
 
 from collections.abc import Iterable, Sequence
@@ -41,15 +42,11 @@ from teamslam.team.estimation.contribution import Observation, Stream
 from teamslam.team.shapes import Bool, Float, Int64
 
 COMPARED = 6
-"""Number of submaps that one submap is compared with: those with the most candidates."""
+"""Most submaps that one submap is compared with: those with the most candidates."""
 REEXAMINED = 8
-"""Number of older undecided submaps that a tick examines again: the newest half, others by
-turns.
-"""
+"""Older undecided submaps that a tick examines again: the newest half, others by turns."""
 REEXAMINED_WITHIN = 10.0
-"""Distance in object radii between undecided landmarks of an older submap and the tick's within
-which the submap is examined again.
-"""
+"""Distance [object radii] to undecided landmarks within which a submap is examined again."""
 
 
 class ViewedSubmap(NamedTuple):
@@ -87,8 +84,8 @@ class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
     ids: the identity of each landmark; place_of: its index, by identity. submaps: those examined;
-    seen_by: their landmarks. missed: landmarks that are probably false (`mark_missed`), which no
-    closure is searched with. sees: landmarks of each submap, updated by merges. merged: landmarks
+    seen_by: their landmarks. missed: landmarks that are probably false (`mark_missed`), with which
+    no closure is searched. sees: landmarks of each submap, updated by merges. merged: landmarks
     that are merged into another one. ties: the merges, with their figures. stamp_ns: last end of a
     submap.
     """
@@ -149,8 +146,8 @@ class IslandView:
         return classes
 
     def _mark_apart(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
-        """Mark pairs of landmarks that cannot be one: observed by one keyframe, named differently,
-        or declared to be two by an operator.
+        """Mark pairs that cannot be one landmark: observed by one keyframe, named differently, or
+        declared to be two by an operator.
         """
         named = np.array(self.ids) < UNNAMED
         apart = named[:, None] & named[None, :]
@@ -206,8 +203,9 @@ class IslandView:
         return np.unique(self._merged_into[places])
 
     def apply_verdicts(self) -> None:
-        """Merge the landmarks that an operator has declared to be one, verdict by verdict; a merge
-        of landmarks declared to be two has no effect.
+        """Merge the landmarks that an operator has declared to be one.
+
+        A merge of landmarks declared to be two has no effect.
         """
         declared = [
             (here, there, each.same)
@@ -253,9 +251,7 @@ class IslandView:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
-        """Merge pairs of submap k and each other submap on which all likely joint assignments
-        agree.
-        """
+        """Merge pairs of submap k and each other submap on which all likely assignments agree."""
         own = self._resolve(self.submaps[k].unnamed)
         others = self.sees.copy()
         others[k] = False
@@ -266,8 +262,8 @@ class IslandView:
             self.record_merges(found, "near")
 
     def compare_again(self, fresh: Sequence[int], turn: int) -> None:
-        """Compare older submaps near the tick's ones (`fresh`) with undecided landmarks, which may
-        be decidable now.
+        """Compare older submaps near the tick's (`fresh`) with undecided landmarks, perhaps
+        decidable now.
 
         turn: selects among many such submaps, other ones at each turn.
         """
@@ -323,10 +319,9 @@ def select_comparisons(
     """Select the landmarks that `own` may be, for each submap worth a comparison.
 
     Besides the submap's landmarks these are the rivals that it lacks: landmarks that one of `own`
-    may be, known to be none of the submap's candidates. Without them a landmark that the submap
-    missed would be associated with its neighbour.
-
-    sees: landmarks of each submap. most_sd: largest standard deviation of a pair's difference.
+    may be and that are none of the submap's candidates. Without them a landmark that the submap
+    missed would be associated with its neighbour. sees: landmarks of each submap. most_sd: largest
+    standard deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)

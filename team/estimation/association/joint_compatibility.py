@@ -38,9 +38,9 @@ SURE_AFTER = 3
 others connect landmarks one spacing off.
 """
 MOST_ASSIGNED = 10
-"""Number of landmarks that are assigned together: those with the most certain candidates."""
+"""Most landmarks that are assigned together: those with the most certain candidates."""
 BEAM = 100
-"""Number of assignments that are continued from landmark to landmark."""
+"""Most assignments that are continued from landmark to landmark."""
 HOPELESS = 12.0
 """Log weight below the best assignment's [nat] at which another is dropped."""
 

@@ -28,7 +28,7 @@ from teamslam.team.estimation.contribution import Contribution, Key, Stream, nam
 OPEN = 2**62
 """Last sequence number of a side that includes all later submaps."""
 MOST_DECISIONS = 400
-"""Number of newest decisions that are stored."""
+"""Newest decisions that are stored."""
 
 
 class Decision(NamedTuple):
@@ -111,7 +111,7 @@ class Landmarks:
         return None if found is None else self._resolve_name(found)
 
     def judged(self) -> set[int]:
-        """The identities that an operator has judged."""
+        """Return the identities that an operator has judged."""
         members = (member for verdict in self.verdicts for member in verdict[:2])
         return {id_ for member in members if (id_ := self.identity(member)) is not None}
 
@@ -150,7 +150,7 @@ class Landmarks:
         return replace(self, decisions=(*self.decisions, *decisions)[-MOST_DECISIONS:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Whether a closure with a third or more of these pairs of identities was undone."""
+        """Return whether a closure with a third or more of these pairs of identities was undone."""
         proposed = {frozenset(pair) for pair in pairs}
         for each in self.undone:
             old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}
@@ -247,5 +247,5 @@ def merge_sets(
 
 
 def name_sides(one: Stream, two: Stream) -> str:
-    """Name the two sides of a decision, in words."""
+    """Name the two sides of a decision."""
     return named(one) if one == two else f"{named(one)} and {named(two)}"

@@ -18,14 +18,14 @@ from teamslam.team.shapes import Bool, UInt32
 KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")
 """The steps that merge landmarks."""
 RUN = 64
-"""Number of a stream's submaps whose rows are stored together."""
+"""Submaps of a stream whose rows are stored together."""
 CHUNK = 4096
-"""Number of given numbers that are stored together."""
+"""Given numbers that are stored together."""
 LAST = 11
-"""Number of a landmark's last members in its summary; all are in the log."""
+"""Last members of a landmark in its summary; all are in the log."""
 
 Rows = np.ndarray
-"""The unnamed landmarks of one submap, ascending by their local number, as records of `ROW`."""
+"""The unnamed landmarks of one submap, ascending by local number, as records of `ROW`."""
 ROW = np.dtype(
     [
         ("local", np.uint32),
@@ -54,7 +54,7 @@ class LocalLandmark(NamedTuple):
     local: int
 
     def __str__(self) -> str:
-        """`r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark."""
+        """Format as `r1/1/12/7`: robot, incarnation, sequence of the submap, local landmark."""
         return f"{self.robot}/{self.incarnation}/{self.sequence}/{self.local}"
 
 
@@ -81,7 +81,7 @@ class MemberRecord(NamedTuple):
 
 
 class MemberSummary(NamedTuple):
-    """The members of a landmark, by name: how many, the first one, and the last of the others."""
+    """Number, first and last members of a landmark, by name."""
 
     size: int
     first: MemberRecord
@@ -110,7 +110,7 @@ class MemberLog:
         return of_run[sequence % RUN] if sequence % RUN < len(of_run) else NO_ROWS
 
     def all_rows(self) -> Iterator[tuple[Stream, int, Rows]]:
-        """Iterate over stream, sequence and rows of each submap, by the streams' names."""
+        """Yield stream, sequence and rows of each submap, by the streams' names."""
         for stream in sorted(self.streams):
             for k, of_run in enumerate(self.runs[self.streams.index(stream)]):
                 for n, rows in enumerate(of_run):

@@ -18,9 +18,9 @@ class Scans:
 
     motions: the pose of keyframe k in the frame of keyframe k − 1, of the first in that of the
     window's start. motion_covariances: of (forward, left, turn), in the tangent space of the
-    motion's end. keyframes: the keyframe of each of the N detections, ascending. points: their
-    positions in the robot's frame at their keyframe [m]. covariances: of the points [m²]. names:
-    the identity of each, UNASSIGNED without one.
+    motion's end. keyframes: of each of the N detections, ascending. points: their positions in the
+    robot's frame at their keyframe [m]. covariances: of the points [m²]. names: the identity of
+    each, or UNASSIGNED.
     """
 
     motions: Float[np.ndarray, "K 3"]
@@ -53,13 +53,13 @@ def points_of(
 
 
 def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
-    """The rotation matrix of an angle."""
+    """Return the rotation matrix of an angle."""
     s, c = core.sin_and_cos(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
-    """The rotation matrix of each angle."""
+    """Return the rotation matrix of each angle."""
     s, c = core.sin_and_cos(angles)
     return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
 
@@ -73,7 +73,7 @@ def relative_to(
 
 
 def pose_jacobians(seen: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 3"]:
-    """∂h/∂ξ of h(pose ∘ Exp(ξ), point) = (x, y): [−1, 0, y; 0, −1, −x]."""
+    """Compute ∂h/∂ξ of h(pose ∘ Exp(ξ), point) = (x, y): [−1, 0, y; 0, −1, −x]."""
     J = np.zeros((len(seen), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = -1.0
     J[:, 0, 2], J[:, 1, 2] = seen[:, 1], -seen[:, 0]

@@ -1,9 +1,9 @@
 """Tracking within a window: an extended Kalman filter that matches the best pair first.
 
 EKF-SLAM (Smith, Self and Cheeseman 1990) with detections as points. A slip of the odometry is
-detected where few detections match despite landmarks nearby, and nearly all match if the robot is
-assumed to have jumped (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is
-then enlarged by the jump.
+detected where few detections match despite landmarks nearby, and nearly all match after a jump of
+the robot (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is then enlarged
+by the jump.
 """
 
 from typing import NamedTuple
@@ -165,9 +165,7 @@ class Tracker:
         points: Float[np.ndarray, "m 2"],
         covariances: Float[np.ndarray, "m 2 2"],
     ) -> float:
-        """Compute the joint squared Mahalanobis distance of these pairs over its limit, exceeded
-        with probability RARE.
-        """
+        """Compute the joint squared Mahalanobis distance of these pairs over its limit (RARE)."""
         m, n = len(landmarks), self._size
         if not m:
             return 0.0
@@ -244,8 +242,9 @@ class Tracker:
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Covariance of a motion with a slip of about this (forward, left, turn): the slip is its
-    standard deviation, at least LEAST_SLIP.
+    """Return the covariance of a motion with a slip of about this (forward, left, turn).
+
+    The slip is its standard deviation, at least LEAST_SLIP.
     """
     metres = max(core.hypot(*slip[:2]), LEAST_SLIP)
     turn = max(abs(float(slip[2])), LEAST_SLIP)
@@ -289,9 +288,7 @@ def _is_slip_suspected(
     covariances: Float[np.ndarray, "n 2 2"],
     reach: float,
 ) -> bool:
-    """Whether few detections match, some miss a landmark nearby, or the pairs do not fit
-    together.
-    """
+    """Return whether few detections match, some miss a landmark nearby, or the pairs do not fit."""
     known = np.nonzero(found != UNASSIGNED)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
         return False

@@ -1,8 +1,7 @@
 """The tests of a closure, at its proposal and during its audit, and of a map's landmarks.
 
-A closure is accepted only if it passes every test of `find_failed_test`; the first failed test is
-the reason for its deferral. An accepted closure is audited for some ticks by `overlap_share`, and
-undone where that falls below the bound of the profile.
+An accepted closure is audited for some ticks by `overlap_share`, and undone where that falls below
+the bound of the profile.
 """
 
 from collections.abc import Collection
@@ -87,7 +86,7 @@ def find_failed_test(closure: Closure, profile: AssociationProfile, tests: Closu
 
 
 def is_ambiguous(closure: Closure, profile: AssociationProfile) -> bool:
-    """Whether another alignment, with enough pairs for a merge of islands, is nearly as likely."""
+    """Return whether another alignment, with enough pairs for a merge, is nearly as likely."""
     evidence = closure.llr - profile.absent * closure.absent
     is_rivalled = (
         evidence - closure.rival_llr < profile.margin
@@ -104,7 +103,7 @@ def matched_share(
 ) -> float:
     """Compute matched places over the number of points near them, of the side with fewer.
 
-    A point is near if within the median distance between neighbouring places of a matched place.
+    Near: within the median distance between neighbouring places of a matched place.
     """
     if len(places) < 2:
         return 0.0
@@ -119,8 +118,8 @@ def overlap_share(
     places: Float[np.ndarray, "k 2"],
     profile: AssociationProfile,
 ) -> float:
-    """Compute matched places over the number of points, of the side with fewer, where both sides
-    viewed.
+    """Compute matched places over the number of points where both sides viewed, of the side with
+    fewer.
 
     one, two: all points of either side, matched ones included. The area is within WIDE spacings of
     a matched place and within one spacing of a point of the other side: maps of two robots differ
@@ -141,7 +140,7 @@ def overlap_share(
 
 
 def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> float:
-    """Twice the median distance [m] between neighbouring places, and at least twice `same`."""
+    """Compute twice the median distance [m] between neighbouring places, at least twice `same`."""
     away = core.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
     np.fill_diagonal(away, np.inf)
     return max(2.0 * float(np.median(away.min(axis=0))), 2.0 * profile.same)
@@ -150,7 +149,7 @@ def spacing(places: Float[np.ndarray, "k 2"], profile: AssociationProfile) -> fl
 def nearest_distance(
     points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance [m] from each point to the nearest one of `others`."""
+    """Compute the distance [m] from each point to the nearest one of `others`."""
     away: Float[np.ndarray, " n"] = core.hypot(
         *(points[:, None] - others[None]).transpose(2, 0, 1)
     ).min(axis=1)
@@ -161,10 +160,10 @@ def find_possible_duplicates(view: IslandView, ids: Collection[int]) -> dict[int
     """Map each of these landmarks that may be one with another of them to the likeliest, which
     stays.
 
-    Two landmarks may be one where they are within the gate, and have the log-likelihood ratio
-    (`gating`) with which a pair without a rival is merged, or would lack it even at one place:
-    there the density of landmarks in the gate exceeds the evidence. The landmark with the most
-    certain position stays, by the area of its covariance's ellipse.
+    Two landmarks may be one where they are within the gate, and have the log-likelihood ratio with
+    which a pair without a rival is merged, or would lack it even at one place: there the density of
+    landmarks in the gate exceeds the evidence. The landmark with the most certain position stays,
+    by the area of its covariance's ellipse.
     """
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)

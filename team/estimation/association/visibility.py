@@ -32,9 +32,7 @@ def pad_views(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
 
 
 def renumber_views(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
-    """Renumber the landmarks of the views; −1 drops a landmark, and a view with fewer than
-    three.
-    """
+    """Renumber the landmarks of the views; −1 drops a landmark, and views of fewer than three."""
     if not views.size:
         return views
     numbered = np.where(views >= 0, to[views], -1)
@@ -45,11 +43,9 @@ def renumber_views(views: Views, to: Int64[np.ndarray, " n"]) -> Views:
 def mark_visible(
     points: Float[np.ndarray, "n 2"], own: Float[np.ndarray, "m 2"], views: Views
 ) -> Bool[np.ndarray, " n"]:
-    """Mark the points in the convex hull of the landmarks of any one view, at their positions
-    `own`.
+    """Mark the points in the convex hull of any one view's landmarks, at their positions `own`.
 
-    A point lies in a hull when the directions from it to the hull's points leave no gap of half a
-    turn.
+    A point lies in a hull when the directions to the hull's points leave no gap of half a turn.
     """
     inside = np.zeros(len(points), np.bool_)
     if not len(points) or not views.size:
@@ -88,10 +84,10 @@ def miss_probabilities(
 
 
 def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
-    """Mark the landmarks that later submaps miss: a landmark of n < WELL_KNOWN submaps, if each
-    well-known landmark beside it in its last one is in WELL_KNOWN n submaps since.
+    """Mark the landmarks that later submaps miss.
 
-    sees: landmarks of each submap, in the order of time.
+    A landmark of n < WELL_KNOWN submaps, if each well-known landmark beside it in its last one is
+    in WELL_KNOWN n submaps since. sees: landmarks of each submap, in the order of time.
     """
     counts = sees.sum(axis=0)
     beside = sees & (counts >= WELL_KNOWN)
