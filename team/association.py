@@ -15,8 +15,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """Thresholds for merging landmarks without identities; lengths in metres.
 
     LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
-    empirical (docs/notes/association-with-undo.md). `tight`, `same` and `slack` are reduced where a
-    map's landmarks stand closer (`estimation.association.density`).
+    empirical (docs/notes/association-with-undo.md).
     """
 
     gate: Positive = GATE

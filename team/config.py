@@ -1,8 +1,8 @@
 """Configuration of a robot: motion model, sensor, front end, bounds.
 
-SI units; angles in radians unless the name ends in `_deg`. Motion noise is a density: a standard
-deviation per square root of a second, of a metre driven and of a radian turned, added in variance,
-so it does not depend on the odometry's rate.
+SI units; angles in radians unless the name ends in `_deg`. Motion noise is a density, added in
+variance: a standard deviation per square root of a second, of a metre driven and of a radian
+turned.
 """
 
 import math
@@ -274,11 +274,11 @@ class FrontEnd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior scales of the errors shared by all submaps of a robot.
+    """Prior scales of the errors shared by all submaps of a robot: Student's t of one degree of
+    freedom.
 
-    The prior is Student's t of one degree of freedom: a robot may be off by any amount. bearing
-    [rad]; clock_offset [s]; range_offset [m]; range_scale, forward_scale: shares of the range and
-    of the distance driven.
+    bearing [rad]; clock_offset [s]; range_offset [m]; range_scale, forward_scale: shares of the
+    range and of the distance driven.
     """
 
     bearing: Positive = 0.002

@@ -1,8 +1,7 @@
 """The fault boundary around a node sets messages aside whose handling raises.
 
-Shells, teams in memory and reruns pass messages to their nodes through it, so all have the same
-results. Such a message is published as `Fault`, counted, and ignored when it is delivered again;
-the node continues with the messages of its `set_aside`. An interrupt or an exit ends the process.
+Such a message is published as `Fault`, counted, and ignored when it is delivered again; the node
+continues with the messages of its `set_aside`. An interrupt or an exit ends the process.
 """
 
 import hashlib
@@ -64,8 +63,7 @@ class Recovers(Protocol):
 class Boundary:
     """Pass messages to one node, and count refused messages and exceptions.
 
-    last, last_refused: description of the newest of each. aside: messages that are not handled
-    again, by key and digest.
+    aside: messages that are not handled again, by key and digest.
     """
 
     name: str
@@ -103,7 +101,7 @@ class Boundary:
     ) -> list[Outgoing]:
         """Let the node handle a message; return the answers, or the fault and the replacement.
 
-        sample: the message as it arrived; None: it is encoded only if its bytes are needed.
+        sample: the message as it arrived; None: encode it if needed.
         """
         if self.aside and _name(sample or _sample_of(message)) in self.aside:
             return []
@@ -121,7 +119,6 @@ class Boundary:
     def _set_aside(
         self, node: Handler, message: m.Message, sample: Sample, error: Exception
     ) -> list[Outgoing]:
-        """Return the fault of an exception, and the node's messages in place of its answer."""
         tag = m.tag_of(type(message))
         out = [self.note(error, sample, tag)]
         self.aside.add(_name(sample))
@@ -213,7 +210,6 @@ def place_of(trace: TracebackType | None) -> str:
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
-    """Return whether an exception is, or was caused by, an interrupt."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

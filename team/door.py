@@ -1,8 +1,6 @@
-"""Refuse messages that are valid but contradict the team.
+"""Refuse messages that are valid but contradict the team: strangers, impossible counters, stamps.
 
-A stranger or a broken robot may send unknown robots, unreachable incarnations and counters, or
-stamps that are years off. The bounds are so wide that no order of arrival makes a true message
-fail.
+The bounds are so wide that no order of arrival makes a true message fail.
 """
 
 from collections.abc import Iterable, Iterator
@@ -46,9 +44,8 @@ class Door:
         return refused or self._another_time(message)
 
     def _note_beginning(self, start: m.InitialPose) -> None:
-        """Store a stream's start time; two contradicting ones remove the stream's bounds.
-
-        One of the two is forged, and the messages of the true source must be accepted.
+        """Store a stream's start time; two contradicting ones, one of them forged, remove its
+        bounds.
         """
         stream = (start.robot, start.incarnation)
         known = self._began.setdefault(stream, start.stamp_ns)
@@ -88,7 +85,6 @@ def absurd(message: m.Message) -> str | None:
 
 
 def _robots(message: m.Message) -> Iterator[str]:
-    """Yield the robots that a message claims for the team."""
     match message:
         case m.SightingFactor():
             yield message.robot

@@ -22,7 +22,6 @@ _STARTED = time.monotonic()
 
 
 def _forked() -> None:
-    """Set the start of a forked process to the fork."""
     global _STARTED
     _STARTED = time.monotonic()
 
@@ -33,10 +32,10 @@ os.register_at_fork(after_in_child=_forked)
 class EndQuery:
     """Query the router for the samples that end the team of this process.
 
-    An end that is older than the process belongs to another run, unless SINCE states an earlier
-    start of the run, or an earlier process of this node took part in that run and ended without a
-    `Tally`. ends: channels on which the team ends: the centre's final map, or, without a centre,
-    each robot's own. robot: the robot of interest on the robots' channels; "*": all.
+    An end older than the process belongs to another run, unless SINCE is earlier, or an earlier
+    process of this node was in that run and left without a `Tally`. ends: channels on which the
+    team ends: the centre's final map, or, without a centre, each robot's own. robot: the robot of
+    interest on the robots' channels; "*": all.
     """
 
     def __init__(

@@ -21,7 +21,6 @@ def install_command(extra: str) -> str:
 
 
 def _packages(extra: str) -> Iterator[str]:
-    """Yield the requirements of an extra, those of contained extras first."""
     try:
         stated = requires(US) or []
     except PackageNotFoundError:

@@ -5,7 +5,7 @@
   (east, north) = E (p(φ, λ) − p(φ₀, λ₀)),  E: the east and north axes at (φ₀, λ₀)
 
 All points have the datum's height h above the ellipsoid; an error of 100 m scales the plane by
-1.6·10⁻⁵. The plane shortens a distance d from the datum by d³ / 6a²: 4 mm at 10 km.
+1.6·10⁻⁵. The plane shortens a distance d by d³ / 6a²: 4 mm at 10 km.
 """
 
 from typing import Annotated

@@ -1,8 +1,8 @@
 """The estimators as a library of functions on arrays, without processes or network.
 
-`from teamslam import …` provides every name listed here. The changelog announces a change of a name
-or its meaning one version ahead. Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in
-(−π, π]. Landmarks are points with ids, measured by range [m] and bearing [rad].
+Poses are (x [m], y [m], theta [rad]), theta counter-clockwise in (−π, π]. Landmarks are points with
+ids, measured by range [m] and bearing [rad]. The changelog announces a change of a name or its
+meaning one version ahead.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -127,9 +127,8 @@ class JoinedMap:
 class BatchMap:
     """The least-squares solution over all measurements at once: the batch reference.
 
-    landmarks: means and joint covariance in the common frame. trajectories: each robot's poses at
-    its start and at its keyframes. chi2, dof: chi2/dof is about 1 for right models. converged:
-    whether the iterations reached the solution.
+    As `JoinedMap`, with each robot's poses at its start and at its keyframes. converged: whether
+    the iterations reached the solution.
     """
 
     landmarks: LandmarkMap
@@ -199,10 +198,10 @@ def join(
 ) -> JoinedMap:
     """Join each robot's consecutive submaps to the team's map by sparse nonlinear least squares.
 
-    Each submap of a robot begins where its last one ended. initial_poses: known ones; without any,
-    the first robot's is the common frame. A robot without one is joined by landmarks that it shares
-    with the others; where these do not suffice, `apart` has the reason. Raises ValueError without
-    submaps, or for an initial pose of a robot without submaps.
+    initial_poses: known ones; without any, the first robot's is the common frame. A robot without
+    one is joined by landmarks that it shares with the others; where these do not suffice, `apart`
+    has the reason. Raises ValueError without submaps, or for an initial pose of a robot without
+    submaps.
     """
     unknown = sorted(set(initial_poses) - set(submaps))
     if unknown or not any(submaps.values()):
@@ -232,7 +231,6 @@ def join(
 
 
 def _ticks(submaps: Mapping[str, Sequence[LocalMap]]) -> Iterator[list[Contribution]]:
-    """Yield the first submaps of all robots, then the second ones, and so on."""
     robots = sorted(submaps)
     for sequence, row in enumerate(zip_longest(*(submaps[robot] for robot in robots))):
         yield [

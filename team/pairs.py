@@ -1,7 +1,6 @@
 """The table of estimators and fusion rules, and which estimator may feed which rule.
 
-A row names its class as `package.module:name`, loaded when it is chosen (`team.registry`), so the
-methods for comparison can be left out of an installation.
+A row names its class as `package.module:name`, loaded when it is chosen (`team.registry`).
 """
 
 from collections.abc import Mapping

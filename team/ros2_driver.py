@@ -1,7 +1,6 @@
 """A ROS 2 robot's driver, without ROS: its topics on Zenoh become a robot's stream.
 
-Messages are decoded, translated as a bag's, and passed to the driver. Damaged, refused and lost
-messages are counted and named; none ends the process.
+Damaged, refused and lost messages are counted and named; none ends the process.
 """
 
 import logging
@@ -97,11 +96,10 @@ class Ros2Driver:
     """Passes the publications on a robot's topics to its driver.
 
     taken: messages by topic; dropped: by reason; lost: published and never received. Waiting
-    messages are passed on in the order of their stamps, since topics have no common order.
-    on_odometry: called with each odometry pose and its frames. datum: origin of the plane of the
-    team's fixes, which are dropped without one. name, others: the robot's name, and the topics of
-    the others in the file, which may be its own, too: a detection there belongs to the robot to
-    whose base its frame is attached.
+    messages are passed on in the order of their stamps. on_odometry: called with each odometry pose
+    and its frames. datum: origin of the plane of the team's fixes, which are dropped without one.
+    name, others: the robot's name, and the topics of the others in the file, which may be its own,
+    too.
     """
 
     def __init__(
@@ -210,7 +208,6 @@ class Ros2Driver:
                 self._note(f"{earliest}: refused", str(error))
 
     def _earliest(self) -> str | None:
-        """Return the topic whose next measurement has the earliest stamp."""
         heads = []
         for topic in self._backlog.waiting:
             queue = self._translated.setdefault(topic, deque())
@@ -221,7 +218,6 @@ class Ros2Driver:
         return min(heads)[1] if heads else None
 
     def _decoded(self, topic: str, kind: str, payload: bytes) -> list[Measured]:
-        """Return the measurements of one message; a static transform has none."""
         self.taken[topic] += 1
         if kind not in READERS:
             self._note(f"{topic}: messages of type {kind} are not read")
@@ -245,7 +241,6 @@ class Ros2Driver:
             return []
 
     def _report_odometry(self, record: Record) -> None:
-        """Pass the odometry's pose on, whether it is used as a pose or as speeds."""
         assert self._on_odometry is not None
         if isinstance(record, OdometryRecord):
             x, y, _ = record.position
@@ -380,7 +375,6 @@ class Ros2Driver:
 
 
 def _stamped(record: Record) -> Record:
-    """Stamp a message without a stamp with the time of its arrival."""
     if isinstance(record, TransformsRecord) or record.stamp_ns:
         return record
     return record._replace(stamp_ns=time.time_ns())

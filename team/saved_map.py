@@ -50,8 +50,7 @@ def write_map(path: Path, saved: m.SavedMap) -> None:
 def submap_of(saved: m.SavedMap) -> m.Submap:
     """Make the submap of a saved map: landmarks only, before the team's time.
 
-    Its end pose lies at its start, with a small covariance of its own. All its unnamed landmarks
-    count as seen at once: no two are one.
+    All its unnamed landmarks count as seen at once: no two are one.
     """
     n = 2 * len(ids(saved.ids, "ids"))
     submap = member_of(

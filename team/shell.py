@@ -272,7 +272,6 @@ class Shell:
                 self._note_recorded(decoded(sample.payload, Tally), self._totals)
 
     def _note_recorded(self, has: Tally, totals: Tally) -> None:
-        """Update the number of messages that the recorder lacks, and the time of its progress."""
         if has.since_ns != totals.since_ns:
             return
         published = dict(zip(totals.keys, totals.counts, strict=True))
@@ -286,9 +285,8 @@ class Shell:
     def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
         """Wait until a recorder has reported all messages that this process published.
 
-        Only the publisher can repeat its messages. The wait ends if no recorder is present for
-        RECORDER_S, or if it makes no progress for RECORDER_S. lacks: whether the recorder lacks
-        anything else. take: handles other samples meanwhile.
+        The wait ends if no recorder is present, or makes progress, for RECORDER_S. lacks: whether
+        the recorder lacks anything else. take: handles other samples meanwhile.
         """
         if self._recorder_is_there is None:
             return
@@ -322,7 +320,6 @@ class Shell:
         return time.monotonic() - self._recorder_since >= BACK_S
 
     def _lacks(self) -> str:
-        """Describe the messages that are missing in the log."""
         if not self._recorder_is_there:
             return "it is away"
         if not self._lacking:
@@ -394,8 +391,7 @@ def process(
     """Run a process of a team until SIGTERM, SIGINT or its parent's death.
 
     A process stopped before its work is done exits with 128 + the signal's number; an `endless` one
-    with 0. The kernel ends it LAST_S after the first signal; a `patient` process, which has to
-    deliver its data, after the second one.
+    with 0. The kernel ends it LAST_S after the first signal, a `patient` process after the second.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format=f"{name}: %(message)s")
     stop = threading.Event()

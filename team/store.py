@@ -1,8 +1,8 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
 
 A submap is complete when all inter-robot measurements that it announces are stored. Admission
-enforces law 1: a submap whose measurements overlap another's, or that differs from a stored one of
-the same name, is refused with the reason.
+refuses a submap whose measurements overlap another's (law 1), or that differs from a stored one of
+the same name.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +23,8 @@ class StoredStream:
     """The members of one incarnation of a robot.
 
     submaps: by sequence. sightings: inter-robot measurements by sequence, then by (stamp,
-    teammate). chain: the complete submaps from sequence 0 on, without a gap; it only grows. used:
-    the (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of refused
+    teammate). chain: the complete submaps from sequence 0 on, without a gap. used: the
+    (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of refused
     submaps, and of those with a refused inter-robot measurement.
     """
 
@@ -154,7 +154,6 @@ class SubmapStore:
         return found
 
     def _settle(self, member: m.Submap | m.SightingFactor, reason: str | None) -> str | None:
-        """Mark a refused member, or extend the chain by a stored one; return the reason."""
         if reason is not None:
             self.refuse(member)
         else:
@@ -168,10 +167,7 @@ class SubmapStore:
             self.chains[key] = stream.chain
 
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
-        """Store a submap, or return the reason for its refusal.
-
-        The measurements of the nearest submaps in sequence bound those of this one (law 1).
-        """
+        """Store a submap, or return the reason to refuse it by the submaps nearest in sequence."""
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
         submaps = stream.submaps
@@ -203,7 +199,6 @@ class SubmapStore:
         return None
 
     def _refusal_of_sighting(self, sighting: m.SightingFactor) -> str | None:
-        """Store an inter-robot measurement, or return the reason for its refusal."""
         teammate = sighting.teammate
         stream = self._stream((sighting.robot, sighting.incarnation))
         from_submap = stream.sightings.setdefault(sighting.sequence, {})

@@ -331,8 +331,8 @@ NAMED = 10
 def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
     """Reduce the map to a form that every receiver accepts; describe the omissions.
 
-    A joint covariance that is not positive definite by rounding is replaced by the landmarks' own;
-    a landmark with an invalid covariance or mean is omitted.
+    A joint covariance lost to rounding is replaced by the landmarks' own; a landmark with an
+    invalid covariance or mean is omitted.
     """
     warnings = []
     if message.joint and unsound(message) is not None:

@@ -1,7 +1,4 @@
-"""Detect a step of the wall clock, as on a computer whose clock has no battery.
-
-Such a computer starts in the past; the ages of files written before the step are wrong by it.
-"""
+"""Detect a step of the wall clock, as on a computer whose clock has no battery."""
 
 import time
 from collections.abc import Mapping

@@ -1,8 +1,7 @@
 """The driver delivers a program's measurements to the robot's process.
 
 Each measurement is checked, written to the robot's file and published by a separate thread, so a
-call never waits for the network. Receivers request missed measurements; the driver answers from the
-file.
+call never waits for the network. Missed measurements are sent from the file.
 """
 
 import logging
@@ -60,16 +59,15 @@ class DriverError(RuntimeError):
 class Driver:
     """Deliver one robot's measurements to its team; use as `with Driver(…) as robot`.
 
-    robot: name of the robot. team: name of the team, as in the scenario. connect: endpoint of the
-    router. keys: folder with the certificate `source-<robot>`. file: file of all measurements,
-    default `<robot>.stream`; a driver started again with the same file continues its stream. start:
-    (x [m], y [m], theta [rad]) in the team's frame; None: unknown. start_covariance: 3 × 3; None:
-    exactly known. landmarks: all landmark ids, if known. latency_s: longest delay of a detection
-    behind the odometry of its time. patience_s: time to wait for the router with a new file; 0:
-    connect later. bounds: physical limits of the robot; without them a yaw rate beyond LIKELY_RAD_S
-    is refused, too. on_message: called in another thread with each message of the team for this
-    robot: poses in the team's frame (`PoseEstimate`), maps (`FusedMap`), smoothed paths
-    (`Trajectory`) and the status of its process; it has to return at once. map: file of a saved map
+    team: as in the scenario. connect: endpoint of the router. keys: folder with the certificate
+    `source-<robot>`. file: of all measurements, default `<robot>.stream`; a driver started again
+    with the same file continues its stream. start: (x [m], y [m], theta [rad]) in the team's frame;
+    None: unknown. start_covariance: 3 × 3; None: exactly known. landmarks: all landmark ids, if
+    known. latency_s: longest delay of a detection behind the odometry of its time. patience_s: time
+    to wait for the router with a new file; 0: connect later. bounds: physical limits of the robot;
+    without them a yaw rate beyond LIKELY_RAD_S is refused, too. on_message: called in another
+    thread with each message of the team for this robot (`PoseEstimate` in the team's frame,
+    `FusedMap`, smoothed `Trajectory`, `Status`); it has to return at once. map: file of a saved map
     that the team's map joins, as by `teamslam central --map`; one driver of the team is enough.
 
     Times `t` are seconds on one clock for the whole team, such as Unix time. Raises DriverError if
@@ -268,8 +266,7 @@ class Driver:
     ) -> None:
         """Add a scan of landmarks without identities at t: ranges [m] and bearings [rad].
 
-        classes: for each landmark the row P(its reported class | class c), that column of the
-        detector's confusion matrix.
+        classes: a row P(its reported class | class c) for each landmark.
         """
         stamp_ns = measurement_messages.stamp_of(t, "detect")
         seen = measurement_messages.detections(
@@ -314,9 +311,8 @@ class Driver:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)), the robot's last published pose in the team's frame.
-
-        None while the robot is not joined to the team's map.
+        """(t, (x, y, theta)), the last published pose in the team's frame; None: not joined to the
+        map.
         """
         return self._node.team_pose
 
@@ -449,7 +445,6 @@ class Driver:
         self._put(kind, message.stamp_ns, encoded(named))
 
     def _begin(self, stamp_ns: int, *, known: bool) -> None:
-        """Begin the stream, or its next incarnation, at this time."""
         first = self._journal.first_incarnation
         self._incarnation = self._incarnation + 1 if self._incarnation else first
         pose, covariance = self._start if known else (b"", b"")
@@ -506,9 +501,8 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """Return the length of the interval that ends now [ns].
-
-        None: no interval; `_drive` bridges the gap, or the next incarnation begins.
+        """Return the length [ns] of the interval that ends now; None: `_drive` bridges the gap, or
+        the next incarnation begins.
         """
         self._resume(stamp_ns)
         end_ns = self._odometer.end_ns
@@ -587,7 +581,6 @@ class Driver:
 def _times(
     t: float | Decimal, duration: float | Decimal | None, call: str
 ) -> tuple[int, int | None]:
-    """Convert the end and the length of an interval to [ns]."""
     length_ns = None if duration is None else measurement_messages.stamp_of(duration, "a duration")
     return measurement_messages.stamp_of(t, call), length_ns
 
@@ -606,7 +599,6 @@ def _read_map(path: Path, *, with_keys: bool) -> m.SavedMap:
 def _start_of(
     robot: str, start: Sequence[float] | None, covariance: ArrayLike | None
 ) -> tuple[bytes, bytes]:
-    """Encode the initial pose and its covariance for the message."""
     if start is None:
         return b"", b""
     what = f"the start of {robot}"

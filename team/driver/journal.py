@@ -1,8 +1,7 @@
 """A driver's file of all measurements, in order of arrival, written before they are published.
 
-The file is append-only: a head (MessagePack), then records `<IBq` (payload length, kind, stamp
-[ns]), the payload (a measurement with number 0) and its CRC-32. An incomplete last record is
-removed; a file with an incomplete head is started again.
+Append-only: a head (MessagePack), then records `<IBq` (payload length, kind, stamp [ns]), the
+payload (a measurement with number 0) and its CRC-32. An incomplete last record is removed.
 """
 
 import fcntl
@@ -34,9 +33,8 @@ Place = tuple[int, int]
 class Sorter:
     """Sort items by their places, with a bounded delay.
 
-    A camera's frame may arrive tens of milliseconds after the odometry of its time, so a
-    measurement is held until one newer by `latency_ns` has arrived. Its number depends on the order
-    of the calls alone; a restarted driver reconstructs it from the file.
+    A camera's frame may arrive after the odometry of its time, so a measurement is held until one
+    newer by `latency_ns` has arrived. Its number depends on the order of the calls alone.
     """
 
     def __init__(self, latency_ns: int) -> None:
@@ -92,11 +90,10 @@ class JournalError(RuntimeError):
 class Journal:
     """One robot's file, open for appending (`opened`). Any thread may read.
 
-    incarnation: the one in progress; 0: none. state: of the stream, as in its head. delivered:
-    every receiver has all of it. calls: offsets of all records but marks, in order of arrival.
-    driven_ns, pose: end of the last odometry interval, and the odometry pose there. cut: number of
-    bytes behind the last whole record; is_damaged: they are no incomplete record. clock: the wall
-    clock at the last mark.
+    incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
+    offsets of all records but marks, in order of arrival. driven_ns, pose: end of the last odometry
+    interval, and the odometry pose there. cut: number of bytes behind the last whole record;
+    is_damaged: they are no incomplete record. clock: the wall clock at the last mark.
     """
 
     path: Path
@@ -243,9 +240,8 @@ class Journal:
         self.cut, self._size = end - at, at
 
     def cut_off(self) -> str:
-        """Remove the bytes behind the last whole record; return a description.
-
-        A killed process leaves an incomplete record. After damage within the file a copy is kept.
+        """Remove the bytes behind the last whole record, with a copy if damaged; return a
+        description.
         """
         if not self.cut:
             return ""
@@ -269,8 +265,7 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
     """Open a robot's journal for appending; return it with a description of its contents.
 
     A delivered stream, or one that has not grown for OLD_S, is moved aside; the new one begins with
-    the next incarnation number. Raises JournalError for a file of another robot or of no driver, or
-    one that another driver has open.
+    the next incarnation. Raises JournalError for a file of another robot, of no driver, or in use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _locked(path, robot)
@@ -310,7 +305,6 @@ def _read_whole(journal: Journal) -> bool:
 
 
 def _first_after(aside: Path | None, robot: str) -> int:
-    """Return the first incarnation of a new file, after those of the file set aside."""
     if aside is not None:
         with suppress(JournalError, OSError):
             earlier = _locked(aside, robot)
@@ -347,8 +341,7 @@ def _locked(path: Path, robot: str) -> Journal:
 def _head_of(journal: Journal) -> tuple[int, int] | None:
     """Return the first incarnation in a file's head, and the head's length; None: an empty file.
 
-    A crash may leave a part of the head and zeros, which count as empty. Raises JournalError for a
-    file of another robot or of no driver.
+    A crash may leave a part of the head and zeros. Raises JournalError for any other file.
     """
     begin = os.pread(journal._file, 4096, 0)
     unpacker = msgpack.Unpacker()
@@ -373,7 +366,6 @@ def _head_of(journal: Journal) -> tuple[int, int] | None:
 
 
 def _is_blank(file: int, at: int) -> bool:
-    """Return whether a file has only zeros from here on."""
     while block := os.pread(file, 2**20, at):
         if any(block):
             return False
@@ -382,7 +374,6 @@ def _is_blank(file: int, at: int) -> bool:
 
 
 def _newest_aside(path: Path) -> Path | None:
-    """Return the file that was set aside last."""
     number = 1
     while path.with_name(f"{path.name}.{number}").exists():
         number += 1

@@ -66,7 +66,7 @@ class Link:
     def open(self, patience_s: float) -> None:
         """Start the thread and wait for the router; raises BusError or KeysError after patience_s.
 
-        With patience_s = 0 it returns at once and logs the first failure.
+        patience_s = 0: return at once, and log the first failure.
         """
         self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S

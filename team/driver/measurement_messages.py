@@ -206,7 +206,6 @@ def square(covariance: ArrayLike | None, what: str) -> bytes:
 
 
 def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
-    """Pack covariances of (range [m], bearing [rad])."""
     packed = _blocks(covariances, count, what)
     for sigma in np.sqrt(np.asarray(covariances)[:, 1, 1]).tolist() if packed else ():
         if sigma > LARGEST_SIGMA_RAD:
@@ -218,7 +217,6 @@ def _polar_blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes
 
 
 def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
-    """Pack the covariances, (count, 2, 2); None: empty."""
     if covariances is None or not count:
         return b""
     blocks = np.asarray(covariances, dtype=np.float64)

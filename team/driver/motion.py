@@ -22,8 +22,8 @@ class Odometer:
     """State of the odometry: end of the last interval, and the odometry pose there if given.
 
     speeds: forward [m/s] and yaw rate [rad/s] of the last interval. gap_ns: time before it without
-    odometry, beyond clock jitter. home: first pose. steps, fastest: number of intervals and their
-    highest speed [m/s]. rates: (ahead, left, turn) per second of the last one.
+    odometry. home: first pose. steps, fastest: number of intervals and their highest speed [m/s].
+    rates: (ahead, left, turn) per second of the last one.
     """
 
     robot: str
@@ -41,7 +41,7 @@ class Odometer:
         """Return the length [ns] of the interval that ends now; None: the first, without a
         duration.
 
-        An interval begins where the last one ended, within clock jitter; `add` changes the state.
+        It begins where the last one ended, within clock jitter.
         """
         end_ns, what = self.end_ns, self._what(call, stamp_ns)
         self.gap_ns = 0

@@ -31,11 +31,11 @@ Stream = tuple[int, int]
 class SourceNode:
     """Call `begin`, then `publish` and `handle` in turn until `finished`.
 
-    An incarnation is published once the robot has consumed the one before, since it drops the rest
-    of that. delivered, recorded: progress of the robot and the recorder. done: incarnation,
-    measurements and submaps of the robot's `Done`. joined: incarnation and submaps acknowledged by
-    the centre. is_peer: the robot keeps a set of its own. concluded: it has its final map. models:
-    configuration announced by the robot's process.
+    An incarnation is published once the robot has consumed the one before. delivered, recorded:
+    progress of the robot and the recorder. done: incarnation, measurements and submaps of the
+    robot's `Done`. joined: incarnation and submaps acknowledged by the centre. is_peer: the robot
+    keeps a set of its own. concluded: it has its final map. models: the robot's announced
+    configuration.
     """
 
     journal: Journal
@@ -163,7 +163,7 @@ class SourceNode:
     def refusal(self, message: m.Message) -> str | None:
         """Return the reason to refuse a message that claims more than was numbered; None: accepted.
 
-        The robot's first progress is accepted: it may belong to another file of the same robot.
+        The robot's first progress may belong to another file.
         """
         refused = absurd(message)
         if refused is not None or not isinstance(message, m.Progress | m.Done):
@@ -217,14 +217,12 @@ class SourceNode:
                 pass
 
     def _update_robot(self, message: m.PoseEstimate | m.Configuration) -> None:
-        """Keep the robot's pose or its announced configuration."""
         if isinstance(message, m.PoseEstimate):
             self.pose = message
         elif message.node == ch.robot_node(self._robot):
             self.models = _models(message)
 
     def _compare(self, head: m.StreamHead) -> None:
-        """Warn if two drivers' stamps differ by more than a day: the team needs one clock."""
         if not self.journal.incarnation or head.robot in self._others:
             return
         apart_ns = self.journal.newest_ns - head.stamp_ns
@@ -250,8 +248,8 @@ class SourceNode:
     def is_delivered(self) -> bool:
         """Whether no process can request the measurements again.
 
-        The robot has consumed all measurements, the centre has acknowledged all its submaps (a peer
-        has its final map), and a recorder, if present, has everything.
+        The robot has consumed them, the centre has acknowledged its submaps (a peer has its final
+        map), and a present recorder has everything.
         """
         newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         incarnation, measurements, submaps = self.done
@@ -302,7 +300,6 @@ class SourceNode:
 
 
 def _models(message: m.Configuration) -> RobotConfig | None:
-    """Decode the configuration in an announcement; None: of another version."""
     try:
         return msgspec.json.decode(message.configuration, type=RobotConfig)
     except (msgspec.MsgspecError, ValueError):

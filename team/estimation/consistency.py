@@ -41,8 +41,8 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 def chi2_limit(dof: int, tail: float) -> float:
     """Compute the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
-    Rounded to twelve digits. For few degrees of freedom by bisection of the finite sum (Abramowitz
-    & Stegun 26.4.4 and 26.4.5).
+    Rounded to twelve digits. For few degrees by bisection of the finite sum (Abramowitz & Stegun
+    26.4.4 and 26.4.5).
     """
     if dof > FEW:
         return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
@@ -116,8 +116,8 @@ def covariance_scale(
 ) -> Scale | None:
     """Estimate the scale s of terms s χ²(dof): the weighted median of squared_k / median χ²(dof_k).
 
-    It is insensitive to a few outliers, however large. Terms with less than one degree of freedom
-    are left out; None where none is left. medians: of χ²(dof), if available.
+    Terms with less than one degree of freedom are left out; None where none is left. medians: of
+    χ²(dof), if available.
     """
     judged = dof >= 1.0
     if not judged.any():

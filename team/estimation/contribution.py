@@ -118,8 +118,8 @@ class OwnBiases:
 
       o ~ N(mean + Gᵀ b, covariance),   cov(o, landmarks) = cross.
 
-    errors: ascending. by_common: G, a row for each of the map's `biases`. Without the priors of (b,
-    o), the map's measurements have the likelihood N(likeliest, evidence⁻¹) of (b, o).
+    errors: ascending. by_common: G, a row for each of the map's `biases`. likeliest, evidence: the
+    likelihood N(likeliest, evidence⁻¹) of (b, o) without their priors.
     """
 
     errors: tuple[RobotBias, ...] = ()

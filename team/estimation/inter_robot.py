@@ -91,8 +91,7 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     """Locate a teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the
     node.
 
-    Its covariance is the sum of the sensor's, that of the marker on the teammate (marker_sigma) and
-    that of the drift.
+    Its covariance is the sum of the sensor's, the marker's (marker_sigma) and the drift's.
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = core.squared(sensor.marker_sigma) + drift * drift
@@ -142,8 +141,7 @@ def reduced(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
     """Reduce several measurements of a teammate from one node to one (range, bearing).
 
-    The median of each; the covariance is the mean of theirs, as for one measurement, since a camera
-    repeats its error on a marker.
+    The median of each, with the mean of their covariances, since a camera repeats its error.
     """
     ranges = [max(core.hypot(*each.point), NEAREST_M) for each in carried]
     bearings = [core.atan2(each.point[1], each.point[0]) for each in carried]

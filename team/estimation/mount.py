@@ -1,8 +1,7 @@
 """A sensor mounted off the origin of the robot's base.
 
 Within a window poses and motions are the sensor's. For a motion T of the base the sensor at m moves
-by m⁻¹ ∘ T ∘ m; at the window's end the base's pose is m ∘ S ∘ m⁻¹ with S the sensor's, and a point
-p in the frame of the sensor's start is m p in the base's.
+by m⁻¹ ∘ T ∘ m; the base's pose is m ∘ S ∘ m⁻¹ with S the sensor's.
 """
 
 import numpy as np

@@ -1,9 +1,9 @@
 """Scans of landmarks, each measurement with its own covariance or with the sensor's.
 
 `own` has a row for each measurement: of length 0 where none has a covariance, else (rr [m²], rb
-[m·rad], bb [rad²], form). form POLAR: the covariance of range and bearing. form POINT: that of a
-point in the sensor's frame, to first order: diag(1, 1/r) S diag(1, 1/r), S along and across the
-measured bearing. form SENSOR: the sensor's noise, at the predicted range.
+[m·rad], bb [rad²], form). POLAR: of range and bearing. POINT: of a point in the sensor's frame, to
+first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing. SENSOR: the
+sensor's noise, at the predicted range.
 """
 
 from typing import NamedTuple

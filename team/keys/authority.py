@@ -1,8 +1,7 @@
 """A team's certificate authority and the certificates that it issues.
 
 Keys are on curve P-256. A certificate names node (CN) and team (O), the router's also its hosts.
-Node certificates are for clients only, so no robot can pose as the router. Validity begins an hour
-early, since robot clocks differ.
+Node certificates are for clients only. Validity begins an hour early, since robot clocks differ.
 """
 
 import os
@@ -60,7 +59,7 @@ def make_keys(
     """Create a missing authority and missing certificates in the folder.
 
     renew: nodes that get a new key and certificate under the same name. revoke: nodes whose name
-    the router no longer accepts; a later certificate has another name. Raises KeysError.
+    the router no longer accepts. Raises KeysError.
     """
     now = now or datetime.now(UTC)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -97,7 +96,6 @@ _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
 def _authority(folder: Path, team: str, now: datetime) -> _Authority:
-    """Load or create the folder's authority."""
     paths = folder / CA, folder / CA_KEY
     if all(path.exists() for path in paths):
         certificate = x509.load_pem_x509_certificate(paths[0].read_bytes())

@@ -1,8 +1,4 @@
-"""Credentials of a process: authority's certificate, own certificate, key.
-
-Files, their match, node, team and validity are checked before connecting, since Zenoh gives refused
-clients no reason.
-"""
+"""Credentials of a process, checked before connecting: Zenoh gives refused clients no reason."""
 
 import re
 import ssl
@@ -124,7 +120,6 @@ def _check_fit(
 
 
 def _named(certificate: x509.Certificate) -> tuple[str, str]:
-    """Return common name and team; either may be empty."""
     found = []
     for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
         values = certificate.subject.get_attributes_for_oid(oid)

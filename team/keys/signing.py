@@ -1,8 +1,6 @@
 """Signatures with a node's key: peers relay robots' messages, and all can verify them.
 
-ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member. Renewals
-keep a certificate's generation; the first after a revocation begins the next. Verification does not
-depend on the time.
+ECDSA over P-256 with SHA-256 of the team's name and the 32 bytes that name the member.
 """
 
 import re
@@ -24,7 +22,7 @@ class Signer:
     """Sign as one node, and verify certificates issued by the team's authority.
 
     certificate: the node's own, DER. Revocations are read from a roster beside the node's files.
-    Raises KeysError for a key of another kind, or an unusable roster.
+    Raises KeysError.
     """
 
     def __init__(self, own: Credentials) -> None:

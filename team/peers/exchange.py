@@ -34,8 +34,7 @@ def make_request(
     """Request the members of the summary's node that this replica lacks; None: there are none.
 
     not_now: (stream, sequence) requested recently from another peer. A stream with equal sequences
-    and another digest is requested whole: its robot has contradicted itself, and all peers keep the
-    smaller member.
+    and another digest is requested whole: its robot has contradicted itself.
     """
     if summary.digest == replica.digest:
         return None
@@ -106,7 +105,6 @@ def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 
 
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
-    """Return whether members of a stream differ although their sequences are equal."""
     stream = holding.robot, holding.incarnation
     mine = replica.announced_of(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)

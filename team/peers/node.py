@@ -1,8 +1,7 @@
 """Replicate the team's set between peers, over third robots, too.
 
 The node publishes a summary when its set has changed or a node appears, requests members that it
-lacks, and answers requests. The fold receives each stream's initial pose, then its submaps without
-a gap.
+lacks, and answers requests.
 """
 
 from collections import Counter, defaultdict
@@ -101,9 +100,9 @@ class NodeTraffic:
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: nodes that may have a set: the robots and a centre. proofs: checks members that come over
-    third nodes; None: no keys, every node is trusted. unsaved: new members since last cleared.
-    refused: rejected members; last_refused: the reason.
+    known: nodes that may have a set. proofs: checks members that come over third nodes; None: no
+    keys, every node is trusted. unsaved: new members since last cleared. refused, last_refused:
+    number of rejected members, and the last reason.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)

@@ -1,12 +1,12 @@
 """Verify by signatures that a member carried by a third node is its author's.
 
 Every robot publishes its certificates, themselves members, and the signature of each of its
-members. An operator signs its orders with its certificate in front, for robots out of its reach.
+members. An operator signs its orders with its certificate in front.
 
 A member is proven by any certificate of its author that the authority issued, that is not revoked,
-and that had not expired at the member's stamp, which is by the author's clock: a stolen key can
-sign with an earlier date until it is revoked. A certificate of a later generation proves that the
-earlier ones are revoked; a roster beside the own key names revocations without a successor.
+and that had not expired at the member's stamp, by the author's clock. A certificate of a later
+generation proves that the earlier ones are revoked; a roster beside the own key names further
+revocations.
 """
 
 from collections.abc import Iterator

@@ -269,7 +269,6 @@ class Replica:
         )
 
     def _holding_of(self, stream: Stream) -> m.Holding | None:
-        """Return `holding`, cached until a member of the stream arrives."""
         holding = self._holdings.get(stream) or self.holding(stream)
         if holding is not None:
             self._holdings[stream] = holding
@@ -336,7 +335,6 @@ class _Announced(NamedTuple):
 
 
 def _stated(message: m.Message) -> tuple[str, int]:
-    """Name a statement among those about its robot."""
     match message:
         case m.Done():
             return "done", message.incarnation
@@ -359,9 +357,7 @@ def _stated(message: m.Message) -> tuple[str, int]:
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
-    """Order two statements of one name; the greater stays: a later conclusion, else the smaller
-    hash.
-    """
+    """Order two statements of one name: a later conclusion, else the smaller hash, is greater."""
     serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
     return serial, bytes(255 - byte for byte in member.hash)
 

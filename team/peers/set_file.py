@@ -2,10 +2,8 @@
 
 Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A truncated last record is
-cut off. After a damaged record reading continues at the next one whose CRC fits; the file is
-rewritten without the damage, which is reported, and the lost members are requested again. `append`
-leaves a record to the operating system: a killed process loses nothing, a power failure the last
-seconds.
+cut off; a damaged one is skipped, reported and removed. A killed process loses nothing, a power
+failure the last seconds.
 """
 
 import logging
@@ -69,7 +67,7 @@ def _next_record(content: bytes, at: int) -> int | None:
     """Find the first intact record from `at` on.
 
     A damaged record of valid length is skipped as a whole: apparent records within it are its
-    author's. Otherwise each body's first byte is tried.
+    author's.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
@@ -85,7 +83,6 @@ def _next_record(content: bytes, at: int) -> int | None:
 
 
 def _is_intact(content: bytes, at: int) -> bool:
-    """Return whether a whole record with its CRC begins here."""
     begin = at + _HEAD.size
     if content[begin : begin + 1] != _BODY:
         return False
@@ -186,7 +183,6 @@ class SetFile:
 
 
 def _is_cut_off(content: bytes, at: int) -> bool:
-    """Return whether the file ends within this record, as after a killed write."""
     if at + _HEAD.size > len(content):
         return any(content[at:]) or at >= len(content)
     length, _ = _HEAD.unpack_from(content, at)
@@ -222,8 +218,8 @@ def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> st
 class Keeper:
     """Stores a set in its file; without a path in memory only.
 
-    members: those in it when opened. Members that cannot be written are reported, kept in memory
-    and written later. Raises SetFileError for an unusable file.
+    members: those in it when opened. Members that cannot be written are reported and written later.
+    Raises SetFileError for an unusable file.
     """
 
     def __init__(self, path: Path | None) -> None:

@@ -100,7 +100,6 @@ class _Evidence:
             self._read(sample)
 
     def _read(self, sample: Sample) -> None:
-        """Register the evidence in a sample's channel and content."""
         row = ch.channel_of(sample.key)
         if row is None or row[0] not in _READ:
             self.plain.add(sample.key)
@@ -188,5 +187,4 @@ def _unsound(sample: Sample) -> str | None:
 
 
 def _noted(log: Log, note: str) -> bool:
-    """Return whether the metadata has this note, for this log or a merged one."""
     return any(name.partition("@")[0] == note for name in log.metadata)

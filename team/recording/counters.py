@@ -1,8 +1,7 @@
 """Counters of one key: missing and duplicate publications of a log.
 
 A publisher counts its publications on a key from 0, and from 0 again after a restart. A life is the
-publications of one process; it follows from the wall clock, or from the order of arrival if the
-clock was set during the run.
+publications of one process.
 """
 
 from array import array
@@ -43,8 +42,7 @@ class Counters:
         """Find defects, one line each.
 
         part: the log is a cut, so earlier publications are not missing. numbered: messages have
-        their own numbers, which reveal missing ones. totals: publishers' final publication counts.
-        Order is not checked, since requested messages arrive late.
+        their own numbers. totals: publishers' final counts.
         """
         counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
         order = np.lexsort((walls, counters))
@@ -74,8 +72,8 @@ def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"
     """Split publications, in order of arrival, into lives of their publisher.
 
     A life begins where the wall clock steps back or stands still, or by order of arrival. The order
-    with fewer lives is used, then with fewer gaps: a set clock adds lives and gaps to the first,
-    late arrivals to the second.
+    with fewer lives is used, then with fewer gaps: a set clock adds to the first, late arrivals to
+    the second.
     """
     if not len(counters):
         return []
@@ -141,7 +139,6 @@ def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[
 
 
 def _gaps(counters: Int64[np.ndarray, " n"], *, part: bool) -> list[Interval]:
-    """Return the missing intervals of one life's ascending counters."""
     before = np.concatenate([counters[:1] - 1 if part else [-1], counters[:-1]])
     missing = counters > before + 1
     pairs = zip(before[missing] + 1, counters[missing] - 1, strict=True)

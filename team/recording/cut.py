@@ -27,10 +27,9 @@ def cut(
 ) -> int:
     """Write the samples of [from_s, to_s) on these channels to a new log; return their number.
 
-    Times are seconds of team time since the first measurement; None: no bound. Adjacent cuts
-    partition a log. Earlier messages of `STANDING` channels are included; metadata is copied with a
-    note. Raises `LogError`, before creating `out`, for an empty result or a damaged log;
-    `RecorderError` if `out` exists.
+    Times are seconds of team time since the first measurement; None: no bound. Earlier messages of
+    `STANDING` channels are included. Raises `LogError`, before creating `out`, for an empty result
+    or a damaged log; `RecorderError` if `out` exists.
     """
     summary = summarise_log(log)
     if summary.damaged:

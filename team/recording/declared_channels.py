@@ -79,7 +79,6 @@ def find_misdeclaration(of: Declared) -> str | None:
 
 
 def _fields(text: bytes, kind: type[Message]) -> list[Any]:
-    """Return the field types of a schema in order; empty if it is not that of this message."""
     try:
         fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -88,7 +87,6 @@ def _fields(text: bytes, kind: type[Message]) -> list[Any]:
 
 
 def _declarations(path: Path) -> Iterator[Frame]:
-    """Yield schema and channel records, in chunks or in the index."""
     opcodes = (Opcode.SCHEMA, Opcode.CHANNEL)
     with path.open("rb") as file:
         try:

@@ -1,8 +1,7 @@
 """Numbered streams of a log: present and missing numbers.
 
 A source numbers measurements across all of its robot's sensor channels; the robot numbers submaps.
-`world/end` or each driver's head gives the total, `progress` and `done` a lower bound, so missing
-numbers are detected at a stream's end, too.
+Ends, heads and progress name totals, so missing numbers are detected at a stream's end, too.
 """
 
 from array import array
@@ -274,8 +273,6 @@ def intervals(of: list[tuple[int, int]]) -> str:
 
 
 class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """The first fields of a numbered message."""
-
     tag: str
     stamp_ns: int
     robot: str
@@ -296,7 +293,6 @@ def numbered_in(payload: bytes) -> _Head | None:
 
 @lru_cache(maxsize=16_384)
 def _role_of(key: str) -> tuple[_Role, str]:
-    """Return the role of a key in the inventory, and its robot."""
     found = ch.channel_of(key)
     if found is None:
         return "", ""

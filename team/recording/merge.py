@@ -25,9 +25,8 @@ class Merged(NamedTuple):
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
     """Write each sample once to a new log `out`, in order of team time.
 
-    Equal stamps keep the order of logs and files. Samples of equal key, counter, wall clock and
-    payload are one publication; measurements, submaps and inter-robot measurements are compared by
-    content, since one recorder may have requested them. All samples are in memory at once. Raises
+    Samples of equal key, counter, wall clock and payload are one publication; measurements, submaps
+    and inter-robot measurements are compared by content. All samples are in memory at once. Raises
     `LogError`, before creating `out`, for logs of different teams or a damaged one; `RecorderError`
     if `out` exists.
     """

@@ -40,8 +40,7 @@ class OwnLog:
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
         """Return the missing intervals of a robot's measurements (incarnation, first, last).
 
-        A killed process loses unflushed measurements, which its robot may have used and will not
-        request again.
+        A killed process loses unflushed measurements, which its robot will not request again.
         """
         if self.failed:
             return []

@@ -49,10 +49,7 @@ def joined_leftovers(path: Path) -> list[Path]:
 
 
 def _numbered_parts(path: Path) -> dict[int, Path]:
-    """Return the files named like the log or its parts, by number.
-
-    Empty without a first file: the parts belong to another, moved log.
-    """
+    """List a log's files by number; none without a first file: they belong to a moved log."""
     if not path.exists():
         return {}
     found = {1: path}
@@ -65,7 +62,6 @@ def _numbered_parts(path: Path) -> dict[int, Path]:
 
 
 def _joined(log: LogFile | None) -> int:
-    """Return the number of the last part in a log's first file."""
     number = "" if log is None else log.metadata.get(JOINED, "")
     return int(number) if number.isascii() and number.isdigit() else 1
 

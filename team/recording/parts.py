@@ -1,8 +1,7 @@
 """A log in parts: a restarted recorder continues in a further file.
 
-At the end of a run the parts are joined into `log.mcap` in order of arrival, unless the disk is
-full. The joined log replaces the first part in one step, so a crash at any time neither loses nor
-repeats samples, and joining can restart.
+At the end of a run the parts are joined into `log.mcap`, unless the disk is full. The joined log
+replaces the first part in one step, so a crash neither loses nor repeats samples.
 """
 
 import os
@@ -49,7 +48,7 @@ def check_continues(
 
     The same run has the same team and scenario and wrote within the hour, or before the wall clock
     was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
-    `LogError` for any other log, and for a finished and joined one unless of this run.
+    `LogError` for any other log.
     """
     parts = parts_of(path)
     remedy = "choose another name or remove it"
@@ -79,7 +78,6 @@ def check_continues(
 
 
 def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
-    """Return whether a log was finished after a map that ends its team."""
     with suppress(LogError):
         if log.complete:
             chunks = log.chunks(ends)
@@ -159,7 +157,6 @@ def join(path: Path) -> list[Path]:
 
 
 def _write_through(path: Path) -> None:
-    """Wait until a file, or a folder's names, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -63,7 +63,6 @@ def git_commit() -> str:
 
 
 def _processor() -> str:
-    """Return the name of the processor; that of its architecture where the system has no other."""
     with suppress(OSError), Path("/proc/cpuinfo").open(encoding="utf-8") as file:
         for line in file:
             name, _, value = line.partition(":")

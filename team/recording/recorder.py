@@ -1,9 +1,8 @@
 """Write samples into an MCAP file with unchanged payload bytes.
 
 Channel: full key, encoding `msgpack`, JSON Schema of its message; views use those of their viewers.
-Log time: team time. Publish time: publisher's wall clock. Sequence: counter modulo 2³². A stamp
-before zero is logged at zero, since MCAP times are unsigned; the reader restores it from the
-payload. The metadata record "teamslam" describes run and program.
+Log time: team time, at least 0. Publish time: publisher's wall clock. Sequence: counter modulo 2³².
+The metadata record "teamslam" describes run and program.
 """
 
 import threading
@@ -167,9 +166,6 @@ class Recorder:
         self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _tag(self, sample: Sample) -> str:
-        """Return the tag of a message on a key with several types; an unknown tag counts as the
-        first.
-        """
         found = channel_of(sample.key)
         if found is None or not found[0].alternatives:
             return ""

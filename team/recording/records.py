@@ -121,7 +121,6 @@ def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> I
 
 
 def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
-    """Return the position of the next chunk record, recognised by its head."""
     file.seek(start)
     tail, begin, ahead = b"", start, _AHEAD
     while block := file.read(ahead):

@@ -86,10 +86,9 @@ More = Callable[[], tuple[Recorder, Inventory]]
 class RecordLoop:
     """Write each bus sample once, request missing ones, and report progress.
 
-    The log also receives `Liveliness` of the others, at the newest team time, and the recorder's
-    status. inventory: of earlier parts. more: opens the next part after a write error; without it
-    the error is raised. peers: recording ends when each has concluded, or was given up or
-    withdrawn. The centre's final map ends any team.
+    inventory: of earlier parts. more: opens the next part after a write error; without it the error
+    is raised. peers: recording ends when each has concluded, or was given up or withdrawn. The
+    centre's final map ends any team.
     """
 
     def __init__(
@@ -146,8 +145,8 @@ class RecordLoop:
     def take(self, samples: list[Sample]) -> None:
         """Write samples; report progress of due robots, or of all without samples.
 
-        A new submap is reported at once, since its robot stays until then. Progress is credit: a
-        writing thread far behind stops the reports.
+        A new submap is reported at once, since its robot stays until then. A writing thread far
+        behind stops the reports, which are credit.
         """
         noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
         self._dropped += len(samples) - len(noted)
@@ -177,7 +176,6 @@ class RecordLoop:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
     def _noted_tally(self, sample: Sample) -> Tally | None:
-        """Store a leaving process's totals; None for other samples."""
         if TALLY.owner(sample.key) is None:
             return None
         with suppress(WireError):
@@ -188,13 +186,11 @@ class RecordLoop:
         return None
 
     def _report_lacking(self, tally: Tally) -> None:
-        """Report to a leaving process its messages that the log lacks."""
         found = self._inventory.received.lacking(tally, self._bus.awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
         self._bus.publish(Outgoing(RECORDED, tally.node, has))
 
     def _write(self, samples: list[Sample]) -> None:
-        """Write to the log if possible; the run continues otherwise."""
         if self._recorder is None:
             return
         try:
@@ -212,7 +208,6 @@ class RecordLoop:
         self._retry_s = time.monotonic() + _RETRY_S
 
     def _go_on(self, now_s: float) -> None:
-        """Open a new part after a write error; missed samples are requested."""
         if self._recorder is not None or self._more is None or now_s < self._retry_s:
             return
         self._retry_s = now_s + _RETRY_S

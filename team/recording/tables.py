@@ -1,8 +1,7 @@
-"""Export a log as tables, CSV or Parquet, one per channel with a row per message.
+"""Export a log as tables, CSV or Parquet (pyarrow), one per channel with a row per message.
 
 Columns: key, counter, wall_ns, then the message's fields. Arrays are numbers with spaces between in
 CSV, exactly readable, lists in Parquet. Digests are hexadecimal, lists and tables of parts JSON.
-Parquet needs pyarrow (extra `parquet`).
 """
 
 import csv

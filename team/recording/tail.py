@@ -52,7 +52,6 @@ class Tail:
         return found
 
     def _opened(self) -> bool:
-        """Return whether the log exists; its header is written at once."""
         if not self.path.exists() or self.path.stat().st_size == 0:
             return False
         try:

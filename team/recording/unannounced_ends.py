@@ -1,8 +1,4 @@
-"""Find processes that ended unannounced, so that messages may be missing.
-
-A process publishes the totals of its publications at its end (`Tally`). A killed process does not,
-and counters do not show its last publications if they never left its machine.
-"""
+"""Find processes that ended without a `Tally`, so that their last messages may be missing."""
 
 from collections import defaultdict
 from collections.abc import Iterator

@@ -138,7 +138,6 @@ def new_bag(folder: Path) -> Iterator[NewBag]:
 
 
 def _quality(latched: bool) -> Qos:
-    """Latched: transient local with a depth of 1, else volatile with a depth of 10."""
     durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
     forever = QosTime(sec=9_223_372_036, nsec=854_775_807)
     return Qos(

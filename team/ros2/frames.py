@@ -46,8 +46,7 @@ class Mount:
     """Map a sensor's frame to the plane of the robot's sensor: (ahead, left) by 2 × 3, then a
     shift.
 
-    pose: of the robot's sensor on the base. place: of this sensor, the same unless the robot has
-    another sensor (`seen_from`).
+    pose: of the robot's sensor on the base. place: of this sensor (`seen_from`).
     """
 
     pose: Place

@@ -79,12 +79,18 @@ def publication(
 ) -> Publication:
     """Return keys and tokens of a topic of the node `node` (without namespace) in a Zenoh session.
 
-    rmw_zenoh, docs/design.md: <domain>/<topic>/<type>/<hash>, and the tokens
-    @ros2_lv/<domain>/<session>/<node>/<entity>/{NN,MP}/<enclave>/<namespace>/<node>[/<topic>/<type>/<hash>/<QoS>]
+    rmw_zenoh, docs/design.md: <domain>/<topic>/<type>/<hash>, and tokens
+
+      @ros2_lv/<domain>/<session>/<node>/<entity>/{NN,MP}/<enclave>/<namespace>/<node>
+      [/<topic>/<type>/<hash>/<QoS>]
+
     with the QoS as reliability:durability:history,depth:deadline:lifespan:liveliness (empty:
     default). zenoh-plugin-ros2dds: <topic>, and
-    @/<session>/@ros2_lv/MP/<topic>/<type>/<keyless>:<reliability>:<durability>:<history>,<depth>:<user
-    data>. Every topic is reliable; a latched one is transient local with a depth of 1, another one
+
+      @/<session>/@ros2_lv/MP/<topic>/<type>/
+      <keyless>:<reliability>:<durability>:<history>,<depth>:<user data>
+
+    Every topic is reliable; a latched one is transient local with a depth of 1, another one
     volatile with a depth of 10.
     """
     name = topic.strip("/")

@@ -67,7 +67,6 @@ class Owners:
         return any(tree.base_from(frame, base) is not None for base in bases)
 
     def _only(self, frames: Mapping[str, set[str]]) -> dict[str, str]:
-        """Return the robot of each frame that only one robot has."""
         found: dict[str, list[str]] = {}
         for name, each in frames.items():
             for frame in each - {""}:

@@ -78,9 +78,9 @@ Measured = Pose | Speeds | Seen | Position
 class Translator:
     """Takes one robot's messages in order of arrival; counts those dropped, by reason.
 
-    mounts: the sensors' mounts by frame, each from its first detection on. antenna: its place
-    (ahead, left) on the base from the first fix on. robot, owners: its name among those that share
-    its topics. datum: of fixes, which are dropped without one.
+    mounts: the sensors' mounts by frame. antenna: its place (ahead, left) on the base from the
+    first fix on. robot, owners: its name among those that share its topics. datum: of fixes, which
+    are dropped without one.
     """
 
     def __init__(
@@ -185,7 +185,6 @@ class Translator:
         return [Position(record.stamp_ns, x, y, record.covariance)]
 
     def _antenna_at(self, frame: str) -> tuple[float, float]:
-        """Return the place (ahead, left) of the antenna's frame on the base."""
         topics = self.topics
         if topics.antenna is not None:
             return topics.antenna
@@ -222,9 +221,8 @@ class Translator:
     def _is_ours(self, frame: str, shared: bool | None) -> bool:
         """Return whether detections in a frame are this robot's.
 
-        shared: whether other robots have the topic; None: it has transforms, perhaps of robots that
-        the file of topics lacks. With several frames in the file, a frame that is attached to no
-        base is undecided.
+        shared: whether other robots have the topic; None: it has transforms, perhaps of unlisted
+        robots.
         """
         owner = self.owners.owner(frame)
         if owner == self.robot:
@@ -292,7 +290,6 @@ class Translator:
         return found
 
     def _name(self, tag: Tag) -> str:
-        """Return the name that the file of topics asks for."""
         if not tag.kind or self.topics.names == "class":
             return tag.kind or tag.name
         if not self._two_names and self._number(tag.name) != self._number(tag.kind) is not None:

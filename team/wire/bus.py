@@ -1,8 +1,4 @@
-"""The interface of a bus, which carries payloads by key, and a bus in memory.
-
-The bus over a network is `teamslam.team.wire.zenoh`. A node uses no bus: its shell receives and
-decodes the samples, and publishes the node's messages.
-"""
+"""The interface of a bus, which carries payloads by key, and a bus in memory."""
 
 import re
 from collections import defaultdict, deque
@@ -104,8 +100,7 @@ class Tap(Protocol):
 class Bus(Protocol):
     """The bus as a shell uses it.
 
-    dropped: number of received samples without a valid attachment, or under another key than they
-    were published on.
+    dropped: number of received samples without a valid attachment, or under another key.
     """
 
     dropped: int
@@ -140,8 +135,7 @@ class Bus(Protocol):
     def request(self, channel: Channel, name: str, request: Message) -> None:
         """Send a query without waiting; `receive` returns the replies as samples.
 
-        No effect while the same query is open. A reply has no counter (`NO_COUNTER`), and the wall
-        clock of its arrival.
+        No effect while the same query is open.
         """
 
     def again(self) -> None:
@@ -218,7 +212,6 @@ _WITH_NODE = {Configuration, Progress, Status, Liveliness, Fault, SetSummary, Me
 
 
 def _sender_of(channel: Channel, message: Message) -> str | None:
-    """Return the node that a message names as its sender; None if it names none."""
     if type(message) in _WITH_NODE:
         return message.node  # type: ignore[attr-defined, no-any-return]
     is_order = channel is ORDER or channel is END_ORDER
@@ -228,8 +221,7 @@ def _sender_of(channel: Channel, message: Message) -> str | None:
 def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
     """Convert a reply to a sample of the channel of its message.
 
-    A stored sample is returned as its author published it. Raises `WireError` if the message does
-    not answer this query, or belongs to another robot.
+    Raises `WireError` if the message does not answer this query, or belongs to another robot.
     """
     if channel is KEPT:
         return _kept(payload)
@@ -244,7 +236,6 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
 
 
 def _kept(payload: bytes) -> Sample:
-    """Return the sample in a reply of the router; raises `WireError`."""
     kept = decoded(payload, Kept)
     sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
     if opened(sample)[0] not in REPLIES[KEPT]:

@@ -6,8 +6,7 @@ others themselves; a certificate for that prefix authenticates the sender. The w
 of every robot, and owns the truth.
 
 `{robot}`: a robot's name, or a saved map as `map-<name>`. `{node}`: `world`, `central`, `recorder`,
-`viewer`, `robot/<name>` or `source/<name>`. `{view}`: a view (`teamslam.team.wire.views`). Rates:
-an incarnation is one life of a robot's stream, a keyframe one instant of observation.
+`viewer`, `robot/<name>` or `source/<name>`. `{view}`: a view (`teamslam.team.wire.views`).
 """
 
 import re
@@ -86,7 +85,6 @@ class Channel:
 
     @cached_property
     def _around(self) -> tuple[str, str | None]:
-        """The key before and after the name; None after it if the key has no name."""
         parts = _PLACE.split(self.template)
         return parts[0], parts[2] if len(parts) > 1 else None
 

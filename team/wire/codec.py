@@ -1,8 +1,8 @@
 """Encode messages, and decode them with all checks, so that only valid ones reach a node.
 
-A payload is decoded into the class of its tag and refused at the first byte that does not fit.
-Values are never unpacked without a type: a list of empty lists takes 75 times its size. Number and
-nesting of the values of a large payload are checked before any is created.
+A payload is decoded into the class of its tag. Values are never unpacked without a type: a list of
+empty lists takes 75 times its size. Number and nesting of the values of a large payload are checked
+before any is created.
 """
 
 from functools import cache
@@ -93,10 +93,7 @@ def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exceptio
 
 
 def unsound(message: Message) -> WireError | None:
-    """Return the error with which every receiver refuses this message; None for a valid one.
-
-    A sender applies it before publishing; the checks are those of `decoded`.
-    """
+    """Return the error with which every receiver refuses this message; None for a valid one."""
     payload = _ENCODER.encode(message)
     kind = type(message)
     try:
@@ -113,7 +110,6 @@ def unsound(message: Message) -> WireError | None:
 
 
 def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
-    """Return the error with which a payload is refused."""
     try:
         decoded(payload, kind)
     except WireError as error:
@@ -135,7 +131,6 @@ def tag_in(payload: bytes) -> str:
 
 
 def _kind(tag: str, expected: tuple[type[Message], ...]) -> type[Message]:
-    """Return the class of a tag; raises `WireError` if it is not expected."""
     kind = BY_TAG.get(tag)
     if kind is not None and (not expected or kind in expected):
         return kind
@@ -223,10 +218,7 @@ def check_structure(payload: bytes) -> None:
 
 
 def _value_at(payload: bytes, at: int) -> tuple[int, int]:
-    """Return the number of values inside the value at `at`, and the position after its head.
-
-    The position is that after the value if there are none inside.
-    """
+    """Return the number of values inside the value at `at`, and the position after its head."""
     code = _byte(payload, at)
     at += 1
     if code < 0x80 or code >= 0xE0:
@@ -250,7 +242,6 @@ def _value_at(payload: bytes, at: int) -> tuple[int, int]:
 
 
 def _group_at(payload: bytes) -> tuple[int, int]:
-    """Return the number of values of the payload's array, and the position of the first."""
     code = _byte(payload, 0)
     if code >> 4 == 0b1001:
         return code & 15, 1
@@ -260,7 +251,6 @@ def _group_at(payload: bytes) -> tuple[int, int]:
 
 
 def _length(payload: bytes, at: int, width: int) -> tuple[int, int]:
-    """Return the unsigned number of `width` bytes, and the position after it."""
     if len(payload) < at + width:
         raise _truncated()
     return int.from_bytes(payload[at : at + width], "big"), at + width

@@ -1,8 +1,7 @@
 """The log of a process, whose lines others can neither flood nor forge.
 
-One filter sees every record of the logger `teamslam`. Each place in the program may log AT_ONCE
-lines, and regains PER_S lines a second; the next line counts the omitted ones. Control characters
-are escaped, so that a record is one line of at most LONGEST characters.
+Each place in the program may log AT_ONCE lines, and regains PER_S lines a second; the next line
+counts the omitted ones. A record is one printable line of at most LONGEST characters.
 """
 
 import logging

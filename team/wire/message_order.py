@@ -1,7 +1,7 @@
 """The order of messages of `latest` channels, by content instead of arrival.
 
 A restarted centre, a late joiner's cache and a repeated reply deliver older messages after newer
-ones. Each order is total, so receivers of the same messages end with the same one.
+ones. Each order is total.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 def set_order(received: int, withdrawn: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     """Return the sort key of a set: number of received submaps, of withdrawn robots, and size.
 
-    The number of received submaps only grows. With the same submaps the fold may withdraw further
-    robots, but reinstates none; of sets with equal numbers the larger contains the other.
+    The first only grows; with the same submaps the fold may withdraw further robots, but reinstates
+    none; of sets with equal numbers the larger contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return received, withdrawn, sum(each.sequence + 1 for each in members), vector

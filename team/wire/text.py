@@ -1,7 +1,7 @@
 r"""Printable forms of foreign texts, which may contain terminal escapes or forged lines.
 
-Control characters (line ends among them), bidirectional overrides and other invisible format
-characters are written as `\x1b` or `\u202e`. Stored texts keep their bytes.
+Control and other invisible characters are written as `\x1b` or `\u202e`. Stored texts keep their
+bytes.
 """
 
 import unicodedata

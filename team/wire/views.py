@@ -1,8 +1,7 @@
 """The table of views, which a viewer node publishes in the schemas of other tools.
 
-No estimate depends on a view, and verification skips it. Foxglove, Lichtblick and Rerun open a log
-with these schemas without configuration. Frames: `map` is that of the team's map, `robot/<name>`
-that of a robot; metres, radians, counter-clockwise; z = 0.
+No estimate depends on a view, and verification skips it. Frames: `map` is that of the team's map,
+`robot/<name>` that of a robot; metres, radians, counter-clockwise; z = 0.
 """
 
 import re

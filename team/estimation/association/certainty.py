@@ -1,15 +1,13 @@
 """Certainty: the probability that a detection is of its associated landmark.
 
-In one scan each landmark gives at most one detection, and each detection is of one landmark, of an
-unmapped one, or clutter. For a landmark j in view with probability v_j and detected with
-probability P_D, the odds of "z is of landmark j" against "z is of something else and j was missed"
-are
+For a landmark j in view with probability v_j and detected with probability P_D, the odds of "z is
+of landmark j" against "z is of something else and j was missed" are
 
   ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)),
 
 with ρ detections per square metre of a view, ρ_out those in no landmark, and V_j = π γ √|S_j| the
-volume of the gate γ: a landmark in another one's gate may be part of it. The marginals over all
-joint associations follow by belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
+volume of the gate γ. The marginals over all joint associations of a scan, one to one, follow by
+belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
 """
 
 from dataclasses import dataclass
@@ -39,8 +37,8 @@ SETTLED = 1e-6
 class FieldOfView:
     """The sector that a window's scans observe, estimated from its own detections.
 
-    density: detections of a scan per square metre of the sector; area [m²]; looks: number of scans.
-    farthest [m]; least, most: bearings [rad].
+    density: detections of a scan per square metre; area [m²]; looks: number of scans. farthest [m];
+    least, most: bearings [rad].
     """
 
     density: float

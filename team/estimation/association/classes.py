@@ -1,9 +1,8 @@
 """Evidence of two landmarks' classes that they are one.
 
 A landmark has ln P(reports | class c) for each of C classes, up to a constant: the sum of its
-detections' rows, each a column of the detector's confusion matrix. With p(c) ∝ P(reports | c) for
-equally frequent classes, the log-likelihood ratio of one landmark against two is ln(Σ_c p₁(c) p₂(c)
-C).
+detections' rows. With p(c) ∝ P(reports | c) for equally frequent classes, the log-likelihood ratio
+of one landmark against two is ln(Σ_c p₁(c) p₂(c) C).
 """
 
 from collections.abc import Sequence
@@ -29,8 +28,8 @@ def compare_classes(one: Classes, two: Classes) -> Float[np.ndarray, " n"]:
 def stack_classes(parts: Sequence[tuple[int, Classes | None]]) -> Classes | None:
     """Concatenate the classes of several lists, given by count and rows; None where none has any.
 
-    Landmarks without classes have zeros. A class that a robot does not report is as unlikely as its
-    landmark's least likely one.
+    Landmarks without classes have zeros; an unreported class is as unlikely as the least likely
+    one.
     """
     most = max((rows.shape[1] for _, rows in parts if rows is not None), default=0)
     if not most:

@@ -38,9 +38,9 @@ class WindowAssociation:
     """The landmark of each detection of a window.
 
     landmark_of: by detection, in [0, L), or UNASSIGNED. names: the identity of each landmark, or
-    UNASSIGNED; sorted by name, then by first detection. counts: number of detections of each
-    landmark. seen: its keyframes. slips: of the odometry. clutter: of each detection left out,
-    whether its place was observed again without finding it.
+    UNASSIGNED; sorted by name, then by first detection. counts, seen: detections and keyframes of
+    each landmark. clutter: of each detection left out, whether its place was observed again without
+    finding it.
     """
 
     landmark_of: Int64[np.ndarray, " N"]
@@ -55,8 +55,7 @@ class WindowAssociation:
 class Clusters:
     """The detections of a window, each of one landmark, before doubtful ones are left out.
 
-    window: smoothed under this association. slips: of the odometry; `scans` has larger covariances
-    of the motions that slipped.
+    window: smoothed. `scans` has larger covariances of the motions that slipped.
     """
 
     scans: Scans
@@ -120,7 +119,6 @@ def _renumber(
     names: Int64[np.ndarray, " before"],
     points: Float[np.ndarray, "before 2"],
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Renumber the landmarks that have a detection: by name, then by their first detection."""
     remaining, first = np.unique(landmark_of, return_index=True)
     remaining, first = remaining[remaining != UNASSIGNED], first[remaining != UNASSIGNED]
     unnamed = names[remaining] == UNASSIGNED
@@ -136,9 +134,9 @@ def _associate_again(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Associate every scan again, from the smoothed path against the landmarks of the whole window.
+    """Associate every scan again, from the smoothed path against all landmarks of the window.
 
-    A detection without a match becomes a new landmark, also for later scans.
+    A detection without a match becomes a new landmark.
     """
     k, n = len(window.poses), len(window.covariance)
     most = n + 2 * len(scans.points)
@@ -210,10 +208,8 @@ def _drop_uncertain(
 
 
 def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]:
-    """Mark the keyframes that observed each landmark's place.
-
-    A keyframe observes a place if it saw something at least as far off and the place lies between
-    the outermost bearings that it saw.
+    """Mark the keyframes that observed each landmark's place: they saw something at least as far
+    off, and the place lies between their outermost bearings.
     """
     looks = np.zeros((len(window.landmarks), len(window.poses)), np.bool_)
     bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
@@ -239,14 +235,13 @@ def _mark_confirmed(
 ) -> Bool[np.ndarray, " L"]:
     """Mark the landmarks with an identity, and those that are likelier real than clutter.
 
-    After its first detection, a real landmark is detected at each look with the probability p of
-    the sensor, a place of clutter matches with q. With c detections and m misses the log odds that
-    it is real, the score by which trackers confirm a track, are
+    After its first detection, a real landmark is detected at each look with probability p, a place
+    of clutter matches with q. With c detections and m misses the log odds that it is real are
 
       (c − 1) log(p/q) + m log((1 − p)/(1 − q)) + log(real ones/places of clutter).
 
-    The misses before the first detection together count at most log HIDDEN, as do those after the
-    last one. q and the last term are those of the window's unconfirmed places.
+    The misses before the first detection count at most log HIDDEN, as do those after the last one.
+    q and the last term are those of the window's unconfirmed places.
     """
     named, p = names != UNASSIGNED, settings.detection_probability
     seen = _mark_seen(scans, landmark_of, len(names))

@@ -2,10 +2,8 @@
 
 The distances of landmarks that one keyframe observed, which are distinct, give the density of
 further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13).
-In groups of landmarks it is far above the map's mean: a pair whose difference is as uncertain as
-the spacing within a group may be either of its members. Neighbours that hide each other in one
-keyframe are counted in the map, among the landmarks of several submaps. The distances also bound
-the lengths of a profile.
+In groups it is far above the map's mean. Neighbours that hide each other in one keyframe are
+counted in the map, among the landmarks of several submaps.
 """
 
 from collections.abc import Iterable
@@ -32,8 +30,7 @@ Spacings = Float[np.ndarray, "U U"]
 class LandmarkDensity:
     """Spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
-    spacings: of each submap (`LocalMap.spacings`). confirmed: positions [m] of the landmarks that
-    several submaps have observed.
+    spacings: of each submap. confirmed: positions [m] of the landmarks of several submaps.
     """
 
     def __init__(
@@ -54,10 +51,9 @@ class LandmarkDensity:
         return np.sort(found[np.isfinite(found)])
 
     def around_landmarks(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Compute the density [1/m²] of further landmarks within each radius [m] in single
-        keyframes.
+        """Compute the density [1/m²] within each radius [m] of a landmark in single keyframes.
 
-        (ordered pairs within R + 1) / (n π R²): half a pair is assumed beside those observed.
+        (ordered pairs within R + 1) / (n π R²): half a pair is added to those observed.
         """
         within = np.searchsorted(self._distances, radius) + 1.0
         found: Float[np.ndarray, " k"] = within / (
@@ -73,7 +69,7 @@ class LandmarkDensity:
     def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Compute the density [1/m²] of the n landmarks of the map, (2 pairs + 1) / (n π R²).
 
-        Duplicates that are not merged yet count as neighbours, so that it is never too small.
+        Duplicates count as neighbours, so that it is never too small.
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (

@@ -3,13 +3,12 @@
 Both test the squared Mahalanobis distance d² = dᵀS⁻¹d of a difference d with covariance S against
 χ² of two degrees of freedom (individual compatibility; Neira and Tardós 2001, IEEE T-RA 17(6)).
 
-A pair of landmarks of a joint Gaussian also has a log-likelihood ratio of "one landmark" against
-"two". With S the joint covariance of their difference plus the slack s₀², and λ expected landmarks
-per square metre,
+Two landmarks also have a log-likelihood ratio of "one" against "two": with S plus the slack s₀²,
+and λ expected landmarks per square metre,
 
   LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ,
 
-plus the evidence of their classes (`classes`), if any.
+plus the evidence of their classes.
 """
 
 from typing import NamedTuple
@@ -52,10 +51,9 @@ def match_scan(
 ) -> Int64[np.ndarray, " n"]:
     """Match the detections of a scan with landmarks; UNASSIGNED without a match.
 
-    An unnamed detection matches unnamed landmarks in its gate; a named one matches the landmark of
-    this name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|. points, covariances: of the
-    detections, in the robot's frame [m, m²]. predicted: the landmarks' positions in that frame,
-    with their covariances.
+    An unnamed detection matches unnamed landmarks in its gate; a named one the landmark of this
+    name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|. points, covariances: of the
+    detections, in the robot's frame [m, m²]. predicted: the landmarks', in that frame.
     """
     seen, spread = predicted
     S = spread[None] + settings.variance_factor * covariances[:, None]
@@ -68,10 +66,9 @@ def match_scan(
 def match_best_first(
     allowed: Bool[np.ndarray, "n L"], costs: Float[np.ndarray, "n L"]
 ) -> Int64[np.ndarray, " n"]:
-    """Assign a landmark to each detection of a scan; UNASSIGNED where no allowed one is left.
+    """Assign a landmark to each detection of a scan, the allowed pair of least cost first.
 
-    The allowed pair of least cost comes first, then the next one whose detection and landmark are
-    both free. Equal costs keep their order.
+    UNASSIGNED where no allowed landmark is left. Equal costs keep their order.
     """
     found = np.full(len(allowed), UNASSIGNED)
     rows, columns = np.nonzero(allowed)
@@ -87,11 +84,10 @@ class Joint(NamedTuple):
     """Landmarks with their joint covariance, in one frame.
 
     mean: positions [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: pairs that cannot be one
-    landmark, symmetric: observed in one scan, named differently, or declared to be two by an
-    operator. density: local; None: that of the profile. unseen: for the landmarks of one map, the
-    probability that all windows that saw each of them missed another one beside it; the density of
-    the profile is then an upper bound. apart_in_window: pairs that one submap has as two landmarks,
-    symmetric; None: not recorded. classes: evidence of their classes; None: none.
+    landmark, symmetric: observed in one scan, named differently, or declared to be two. density:
+    local; None: that of the profile. unseen: probability that all windows that saw each landmark
+    missed another one beside it; the density of the profile is then an upper bound.
+    apart_in_window: pairs that one submap has as two landmarks, symmetric; None: not recorded.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -127,8 +123,8 @@ class Joint(NamedTuple):
 class Pair(NamedTuple):
     """Two landmarks that are one, with the index of the second.
 
-    llr: log-likelihood ratio. sd: largest standard deviation [m] of the difference. rival: best LLR
-    of a pair that excludes this one.
+    sd: largest standard deviation [m] of the difference. rival: best LLR of a pair that excludes
+    this one.
     """
 
     first: int
@@ -185,10 +181,7 @@ def gate_pairs(
     profile: AssociationProfile,
     most_sd: float = np.inf,
 ) -> tuple[Indices, Indices, Float[np.ndarray, " k"]]:
-    """Select the pairs that can be one landmark; return them with the standard deviation [m].
-
-    They are within the gate, of at most `most_sd` [m], not apart, and of compatible classes.
-    """
+    """Select the pairs that can be one landmark; return them with the standard deviation [m]."""
     at = evaluate_pairs(joint, first, second, profile)
     open_ = (at.chi2 < profile.gate) & (at.sd <= most_sd) & ~joint.apart[first, second]
     open_ &= joint.compare_classes(first, second) > -CONTRADICTED
@@ -204,7 +197,7 @@ def required_llr(
 ) -> Float[np.ndarray, " k"]:
     """Return the log-likelihood ratio for which each pair is merged without a rival.
 
-    It is larger where the standard deviation is large, and by SPLIT where one submap has both.
+    SPLIT is added where one submap has both.
     """
     least = np.where(sd < profile.tight, profile.llr_tight, profile.llr_loose)
     if joint.apart_in_window is not None:

@@ -1,9 +1,7 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
-Every submap adds its unnamed landmarks to the map as landmarks of their own. The steps: *tracking*
-against the last submaps of the same robot; *near*, landmarks of older submaps where the standard
-deviation of the difference is small, submap by submap; *sweep*, landmarks that were split. Closures
-and merges of islands follow (`closure`).
+The steps: *track* against the last submaps of the same robot; *near*, landmarks of older submaps
+where the standard deviation of the difference is small; *sweep*, landmarks that were split.
 
 The landmarks of one submap are distinct, but unmerged fragments of one landmark are candidates for
 each other, and the assignments to all of them at once do not agree on any. So the landmarks of a
@@ -83,11 +81,10 @@ class ViewedSubmap(NamedTuple):
 class IslandView:
     """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
 
-    ids: the identity of each landmark; place_of: its index, by identity. submaps: those examined;
-    seen_by: their landmarks. missed: landmarks that are probably false (`mark_missed`), with which
-    no closure is searched. sees: landmarks of each submap, updated by merges. merged: landmarks
-    that are merged into another one. ties: the merges, with their figures. stamp_ns: last end of a
-    submap.
+    ids: the identity of each landmark; place_of: its index, by identity. seen_by: landmarks of each
+    submap. missed: landmarks that are probably false (`mark_missed`), with which no closure is
+    searched. sees: landmarks of each submap, updated by merges. merged: landmarks that are merged
+    into another one. ties: the merges. stamp_ns: last end of a submap.
     """
 
     def __init__(
@@ -103,8 +100,8 @@ class IslandView:
     ) -> None:
         """View the landmarks with this mean [m] and covariance [m²].
 
-        forgotten: pairs of landmarks of one submap that is not among `submaps`, and which of these
-        pairs one keyframe observed.
+        forgotten: pairs of landmarks of one submap not among `submaps`, and whether one keyframe
+        observed both.
         """
         count = len(ids)
         self.ids = ids
@@ -135,7 +132,6 @@ class IslandView:
         )
 
     def _sum_classes(self) -> Classes | None:
-        """Sum the evidence of the submaps on each landmark's class; None where there is none."""
         rows = [(len(s.unnamed_rows), s.observation.unnamed.classes) for s in self.submaps]
         stacked = stack_classes(rows)
         if stacked is None:
@@ -146,9 +142,6 @@ class IslandView:
         return classes
 
     def _mark_apart(self, forgotten: Int64[np.ndarray, "_ 2"]) -> Bool[np.ndarray, "n n"]:
-        """Mark pairs that cannot be one landmark: observed by one keyframe, named differently, or
-        declared to be two by an operator.
-        """
         named = np.array(self.ids) < UNNAMED
         apart = named[:, None] & named[None, :]
         for submap in self.submaps:
@@ -262,10 +255,9 @@ class IslandView:
             self.record_merges(found, "near")
 
     def compare_again(self, fresh: Sequence[int], turn: int) -> None:
-        """Compare older submaps near the tick's (`fresh`) with undecided landmarks, perhaps
-        decidable now.
+        """Compare older undecided submaps near the tick's (`fresh`), perhaps decidable now.
 
-        turn: selects among many such submaps, other ones at each turn.
+        turn: selects among many such submaps.
         """
         near = np.flatnonzero(self.sees[fresh].any(axis=0))
         if not len(near):
@@ -280,11 +272,9 @@ class IslandView:
             self.compare(k)
 
     def sweep(self) -> None:
-        """Merge landmarks at one place, certain relative to each other and never seen together,
-        where all likely joint assignments of them agree.
+        """Merge landmarks at one place, never seen together, where all likely assignments agree.
 
-        Landmarks that were undecided when new are uncertain: pair by pair, each the likeliest by
-        itself, they can turn a robot by a spacing.
+        Pair by pair, each the likeliest by itself, they can turn a robot by a spacing.
         """
         at = np.flatnonzero(~self.merged)
         mean = self.joint.mean[at]
@@ -318,10 +308,9 @@ def select_comparisons(
 ) -> list[Indices]:
     """Select the landmarks that `own` may be, for each submap worth a comparison.
 
-    Besides the submap's landmarks these are the rivals that it lacks: landmarks that one of `own`
-    may be and that are none of the submap's candidates. Without them a landmark that the submap
-    missed would be associated with its neighbour. sees: landmarks of each submap. most_sd: largest
-    standard deviation of a pair's difference.
+    Besides the submap's landmarks these are the rivals that it lacks: without them a landmark that
+    the submap missed would be associated with its neighbour. sees: landmarks of each submap.
+    most_sd: largest standard deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)

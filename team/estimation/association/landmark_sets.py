@@ -1,9 +1,8 @@
 """Unnamed landmarks as sets of (submap, local landmark), with the evidence for each merge.
 
-A submap adds each of its unnamed landmarks as a set with a number derived from the submap's name;
-association merges sets. A set has the number of its smallest member, so its identity lasts while
-members are added; a set with a named landmark has that name. All of this depends only on the order
-in which submaps are added.
+A submap adds each of its unnamed landmarks as a set; association merges sets. A set has the number
+of its smallest member, so its identity lasts, or the name of a named landmark. All of this depends
+only on the order in which submaps are added.
 """
 
 import hashlib
@@ -34,9 +33,8 @@ MOST_DECISIONS = 400
 class Decision(NamedTuple):
     """A closure, or a merge of robots, that was accepted, undone or deferred.
 
-    kind: "closure", "merge", "undone", "waits". about: the robots concerned, in words. why: the
-    failed test; empty if accepted. absent: number of landmarks of one side that the other side
-    viewed without having one. rival_llr: evidence for the best other alignment.
+    kind: "closure", "merge", "undone", "waits". about: the robots concerned, in words. Figures as
+    in `verification.Closure`.
     """
 
     stamp_ns: int
@@ -77,8 +75,8 @@ class Landmarks:
 
     present: the members of each landmark of the map, by its identity. log: all members, also of
     dropped landmarks. names: names that an operator has declared to be another one. waits: the last
-    failed attempt of each stream. opened: the closures of the last tick. undone: closures that are
-    not accepted again.
+    failed attempt of each stream. opened: the closures of the last tick. undone: closures not
+    accepted again.
     """
 
     present: Mapping[int, MemberSummary] = field(default_factory=dict)
@@ -165,9 +163,7 @@ NO_LANDMARKS = Landmarks()
 def add_landmarks(
     landmarks: Landmarks, contributions: Sequence[Contribution]
 ) -> tuple[Landmarks, dict[Key, list[int]]]:
-    """Add each unnamed landmark of the submaps as a set of its own; return also the numbers of the
-    landmarks of each submap that has some.
-    """
+    """Add each unnamed landmark of the submaps as a set; return also the numbers by submap."""
     present, log = dict(landmarks.present), landmarks.log
     numbers: dict[Key, list[int]] = {}
     for each in contributions:
@@ -212,8 +208,7 @@ def merge_sets(
     """Merge sets; return also the new number of each renumbered identity.
 
     ties: each identity to merge with `tie.into`. The result has the name of a named set, else the
-    number of its smallest member; where that is the identity to be lost, the tie is recorded in the
-    other direction.
+    number of its smallest member; a tie in the other direction is reversed.
     """
     present, log, names = dict(landmarks.present), landmarks.log, dict(landmarks.names)
     becomes: dict[int, int] = {}

@@ -1,8 +1,7 @@
 """Append-only log of the members of all unnamed landmarks, in few bytes and shared arrays.
 
-A member, a local landmark of a submap, has a number of its own until its landmark is merged with
-another. A longer log shares all but its last rows with the log before, so checkpoints store no row
-twice, and the time of a tick depends on its own submaps only.
+A longer log shares all but its last rows with the log before, so checkpoints store no row twice,
+and the time of a tick depends on its own submaps only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -61,8 +60,7 @@ class LocalLandmark(NamedTuple):
 class MergeRecord(NamedTuple):
     """The step that merged the set of this number into another one, and its figures.
 
-    rival: best log-likelihood ratio of a pair that excludes it. stamp_ns: last end of a submap in
-    the tick.
+    stamp_ns: last end of a submap in the tick.
     """
 
     kind: str

@@ -18,9 +18,8 @@ class Scans:
 
     motions: the pose of keyframe k in the frame of keyframe k − 1, of the first in that of the
     window's start. motion_covariances: of (forward, left, turn), in the tangent space of the
-    motion's end. keyframes: of each of the N detections, ascending. points: their positions in the
-    robot's frame at their keyframe [m]. covariances: of the points [m²]. names: the identity of
-    each, or UNASSIGNED.
+    motion's end. keyframes: of each of the N detections, ascending. points, covariances: in the
+    robot's frame at their keyframe [m, m²]. names: the identity of each, or UNASSIGNED.
     """
 
     motions: Float[np.ndarray, "K 3"]

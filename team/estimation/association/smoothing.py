@@ -45,8 +45,8 @@ def smooth_window(
 ) -> SmoothedWindow:
     """Minimise Σ ‖Log(motion⁻¹ ∘ before⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
 
-    The norms are those of the covariances; the window starts at zero. landmark_of: by detection, or
-    UNASSIGNED; every landmark has a detection. Raises LinAlgError without a solution.
+    The window starts at zero. landmark_of: by detection, or UNASSIGNED; every landmark has a
+    detection. Raises LinAlgError without a solution.
     """
     used = np.nonzero(landmark_of != UNASSIGNED)[0]
     seen_by, seen = scans.keyframes[used], landmark_of[used]
@@ -88,7 +88,6 @@ def _linearise_motions(
     poses: Float[np.ndarray, "K 3"],
     size: int,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], float]:
-    """Linearise the motions to information, gradient and cost."""
     k = len(poses)
     before = np.concatenate((np.zeros((1, 3)), poses[:-1]))
     went = np.column_stack((relative_to(before, poses[:, :2]), poses[:, 2] - before[:, 2]))

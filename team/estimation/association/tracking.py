@@ -1,9 +1,8 @@
 """Tracking within a window: an extended Kalman filter that matches the best pair first.
 
 EKF-SLAM (Smith, Self and Cheeseman 1990) with detections as points. A slip of the odometry is
-detected where few detections match despite landmarks nearby, and nearly all match after a jump of
-the robot (one-point RANSAC; Ortín and Montiel 2001). The covariance of that motion is then enlarged
-by the jump.
+detected where few detections match, and nearly all match after a jump of the robot (one-point
+RANSAC; Ortín and Montiel 2001); it enlarges the covariance of that motion.
 """
 
 from typing import NamedTuple
@@ -184,8 +183,8 @@ class Tracker:
         """Find the slip (forward, left, turn) that explains most of a scan; None if none does.
 
         Each pair of a detection and a landmark near it proposes a slip, given a pose wrong by
-        slip_m; the other pairs are counted under that proposal. A slip must explain more pairs than
-        those `found` without it, and fit better by more than the cost of one misfitting pair.
+        slip_m. A slip must explain more pairs than those `found` without it, and fit better by more
+        than the cost of one misfitting pair.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
         seen, spread = self.predict_landmarks()

@@ -1,8 +1,4 @@
-"""The tests of a closure, at its proposal and during its audit, and of a map's landmarks.
-
-An accepted closure is audited for some ticks by `overlap_share`, and undone where that falls below
-the bound of the profile.
-"""
+"""The tests of a closure, at its proposal and during its audit, and of a map's landmarks."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -28,10 +24,9 @@ class Closure(NamedTuple):
 
     why: the failed test; empty if accepted. llr: log-likelihood ratio of its pairs. absent: number
     of landmarks of one side that the other side viewed without having one. rival_pairs, rival_llr:
-    pairs and evidence of the best other alignment. share: matched share of the landmarks near the
-    matched places, of the side with fewer. sd: largest standard deviation [m] of a pair's
-    difference at its acceptance. motion: (x, y, θ) that maps the patch onto the target; zero within
-    one map.
+    of the best other alignment. share: matched share of the landmarks near the matched places, of
+    the side with fewer. sd: largest standard deviation [m] of a pair's difference. motion: (x, y,
+    θ) that maps the patch onto the target; zero within one map.
     """
 
     pairs: tuple[Pair, ...]
@@ -46,11 +41,10 @@ class Closure(NamedTuple):
 
 
 class ClosureTests(NamedTuple):
-    """Requirements of a closure.
+    """Least pairs, evidence, and context of a closure.
 
-    pairs, llr: least number of pairs and least evidence. context: least number of landmarks outside
-    the matched place, relative to the pairs, of the `known` ones of both sides (two islands only;
-    0: not tested).
+    context: landmarks outside the matched place, relative to the pairs, of the `known` ones of both
+    sides (two islands only; 0: not tested).
     """
 
     pairs: int
@@ -121,9 +115,8 @@ def overlap_share(
     """Compute matched places over the number of points where both sides viewed, of the side with
     fewer.
 
-    one, two: all points of either side, matched ones included. The area is within WIDE spacings of
-    a matched place and within one spacing of a point of the other side: maps of two robots differ
-    in extent.
+    one, two: all points of either side. The area is within WIDE spacings of a matched place and
+    within one spacing of a point of the other side.
     """
     if len(places) < 2 or not len(one) or not len(two):
         return 0.0
@@ -160,10 +153,9 @@ def find_possible_duplicates(view: IslandView, ids: Collection[int]) -> dict[int
     """Map each of these landmarks that may be one with another of them to the likeliest, which
     stays.
 
-    Two landmarks may be one where they are within the gate, and have the log-likelihood ratio with
-    which a pair without a rival is merged, or would lack it even at one place: there the density of
-    landmarks in the gate exceeds the evidence. The landmark with the most certain position stays,
-    by the area of its covariance's ellipse.
+    They are within the gate, with the evidence of a pair that is merged, or in such a density that
+    no pair would have it. The landmark with the most certain position stays, by the area of its
+    covariance's ellipse.
     """
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)

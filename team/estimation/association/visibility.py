@@ -1,7 +1,7 @@
 """Negative evidence: landmarks of one side that the other side viewed without observing them.
 
-The landmarks that one keyframe observed together span a polygon inside its field of view, which is
-convex. A landmark of the other side in this polygon should have been observed.
+The landmarks that one keyframe observed together span a polygon inside its convex field of view; a
+landmark of the other side in this polygon should have been observed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -70,8 +70,7 @@ def miss_probabilities(
 ) -> Float[np.ndarray, " n"]:
     """Compute the probability that all windows that saw each landmark missed another one beside it.
 
-    seen_by: the landmarks of each window. radius [m]: a window with a landmark within it saw the
-    place.
+    seen_by: the landmarks of each window. radius [m]: of a place around a landmark.
     """
     x, y = points.T
     near = core.hypot(x[:, None] - x, y[:, None] - y) < radius
@@ -87,7 +86,7 @@ def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
     """Mark the landmarks that later submaps miss.
 
     A landmark of n < WELL_KNOWN submaps, if each well-known landmark beside it in its last one is
-    in WELL_KNOWN n submaps since. sees: landmarks of each submap, in the order of time.
+    in WELL_KNOWN n submaps since. sees: by submap, in the order of time.
     """
     counts = sees.sum(axis=0)
     beside = sees & (counts >= WELL_KNOWN)

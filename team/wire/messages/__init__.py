@@ -1,9 +1,9 @@
 """The messages: frozen, versioned, positional; one module for each kind of publisher.
 
-On the wire a message is a MessagePack array `[tag, field, field, …]`; `tag` is "name/version". A
-later program may append fields with defaults without a new version; readers ignore further fields.
-A new meaning, unit or frame is a new version. Arrays are `bin`: little-endian, C order, of the type
-`Floats`, `Ids` or `Stamps`. SI units, radians, bearings in (−π, π].
+A message is a MessagePack array `[tag, field, field, …]`; `tag` is "name/version". A later program
+may append fields with defaults; readers ignore further fields. A new meaning, unit or frame is a
+new version. Arrays are `bin`: little-endian, C order, of the type `Floats`, `Ids` or `Stamps`. SI
+units, radians, bearings in (−π, π].
 
 `stamp_ns` is the team time of the measurement that the message is about. `check` raises
 `ValueError` with the reason where the numbers do not fit the message.

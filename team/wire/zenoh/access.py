@@ -1,7 +1,6 @@
 """Access control at the router: a node publishes its own keys and receives those of its team.
 
-Zenoh's rules select by message, direction as the router sees it, and key; a subject is a
-certificate's common name. Each node has a rule, which includes its advanced publishers' caches and
+Each node has a rule, for its certificate's common name, with its advanced publishers' caches and
 heartbeats, `…/@adv/pub/*/*/*`.
 """
 
@@ -85,7 +84,6 @@ def access_control(roster: Roster) -> dict[str, Any]:
 
 
 def _keys(prefix: str, keys: Sequence[str]) -> list[str]:
-    """Add the keys of the publishers' caches and heartbeats."""
     return [f"{prefix}{key}{rest}" for key in keys for rest in ("", "/@adv/pub/*/*/*")]
 
 

@@ -1,7 +1,7 @@
 """Track the publications of a publisher: deliver each once and find the missing ones.
 
-A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats,
-so a receiver detects every gap (docs/decisions/07-delivery-by-counts.md).
+A publisher numbers its publications on a key from 0 and repeats the last number in its heartbeats
+(docs/decisions/07-delivery-by-counts.md).
 """
 
 from dataclasses import dataclass, field
@@ -24,8 +24,8 @@ T = TypeVar("T")
 class Arrivals(Generic[T]):
     """Publications of one publisher on one key; those before `first` are not requested.
 
-    Memory is proportional to the arrivals, not to the numbers, which come from the wire. in_order:
-    delay publications after a gap until it is closed or overdue. newest: last number received.
+    Memory is proportional to the arrivals. in_order: delay publications after a gap until it is
+    closed or overdue. newest: last number received.
     """
 
     first: int
@@ -76,8 +76,8 @@ class Arrivals(Generic[T]):
     def due(self, now_s: float) -> tuple[int, int | None] | None:
         """Return the interval to request now, if a gap is old enough; end None: everything since.
 
-        A repeated request is for everything since: the cache always has the newest publication, so
-        a reply without the missing numbers shows that they are gone.
+        A repeated request is for everything since: a reply without the missing numbers shows that
+        they are gone.
         """
         missing = self.missing
         if missing is None:
@@ -102,9 +102,8 @@ class Arrivals(Generic[T]):
     def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
         """Record the complete reply for `first` to `newest`; return the items to deliver.
 
-        Numbers still missing are gone. known: the last number at the request. If it exceeds the
-        publisher's and nothing newer arrived since, it was that of another key: after a cut Zenoh
-        can deliver a heartbeat under another key.
+        Numbers still missing are gone. known: the last number at the request; if it exceeds the
+        publisher's and nothing newer arrived, it was that of another key, as after a cut link.
         """
         for begin, end in self._open():
             self._give_up(max(begin, first), min(end, newest))
@@ -118,7 +117,6 @@ class Arrivals(Generic[T]):
         return self._settled.next_absent(self.first)
 
     def _give_up(self, first: int, last: int) -> None:
-        """Record the numbers first … last as gone."""
         self._gone.add(first, last)
         self._gone.join_first(MOST_GAPS)
         self._settled.add(first, last)

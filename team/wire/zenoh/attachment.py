@@ -1,9 +1,8 @@
 """The attachment of a publication: stamps, counter, and a hash of its key.
 
 32 bytes, `<qqq8s`: team time [ns], the publisher's wall clock [ns] and counter of the key, and the
-8-byte BLAKE2b of the whole key (UTF-8). Zenoh abbreviates keys by numbers per link, so data in
-flight when a link is cut can arrive under another key; the hash reveals that. The length is the
-version of the format: 24 bytes have no hash.
+8-byte BLAKE2b of the whole key (UTF-8): data in flight when a link is cut can arrive under another
+key. The length is the version of the format.
 """
 
 import hashlib

@@ -1,8 +1,7 @@
 """The bus over Zenoh: publish, subscribe, query and answer for one process of the team.
 
-Zenoh's receiving thread puts samples, queries and liveliness directly into one unbounded queue: the
-order of arrival is preserved across subscriptions, and a slow node never blocks the link (the
-team's credit bounds the queue).
+Zenoh's receiving thread fills one unbounded queue: the order of arrival is preserved across
+subscriptions, and a slow node never blocks the link (the team's credit bounds the queue).
 """
 
 import atexit
@@ -54,10 +53,9 @@ _Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | Non
 class ZenohBus:
     """A bus over one Zenoh session: a client of the router at `connect`.
 
-    keys: this node's certificate for TLS; None: TCP. sheds: dispensable channels. stop: wait for a
-    silent router until this event. Raises `BusError` when no router answers within `patience_s`, or
-    either side refuses the other. One thread publishes and receives; `close` may be called from
-    any.
+    keys: for TLS; None: TCP. sheds: dispensable channels. stop: wait for a silent router until this
+    event. Raises `BusError` when no router answers within `patience_s`, or either side refuses the
+    other. One thread publishes and receives; `close` may be called from any.
     """
 
     def __init__(
@@ -122,11 +120,7 @@ class ZenohBus:
         self._session.close()  # type: ignore[no-untyped-call] # the stub has no `-> None`
 
     def _flush(self) -> None:
-        """Wait until the router has received the publications, which a closing session may drop.
-
-        The query follows them on their link and nobody answers it, so its end comes from the
-        router.
-        """
+        """Wait until the router has received the publications: a query follows them."""
         with suppress(zenoh.ZError):
             for _ in self._session.get(
                 self._prefix + _FLUSH,
@@ -243,15 +237,13 @@ class ZenohBus:
         return row is not None and row.name in self._sheds
 
     def _shed(self, item: _Item) -> None:
-        """Queue a dispensable sample unless too many items wait."""
         if self._queue.qsize() < MOST_WAITING:
             self._admit(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """Return all samples since the last call, in order; wait at most `timeout_s` for the first.
 
-        Queries are answered here, on the caller's thread: a node's state needs no lock. Missing
-        samples are requested and returned when they arrive. Samples that arrive during the call are
+        Queries are answered here, on the caller's thread. Samples that arrive during the call are
         left for the next, which bounds it for a fast team.
         """
         self._check_open()
@@ -330,8 +322,7 @@ class ZenohBus:
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
         """Query and return the replies' payloads in order; empty when nobody answers.
 
-        Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries: two nodes
-        must not query each other at once.
+        Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries.
         """
         self._check_open()
         payloads = self._queries.ask(channel, name, request, timeout_s)

@@ -37,9 +37,8 @@ class ForeignSample(NamedTuple):
 class ForeignKeys:
     """Subscriptions to keys and tokens at a router or peer; raises BusError where none answers.
 
-    Zenoh's thread fills one channel per subscription without running Python, so a busy process does
-    not block it. Samples of one key keep their publisher's order. latched: keys whose earlier
-    samples are requested from the publishers' caches.
+    Zenoh's thread fills one channel per subscription without running Python. Samples of one key
+    keep their order. latched: keys whose earlier samples are requested from the publishers' caches.
     """
 
     def __init__(

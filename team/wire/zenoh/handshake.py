@@ -1,8 +1,8 @@
 """Diagnose a failing link to a router, for which Zenoh reports only a timeout.
 
-One TLS handshake by the standard library distinguishes the cases. Only evidence refuses a link: a
-TLS alert about our certificate, a router certificate that fails verification, an answer that is not
-TLS. A timeout or a network error is a reason to wait.
+Only evidence in one TLS handshake refuses a link: an alert about our certificate, a router
+certificate that fails verification, an answer that is not TLS. A timeout or a network error is a
+reason to wait.
 """
 
 import re

@@ -1,12 +1,11 @@
 """Request missing publications from their publisher's cache.
 
 Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
-publisher are therefore counted (`teamslam.team.wire.zenoh.arrivals`) and compared with its
-heartbeats, and gaps older than half a second are requested.
+publisher are therefore counted (`arrivals`) and compared with its heartbeats, and gaps older than
+half a second are requested.
 
-Keys, publishers and numbers come from the wire, so the tracked publishers are bounded, per node and
-in all; samples of further ones are delivered as they come. A robot has some 30 keys with a cache,
-the centre five per robot; a team of 100 robots, each restarted 30 times, is within the bounds.
+The tracked publishers are bounded, per node and in all; samples of further ones are delivered as
+they come. A team of 100 robots, each restarted 30 times, is within the bounds.
 """
 
 import struct
@@ -146,11 +145,7 @@ class Recovery:
         return delivered
 
     def _arrivals_of(self, key: str, publisher: str, first_known: int) -> Arrivals[Sample] | None:
-        """Return the arrivals of one publisher on one key; None beyond the bounds, and on a key of
-        no channel.
-
-        On a `latest` channel nothing before the first known number is requested.
-        """
+        """Return the arrivals of one publisher on one key; None beyond the bounds."""
         found = self._arrivals.get((key, publisher))
         if found is None:
             row = row_of(key)
@@ -247,5 +242,4 @@ def _node_of(key: str) -> str:
 
 
 def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
-    """Return the publisher as in its heartbeats, and its number of the publication."""
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

@@ -62,8 +62,8 @@ def router(
 ) -> Iterator[str]:
     """Run a router in this process; yield its endpoint.
 
-    keys: the router's credentials and the roster of accepted nodes: it then uses TLS only and logs
-    refused nodes, with the reason. Raises `BusError` when it cannot listen there.
+    keys: the router's credentials and the roster of accepted nodes, for TLS only. Raises `BusError`
+    when it cannot listen there.
     """
     settings: dict[str, object] = {
         "mode": "router",
@@ -104,8 +104,7 @@ def router(
 class _Keeper:
     """Stores each team's ends and operators' orders, and answers queries for them.
 
-    team: the only team of a router with keys, whose access control would refuse a subscription to
-    all teams' keys; "*": any team.
+    team: the only team of a router with keys, for its access control; "*": any team.
     """
 
     def __init__(self, session: zenoh.Session, team: str) -> None:
@@ -123,7 +122,6 @@ class _Keeper:
         )
 
     def _of(self, key: zenoh.KeyExpr) -> tuple[StoredMessages, str]:
-        """Return the stored messages of a key's team, and the key within the team."""
         _, team, rest = str(key).split("/", 2)
         if team not in self._teams and len(self._teams) >= MOST_TEAMS:
             return StoredMessages(), rest  # not kept

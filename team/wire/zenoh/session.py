@@ -1,7 +1,6 @@
 """Open a process's link to its team's router and monitor it.
 
-Every process is a client of one router, a star without discovery: an unconfigured process cannot
-connect, and the router is the single place to control or watch the traffic.
+Every process is a client of one router, a star without discovery.
 """
 
 import json
@@ -61,8 +60,7 @@ def client(
 ) -> zenoh.Session:
     """Open a client's session; raises `BusError` after `patience_s`, or if the router refuses us.
 
-    stop: wait until this event for a router that accepts connections without answering, as a
-    stopped or busy one does.
+    stop: wait until this event for a router that accepts connections without answering.
     """
     settings: dict[str, object] = {
         "mode": "client",
@@ -119,10 +117,9 @@ class RouterLink:
     """The link of one session to its router: logs why it is down, and raises on evidence against
     it.
 
-    Silence never ends a process. Only evidence raises `BusError`: the result of a handshake
-    (`teamslam.team.wire.zenoh.handshake`), or the router's statement that its roster lacks our
-    certificate. Zenoh connects a revoked certificate, too, and drops its messages silently; so that
-    query follows each new link.
+    Silence never ends a process. Evidence is the result of a handshake (`handshake`), or the
+    router's statement that its roster lacks our certificate: Zenoh connects a revoked one and drops
+    its messages silently, so that query follows each new link.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:
@@ -170,7 +167,6 @@ class RouterLink:
             self._interval_s = LINK_S
 
     def _wait(self, now_s: float) -> None:
-        """Examine a missing link, and log the reason at intervals."""
         if self._away_since is None:
             self._away_since, self._interval_s = now_s, LINK_S
         away_s = now_s - self._away_since
@@ -185,7 +181,6 @@ class RouterLink:
             )  # fmt: skip
 
     def _examine(self, now_s: float) -> None:
-        """Make a handshake on its own thread, at intervals that double."""
         running = self._examining is not None and self._examining.is_alive()
         if running or now_s < self._examine_due:
             return

@@ -1,15 +1,11 @@
 """Samples of a team that a router stores for absent processes: ends and orders.
 
-A stored sample keeps its key, bytes and attachment, and thereby its author. It is checked before it
-is stored, and an end replaces only an end of the same author.
+A stored sample keeps its key, bytes and attachment, and thereby its author; an end replaces only an
+end of the same author.
 
-Ends (`ENDS`) are stored until their author publishes another. A starting process cannot tell
-whether it belongs to the finished run or to a new one. The router stores which nodes of that run
-never announced their end (`Tally`): a node of that name is sent the end until one of its processes
-announces its own.
-
-Orders of operators who have left are valid until the centre's final map, or until no process of the
-team is present.
+Ends (`ENDS`) are stored until their author publishes another. A node that was in that run and never
+announced its end (`Tally`) is sent the end until one of its processes announces its own. Orders are
+valid until the centre's final map, or until no process of the team is present.
 """
 
 import threading
@@ -31,8 +27,6 @@ MOST_NODES = 1_000
 
 @dataclass(frozen=True)
 class _End:
-    """A stored end: channel, monotonic time of arrival [s], reply, and the nodes that missed it."""
-
     channel: str
     since_s: float
     reply: bytes
