@@ -3,12 +3,10 @@
 The patch, the landmarks of a stream's last submaps, is compared with the rest of its island, or
 with another island. Pair voting proposes alignments; each is grown from two of its pairs under the
 joint covariance. Its evidence is the log-likelihood ratio of its pairs less a penalty for absent
-landmarks: those of one side that the other side viewed without having one. The best alignment is a
-closure only if it passes the tests of `verification`, among them a margin to every other alignment.
+landmarks: those of one side that the other side viewed without having one.
 
-Voting needs many pairs, since it searches everywhere. Where the place of a submap is uncertain by
-only a few metres, `assign_nearby` weighs all joint assignments to the landmarks there: three common
-pairs suffice, with the evidence required of one uncertain pair.
+Where a submap's place is uncertain by only a few metres, three common pairs suffice
+(`assign_nearby`).
 """
 
 from collections.abc import Callable, Sequence
@@ -58,21 +56,19 @@ from teamslam.team.shapes import Float
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
 WEAK = 2
-"""Ratio of the best alignment's pairs to the votes of another, from which that is no rival."""
+"""An alignment with fewer votes than the best one's pairs / WEAK is no rival."""
 EXAMINED = 120
-"""Number of examined alignments, those with the most matched points."""
+"""Most examined alignments, those with the most matched points."""
 TRIED = 8
-"""Number of grown ones, those with the fewest absent landmarks for their matched ones."""
+"""Most grown alignments, those with the fewest absent landmarks for their matched ones."""
 WORTH = 3.0
 """Approximate log-likelihood ratio of a matched point, to select the alignments to grow."""
 SEEDS = 3
-"""Number of tried pairs of seeds for each."""
+"""Pairs of seeds tried for each alignment."""
 PART = 15
 """Number of neighbouring landmarks in a part of the patch that votes by itself."""
 LARGE = 150
-"""Number of landmarks from which a patch is halved into parts, as a map of many windows in one
-submap is.
-"""
+"""Number of landmarks from which a patch is halved into parts."""
 TOLERANCE, REACH = 0.4, 30.0
 """Largest distance of matched points in a proposal, and of two points that vote together, in radii
 of one object.
@@ -84,9 +80,8 @@ NEARLY = 2.0
 class Side(NamedTuple):
     """Landmarks of one side: their indices in the joint Gaussian, their positions and spreads.
 
-    ids: their indices in the caller's map. within: their indices in the whole side. views:
-    landmarks of the whole side that were observed together. parts: groups of neighbours in the
-    whole side.
+    ids, within: their indices in the caller's map and in the whole side. views: landmarks of the
+    whole side that were observed together. parts: groups of neighbours in the whole side.
     """
 
     at: Indices
@@ -101,10 +96,9 @@ class Placement(NamedTuple):
     """A placement of the patch on the target: its pairs, and the part of the target it was grown
     on.
 
-    absent: number of landmarks of one side that the other side viewed without having one. evidence:
-    log-likelihood ratio of the pairs less the penalty for them. as_rival: the same where a landmark
-    is absent only if the other side has none at all beside it, matched or not: in bent maps few of
-    a place's pairs are found, and unmatched landmarks beside others are no evidence against it.
+    absent: number of absent landmarks. evidence: log-likelihood ratio of the pairs less the penalty
+    for them. as_rival: the same, but a landmark with another one beside it, matched or not, is not
+    absent, since in bent maps few pairs of a place are found.
     """
 
     merged: Alignment
@@ -116,13 +110,13 @@ class Placement(NamedTuple):
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """The pairs by their indices in the patch and in the map of the target."""
+        """Pairs by their indices in the patch and in the map of the target."""
         of = dict(zip(self.target.at.tolist(), self.target.ids.tolist(), strict=True))
         return [(pair.first, of[pair.second]) for pair in self.merged.pairs]
 
 
 JointOf = Callable[[Vote], tuple[Joint, Side]]
-"""The joint Gaussian of both sides for a proposed alignment, and the target's part in it."""
+"""Return the joint Gaussian of both sides for a proposed alignment, and the target's part in it."""
 
 
 def align(
@@ -134,11 +128,9 @@ def align(
     *,
     is_own: bool = False,
 ) -> list[Placement]:
-    """Find the alignments of a patch with a target, by decreasing evidence; those of fewer votes
-    than least / WEAK are neither closures of `least` pairs nor rivals.
+    """Find the alignments of a patch with a target, by decreasing evidence.
 
-    is_own: the target is the patch's own map, and the alignment of landmarks with themselves is
-    left out.
+    Those of fewer votes than least / WEAK are neither closures of `least` pairs nor rivals.
     """
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
@@ -180,8 +172,8 @@ def find_closure(
 ) -> Closure | None:
     """Find the best alignment of a patch with a target and test it; None where none has two pairs.
 
-    aliases: returns alignments of the patch that are certainly wrong: evidence as strong as theirs
-    does not prove a place. Called only for an alignment that passes all other tests.
+    aliases: returns alignments that are certainly wrong: evidence as strong as theirs proves no
+    place.
     """
     found = align(patch, target, joint_of, profile, tests.pairs)
     if not found:
@@ -235,9 +227,6 @@ def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: Associati
 def _count_absent(
     merged: Alignment, patch: Side, target: Side, profile: AssociationProfile
 ) -> tuple[int, int]:
-    """Count the landmarks of either side unmatched where the other side viewed, and those of them
-    with none of the other side nearby.
-    """
     mean = merged.mean
     place = np.full(int(max(target.views.max(initial=-1), target.within.max())) + 1, -1)
     place[target.within] = np.arange(len(target.within))
@@ -256,10 +245,11 @@ def _count_missing(
     views: tuple[Views, Views],
     profile: AssociationProfile,
 ) -> tuple[int, int]:
-    """Count the unmatched points of two sides, given with the matched ones' indices, inside the
-    other side's views, and those of them far from all points of the other side.
+    """Count the absent points of two sides, and those of them far from all points of the other
+    side.
 
-    A point close to a matched place may be a split-off part of that landmark, and is not counted.
+    Sides are given with the matched points' indices. A point close to a matched place may be a part
+    of that landmark, and is not counted.
     """
     count = surely = 0
     for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
@@ -277,12 +267,10 @@ def _count_missing(
 def combine_maps(
     patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
 ) -> tuple[Joint, Side]:
-    """Combine two maps in the target's frame, with the patch as voted and free to lie anywhere;
-    return also the target's part in it.
+    """Combine two maps in the target's frame; return also the target's part in it.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
-    map's extent. Only the target's landmarks near the patch as voted can be paired, and are
-    included.
+    map's extent. Only the target's landmarks near the patch as voted are included.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
@@ -321,7 +309,6 @@ def combine_maps(
 def _grow_alignment(
     patch: Side, target: Side, joint: Joint, vote: Vote, profile: AssociationProfile
 ) -> Alignment | None:
-    """Grow the largest alignment from one of a few pairs of seeds; None where all seeds fail."""
     place = dict(zip(target.within.tolist(), target.at.tolist(), strict=True))
     first = patch.at[vote.first]
     second = np.array([place[k] for k in vote.second.tolist()], np.int64)
@@ -345,7 +332,7 @@ def _grow_alignment(
 
 
 def patch_step(profile: AssociationProfile) -> int:
-    """Number of submaps between successive patches of a stream."""
+    """Return the number of submaps between successive patches of a stream."""
     return max(1, profile.recent // 2)
 
 
@@ -376,8 +363,9 @@ def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None
 def search_other_island(
     mine: IslandView, theirs: IslandView, stream: Stream, last: int
 ) -> Closure | None:
-    """Search another island for a stream's submaps up to `last`; the pairs are indices in the two
-    views, and the motion maps the first island's frame into the second's.
+    """Search another island for a stream's submaps up to `last`.
+
+    Pairs are indices in the two views; the motion maps the first island's frame into the second's.
     """
     profile = mine.profile
     submaps = mine.find_latest(stream, last)
@@ -417,10 +405,10 @@ def search_other_island(
 
 
 def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
-    """Find the first of these submaps, the newest first, whose landmarks are assigned to others.
+    """Find the newest of these submaps whose landmarks are assigned to others.
 
-    The assignment needs at least SURE_AFTER pairs, one of them with a standard deviation above
-    `near`, the joint evidence of `assign_jointly`, and the share of a closure.
+    The assignment needs SURE_AFTER pairs, one of them with a standard deviation above `near`, the
+    joint evidence of `assign_jointly`, and the share of a closure.
     """
     profile = view.profile
     most_sd = NEARLY * profile.same
@@ -461,10 +449,9 @@ def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
 
 
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
-    """Find the landmarks that may coincide with the patch's by the joint covariance; none where all
-    are certain.
+    """Find the landmarks that may coincide with the patch's; none where all are certain.
 
-    An alignment with any other landmark is no rival: `grow_alignment` would reject its seeds.
+    An alignment with any other landmark would be rejected by `grow_pairs`.
     """
     others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
@@ -492,9 +479,7 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
 
 
 def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
-    """Make the side of a patch, with parts of at least PART landmarks where possible: those of its
-    submaps from the last one backwards, and the halves of halves of a large patch.
-    """
+    """Make the side of a patch, with parts of its last submaps and the halves of a large patch."""
     parts = []
     for first in range(len(submaps)):
         part = join_indices([])
@@ -519,5 +504,4 @@ def _halve(points: Float[np.ndarray, "n 2"], part: Indices) -> list[Indices]:
 
 
 def _is_identity(first: Indices, second: Indices) -> bool:
-    """Whether a third of the pairs are of landmarks with themselves."""
     return bool(3 * np.count_nonzero(first == second) >= len(first))

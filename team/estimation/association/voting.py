@@ -2,7 +2,7 @@
 
 Two points of one side at the distance of two points of the other propose a rigid motion (a Hough
 transform over SE(2)); motions with many votes are refined by nearest neighbours. All places are
-searched: an alignment that is not proposed could not be counted as a rival.
+searched, so that every rival is found.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from teamslam.team.estimation.association.classes import (
 from teamslam.team.shapes import Bool, Float, Int64
 
 MOST_BINS = 60
-"""Number of refined motions, those with the most votes."""
+"""Most refined motions, those with the most votes."""
 ANGLE_BIN = np.radians(6.0)
 """Width of a bin of rotations [rad]; bins of translations are three tolerances wide."""
 REFINEMENTS = 4
-"""Number of steps of nearest neighbours."""
+"""Steps of nearest neighbours."""
 MOST_HYPOTHESES = 100_000
 """Most pairs of baselines that vote: the longest, which determine the heading best."""
 MOST_OF_PART = 16
-"""Number of a part's motions that are refined on all points."""
+"""Motions of a part that are refined on all points."""
 MOST_COUNTED = 4_000_000
-"""Number of cells up to which votes are counted cell by cell."""
+"""Most cells for which votes are counted cell by cell."""
 WIDER = 1.01
 """Half of the strip in which the points within reach are searched, in reaches: for rounding."""
 MOST_DISTANCES = 2_000_000
-"""Number of distances between points in memory at once."""
+"""Most distances between points in memory at once."""
 
 
 class PointSet(NamedTuple):
@@ -49,13 +49,13 @@ class PointSet(NamedTuple):
     classes: Classes | None = None
 
     def select(self, part: Int64[np.ndarray, " k"]) -> "PointSet":
-        """Some of the points."""
+        """Select some of the points."""
         return PointSet(
             self.mean[part], self.sd[part], None if self.classes is None else self.classes[part]
         )
 
     def move(self, by: Float[np.ndarray, "2"]) -> "PointSet":
-        """The points, moved."""
+        """Translate the points."""
         return self._replace(mean=self.mean + by)
 
 
@@ -77,9 +77,8 @@ def propose_alignments(
     """Propose distinct rigid motions of a onto b, by decreasing number of matched points.
 
     tolerance: largest distance of matched points [m]. longest: largest distance [m] of two points
-    that vote together, since maps are not rigid over any distance. parts: subsets of a that vote by
-    themselves as well: where two maps share a small place far from the centroid of a, the votes of
-    all points scatter.
+    that vote together. parts: subsets of a that vote by themselves as well, for a small shared
+    place.
     """
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
@@ -117,7 +116,6 @@ def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
 
 
 def _compatible(a: PointSet, b: PointSet) -> Bool[np.ndarray, "n m"] | None:
-    """Mark the pairs of points whose classes do not contradict each other; None: all."""
     if a.classes is None or b.classes is None:
         return None
     n, m = len(a.mean), len(b.mean)
@@ -130,9 +128,6 @@ def _compatible(a: PointSet, b: PointSet) -> Bool[np.ndarray, "n m"] | None:
 def _propose_motions(
     one_side: PointSet, other_side: PointSet, tolerance: float, longest: float
 ) -> Float[np.ndarray, "_ 3"]:
-    """Propose the motions of the origin of one side, its centroid, in the bins with the most
-    votes.
-    """
     a, b, fits = one_side.mean, other_side.mean, _compatible(one_side, other_side)
     shortest = 4.0 * tolerance
     i, j, length_a = _list_baselines(a, shortest, longest)
@@ -177,7 +172,6 @@ def _list_baselines(
 
 
 def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np.ndarray, "3"]]:
-    """Find the mean motion of each of the fullest cells, in two grids half a cell apart."""
     peaks = []
     turns = round(2.0 * np.pi / ANGLE_BIN)
     for shift in (0.0, 0.5):
@@ -204,10 +198,7 @@ def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np
 def _rank_codes(
     codes: Int64[np.ndarray, " v"], beyond: int
 ) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
-    """Rank each code among the distinct ones, and count the occurrences of these.
-
-    beyond: all codes are smaller. Codes of a small range are counted, which is faster than sorting.
-    """
+    """Rank each code among the distinct ones, and count these; all codes are below `beyond`."""
     if beyond > MOST_COUNTED:
         _, of, counts = np.unique(codes, return_inverse=True, return_counts=True)
         return of, counts
@@ -223,9 +214,7 @@ def _refine(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """Refine the motions by nearest neighbours, with a tolerance that narrows to `tolerance`; drop
-    those that no two points confirm.
-    """
+    """Refine the motions by nearest neighbours; drop those that no two points confirm."""
     local, fits = a.mean - centre, _compatible(a, b)
     size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     votes = []
@@ -255,11 +244,7 @@ def _find_neighbours(
     reach: float,
     fits: Bool[np.ndarray, "n m"] | None,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find the nearest point of b within reach of each point, else 0; mark those mutually nearest.
-
-    Of points at equal distances the first one is the nearest. A point is compared with the points
-    of b in a strip of x. fits: the pairs of compatible classes; None: all.
-    """
+    """Find the nearest point of b for each point; mark those mutually nearest and within reach."""
     n, m = len(a), len(b)
     s, c = core.sin_and_cos(motions[:, 2:])
     x = (c * a[:, 0] - s * a[:, 1] + motions[:, :1]).ravel()
