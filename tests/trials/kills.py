@@ -45,7 +45,6 @@ from teamslam.team.wire.channels import FINAL_MAP
 from teamslam.team.wire.codec import WireError
 
 PROGRAM = (sys.executable, "-P", "-m", "teamslam")
-KINDS = ("robot", "central", "router", "record", "world", "viewer")
 PROC = Path("/proc")
 STOP_S = 12.0
 """How long [s] a process is stopped, in the acceptance."""

@@ -1,5 +1,7 @@
 """The bus over Zenoh: lost links, peers and processes; and the router."""
 
+import itertools
+import random
 import subprocess
 import sys
 import threading
@@ -34,7 +36,6 @@ from tests.support import (
     submap,
     wait_until,
 )
-from tests.trials.late_joins import storm
 
 FINAL = example(m.FusedMap)
 
@@ -492,9 +493,36 @@ def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint):
             bus.subscribe(c.SUBMAP)
 
 
-def test_who_joins_while_others_publish_gets_everything_once_and_in_order():
-    partial, _, _ = storm(joins=12, publishers=4, seed=5)
-    assert partial == 0
+def join_late(endpoint: str, team: str, rng: random.Random) -> dict[str, list[int]]:
+    """The counters of each key that a bus receives which joins while four others publish."""
+    robots, messages = [f"r{n}" for n in range(4)], 24
+    buses = {robot: ZenohBus(team, endpoint) for robot in robots}
+
+    def publish(first: int, end: int) -> None:
+        for count, robot in itertools.product(range(first, end), robots):
+            message = build.withdrawal(stamp_ns=count, robot=robot, reason="x" * 1_500)
+            buses[robot].publish(Outgoing(c.WITHDRAWAL, robot, message))
+
+    before = rng.randrange(messages)
+    publish(0, before)
+    sending = threading.Thread(target=publish, args=(before, messages))
+    sending.start()
+    found: dict[str, list[int]] = {c.WITHDRAWAL.key(robot): [] for robot in robots}
+    with ZenohBus(team, endpoint) as late:
+        late.subscribe(c.WITHDRAWAL)
+        for sample in received(late, messages * len(robots)):
+            found[sample.key].append(sample.counter)
+        sending.join()
+    for bus in buses.values():
+        bus.close()
+    return found
+
+
+def test_who_joins_while_others_publish_gets_everything_once_and_in_order(endpoint):
+    rng = random.Random(5)
+    for number in range(12):
+        found = join_late(endpoint, f"t{number}", rng)
+        assert all(counters == list(range(24)) for counters in found.values())
 
 
 def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint):

@@ -20,7 +20,7 @@ from teamslam.team.estimation.scans import unclaimed
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.wire import messages as m
-from tests.trials.general_measurements import CASES, mean_nees
+from tests.estimation.measurement_forms import CASES, mean_nees
 
 WINDOWS = {1011: 34, 1022: 34, 1074: 21}
 """Windows of r1 of `thesis` by seed: odometry off by three sigma beside close landmarks."""

@@ -1,18 +1,11 @@
-"""Are submaps consistent, whatever the form of the measurements? NEES over seeds, and mutants.
+"""Worlds with each form of measurement, and the NEES of the submaps made of them.
 
-    python -m tests.trials.general_measurements [--seeds 200] [--only NAME]
-
-Worlds whose robots tell odometry as increments on SE(2) with a lateral part and a correlated
-covariance, or as a car's encoders; that see landmarks as points or as range and bearing, each with
-a covariance of its own; through a sensor that is mounted away from the base. Each submap is held
-against the truth in its own frame. The mean NEES per degree of freedom must lie in the two-sided
-99.9 % interval of chi-square, and each mutant (a wrong mount, claims that are turned,
-that are half or twice the truth, a lateral part left out) must lie outside of it.
-Exit status 1 where one does not.
+Odometry is speeds, increments on SE(2) with a lateral part and a correlated covariance, or a car's
+encoders; landmarks are points or range and bearing, each with its own covariance, measured by a
+mounted sensor. A submap is compared with the truth in its own frame. A mutant changes the robot's
+configuration or its streams so that the stated covariances are wrong.
 """
 
-import argparse
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -87,22 +80,6 @@ def _less_lateral(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig,
     return robot, replace(world.streams[0], intervals=replace(told, covariances=less))
 
 
-def _odometry_factor(factor: float) -> Callable[..., tuple[RobotConfig, RobotStream]]:
-    def changed(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
-        motion = msgspec.structs.replace(robot.motion, covariance_factor=factor)
-        return msgspec.structs.replace(robot, motion=motion), world.streams[0]
-
-    return changed
-
-
-def _sensor_factor(factor: float) -> Callable[..., tuple[RobotConfig, RobotStream]]:
-    def changed(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
-        sensor = msgspec.structs.replace(robot.sensor, covariance_factor=factor)
-        return msgspec.structs.replace(robot, sensor=sensor), world.streams[0]
-
-    return changed
-
-
 def _no_shares(robot: RobotConfig, world: WorldStreams) -> tuple[RobotConfig, RobotStream]:
     motion = msgspec.structs.replace(robot.motion, shares=None)
     return msgspec.structs.replace(robot, motion=motion), world.streams[0]
@@ -113,7 +90,7 @@ CASES: Mapping[str, Case] = {
     "increments": Case(
         _world(odometry="increments", odometry_claims=True, odometry_correlation=0.6),
         _robot(),
-        {"less lateral": _less_lateral, "claims halved": _odometry_factor(0.5)},
+        {"less lateral": _less_lateral},
     ),
     "increments without covariance": Case(
         _world(odometry="increments"),
@@ -123,18 +100,18 @@ CASES: Mapping[str, Case] = {
     "points": Case(
         _world(landmark_form="points", landmark_claims=(0.4, 3.0)),
         _robot(),
-        {"turned by a right angle": _turned, "claims halved": _sensor_factor(0.5)},
+        {"turned by a right angle": _turned},
     ),
     "ranges with own covariances": Case(
         _world(landmark_claims=(0.4, 3.0)),
         _robot(),
-        {"claims doubled": _sensor_factor(2.0)},
+        {},
     ),
     "mount": Case(_world(), _robot(mount=MOUNT), {"another mount": _other_mount}),
     "car": Case(
         _world(odometry="steering", speed_m_s=2.0),
         _robot(CAR, mount=MOUNT),
-        {"no shares": _no_shares, "another mount": _other_mount},
+        {"no shares": _no_shares},
     ),
 }  # fmt: skip
 
@@ -175,26 +152,3 @@ def mean_nees(case: Case, seeds: int, mutant: str | None = None) -> tuple[float,
             total, dof = total + squared, dof + numbers
     low, high = chi2_interval(dof, PROBABILITY, 1)
     return total / dof, low, high
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, add_help=True)
-    parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--only", default="")
-    options = parser.parse_args()
-    failed = 0
-    for name, case in CASES.items():
-        if not name.startswith(options.only):
-            continue
-        for mutant in (None, *case.mutants):
-            value, low, high = mean_nees(case, options.seeds, mutant)
-            right = (low <= value <= high) == (mutant is None)
-            failed += not right
-            what = f"{name}: {mutant}" if mutant else name
-            verdict = "" if right else "   WRONG"
-            print(f"{what:50} NEES/dof {value:8.3f}   [{low:.3f}, {high:.3f}]{verdict}", flush=True)
-    return int(failed > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
