@@ -11,12 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from teamslam.central.desk.evaluation.errors import Path
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
     Scan,
-    anchored,
     chains_of,
 )
 from teamslam.sim.scenarios.scenario import Scenario
@@ -24,8 +22,7 @@ from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_grap
 from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
 from teamslam.team.estimation.models import increment_of
-from teamslam.team.estimation.se2 import between, compose, exponential
-from teamslam.team.wire import channels as ch
+from teamslam.team.estimation.se2 import compose, exponential
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
 
 small = st.floats(-0.3, 0.3)
@@ -95,14 +92,6 @@ def test_the_map_is_consistent_and_a_measurement_used_twice_is_found(twice):
     assert inside == (not twice), f"NEES/dof {total / dof:.3f} over {dof}"
 
 
-def test_a_robot_that_the_join_left_out_is_named():
-    of = scenario(robots=2)
-    log = [s for s in joined_log(of, 0.1) if s.key != ch.TRAJECTORY.key("r2")]
-    limit = batch_map(log)
-    assert list(limit.paths) == ["r1"]
-    assert limit.left_out == ("r2: it is not in the joined map",)
-
-
 def test_an_unknown_start_is_found_where_the_map_lies():
     of = scenario(robots=2)
     lost = msgspec.structs.replace(
@@ -112,38 +101,7 @@ def test_an_unknown_start_is_found_where_the_map_lies():
     assert limit.position_rmse_m["r2"] < 0.3
 
 
-def test_a_log_without_trajectories_says_what_to_run():
-    log = [s for s in joined_log(scenario(), 0.1) if s.key != ch.TRAJECTORY.key("r1")]
-    with pytest.raises(BatchReferenceError, match="--fusion join"):
-        batch_map(log)
-
-
-def test_a_run_that_did_not_end_has_no_limit():
-    with pytest.raises(BatchReferenceError, match="record a run to its end"):
-        batch_map(world_log(scenario()))
-
-
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(BatchReferenceError, match=r"pip install '?gtsam"):
         batch_map([])
-
-
-def test_every_filling_holds_the_anchors():
-    of = scenario()
-    chain = chains_of(world_log(of), of)[0]
-    stream = streams(of).streams[0]
-    assert stream.truth is not None
-    anchors = Path(chain.stamps_ns[::5], stream.truth[::5])
-    fillings = anchored(chain, anchors)
-    for poses in fillings:
-        for pose, anchor in zip(poses[::5], stream.truth[::5], strict=True):
-            np.testing.assert_allclose(between(anchor, pose), 0.0, atol=1e-9)
-    onward, back, _ = fillings
-    odometry = chain.dead_reckoned
-    for i in range(20):
-        moved = between(odometry[i], odometry[i + 1])
-        if i % 5 != 4:
-            np.testing.assert_allclose(between(onward[i], onward[i + 1]), moved, atol=1e-9)
-        if i % 5 != 0:
-            np.testing.assert_allclose(between(back[i], back[i + 1]), moved, atol=1e-9)

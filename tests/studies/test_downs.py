@@ -1,24 +1,20 @@
 """The experiments after Downs' thesis: his protocol on his simulator, his tables and tests."""
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
 
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments import downs_minima
-from teamslam.sim.studies.experiments.downs import HIS, TABLE_5_1, TABLE_5_3, TABLE_5_5
+from teamslam.sim.studies.experiments.downs import TABLE_5_1
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
 from teamslam.sim.studies.experiments.downs_simulated import (
     SIMULATED_5_1,
     WORLDS,
 )
-from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.team.estimation.map_joining.alignment import procrustes
-
-SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
 
 def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances():
@@ -33,40 +29,6 @@ def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_co
         assert 0 < robot["position_rmse"] < 2.0
         assert len(robot["map"]["ids"]) == robot["landmarks"]
     assert result["with_covariances"]["rmse"] < 0.5 * result["team"]["rmse"]
-
-
-def _results(ekf: float, joined: float) -> Results:
-    """Every robot of every run with the same map error, but for a millimetre a robot."""
-    options = Options((1,), datasets=(SET_1,))
-    tasks = {t.name: t for table in (TABLE_5_3, TABLE_5_5) for t in table.tasks(options)}
-
-    def result(label: str) -> Figures:
-        error = ekf if "ekf-slam" in label else joined
-        robots = {f"r{k}": {"rmse": error + 0.001 * k * k * error} for k in range(1, 6)}
-        return {"robots": robots, "rmse": error, "team": {"rmse": error}}
-
-    return Results({name: result(task.label) for name, task in tasks.items()})
-
-
-def test_the_paired_test_tells_maps_that_differ_from_those_that_do_not():
-    options = Options((1,), datasets=(SET_1,))
-    apart = TABLE_5_3.outcome(options, _results(0.4, 0.03)).figures["t_tests"][HIS]
-    same = TABLE_5_3.outcome(options, _results(0.4, 0.4)).figures["t_tests"][
-        "printed, all nine sets"
-    ]
-    assert apart["pairs"] == 5
-    assert apart["p"] < 1e-6
-    assert same["pairs"] == 45
-    assert same["mean_before_m"] == pytest.approx(0.4004, abs=5e-4)
-    assert same["mean_after_m"] == pytest.approx(0.0347, abs=5e-4)
-
-
-def test_the_team_is_compared_set_by_set_and_one_set_has_no_p():
-    options = Options((1,), datasets=(SET_1,))
-    tests = TABLE_5_5.outcome(options, _results(0.4, 0.03)).figures["t_tests"]
-    assert tests[HIS]["pairs"] == 1
-    assert tests[HIS]["p"] is None
-    assert tests["printed, all nine sets"]["p"] == pytest.approx(0.128, abs=1e-3)
 
 
 def _map(points: np.ndarray, sigma: float) -> Figures:

@@ -1,29 +1,23 @@
 """Runs of experiments, and shards that are computed apart."""
 
 import json
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import pytest
-from joblib.externals.loky.process_executor import TerminatedWorkerError
 from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
-from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner, xu_localisation
-from teamslam.sim.studies.experiments.cases import FOLDER, Cases, Done
+from teamslam.sim.studies.experiments.cases import Cases, Done
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
 from teamslam.sim.studies.experiments.output import write
-from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, dataset, planned
-from teamslam.sim.studies.experiments.shards import Shard, tasks_of
-from teamslam.sim.studies.experiments.sources import sources_of
-from teamslam.sim.studies.experiments.task import ROOTS, Task
+from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, planned
+from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 
 WORK = "json:loads"
@@ -117,85 +111,6 @@ def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     assert Cases(tmp_path).found(counted(2.0)) is None
     monkeypatch.setattr("teamslam.sim.studies.experiments.task.program_of", lambda _: "0" * 16)
     assert Cases(tmp_path).found(counted(1.0)) is None
-
-
-def test_a_result_that_was_cut_off_is_computed_again(tmp_path):
-    list(Cases(tmp_path).run([counted(1.0), counted(2.0)], 1))
-    for kept in (tmp_path / FOLDER).rglob("output.pkl"):
-        kept.write_bytes(kept.read_bytes()[:-9])
-    (concluded,) = computed([plan(counted(1.0), counted(2.0))], tmp_path, 1, silent)
-    assert concluded.outcome.figures["means"] == [1.0, 2.0]
-
-
-def test_a_task_is_named_by_its_parameters_and_not_by_where_its_data_lies():
-    assert counted(1.0).name == counted(1.0).name
-    assert counted(1.0).name != counted(2.0).name
-    there, here = (Task(WORK, {"a": 1}, "", local={"path": path}) for path in ("/there", "/here"))
-    assert there.name == here.name
-
-
-def test_the_program_of_a_run_is_every_source_that_it_imports():
-    sources = sources_of("teamslam.sim.studies.experiments.team_runs", ROOTS)
-    wanted = {
-        "teamslam.team.estimation.hybrid_slam.outliers",
-        "teamslam.central.submap_fold",
-        "teamslam.sim.studies.rules.svd_rule",  # found by the name that a table gives
-        "teamslam.sim.studies.batch_reference.graph",
-        "teamslam.sim",
-    }
-    assert wanted <= sources.keys()
-    assert "teamslam.sim.studies.experiments.output" not in sources
-    assert not {name for name in sources if name.partition(".")[0] == "numpy"}
-
-
-def test_leaving_early_ends_the_long_run_too(tmp_path):
-    begun = time.monotonic()
-    slow = Task("subprocess:run", {"args": ["sleep", "300"]}, "slow")
-    runs = Cases(tmp_path).run([counted(1.0), slow], 2)
-    assert next(runs).task == counted(1.0)
-    runs.close()  # type: ignore[attr-defined] # a generator
-    assert time.monotonic() - begun < 200.0
-
-
-@pytest.mark.parametrize("error", [KeyError, ValueError])
-def test_leaving_while_a_case_is_handed_over_leaves_no_error(error, tmp_path, monkeypatch):
-    """The pool's thread fails with a KeyError on that case; another error is shown."""
-    task = counted(1.0)
-
-    class PoolThread(threading.Thread):
-        __module__ = TerminatedWorkerError.__module__
-
-        def run(self) -> None:
-            raise error("a case")
-
-    def left_early(*_: object) -> Iterator[Done]:
-        try:
-            yield Done(task, {})
-        finally:
-            thread = PoolThread()
-            thread.start()
-            thread.join()
-
-    shown: list[threading.ExceptHookArgs] = []
-    monkeypatch.setattr(threading, "excepthook", shown.append)
-    monkeypatch.setattr(Cases, "_parallel", left_early)
-    runs = Cases(tmp_path).run([task, counted(2.0)], 2)
-    next(runs)
-    runs.close()  # type: ignore[attr-defined] # a generator
-    assert [each.exc_type for each in shown] == [each for each in [error] if each is not KeyError]
-
-
-def test_a_data_set_is_known_by_its_content(tmp_path):
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "Barcodes.dat").write_text("1 5\n")
-    a, b = dataset(tmp_path / "a"), dataset(tmp_path / "b")
-    assert (a.name, b.name) == ("a", "b")
-    assert a.sha256 == b.sha256
-    (tmp_path / "b" / "Barcodes.dat").write_text("1 6\n")
-    assert dataset(tmp_path / "b").sha256 != a.sha256
-    with pytest.raises(DatasetError, match="no such file"):
-        dataset(tmp_path / "c")
 
 
 def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(tmp_path):
@@ -301,10 +216,3 @@ def test_a_shard_is_a_number_of_a_number(text):
     refused = RUN.invoke(app, ["experiment", "xu-4.4", "--shard", text])
     assert refused.exit_code == 2
     assert "as 2/8" in refused.output
-
-
-def test_every_run_is_in_one_shard_and_long_runs_are_spread():
-    tasks = {each.name: each for each in (task(k, float(k)) for k in range(10))}
-    parts = [tasks_of(tasks, Shard(k, 3)) for k in (1, 2, 3)]
-    assert sorted(name for part in parts for name in part) == sorted(tasks)
-    assert [max(each.cost for each in part.values()) for part in parts] == [9.0, 8.0, 7.0]

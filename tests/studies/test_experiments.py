@@ -1,28 +1,16 @@
 """Experiments: figures over seeds, goals, the page, the command line."""
 
-import json
-
 import pytest
 from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
-from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments import accuracy_few, accuracy_worlds
-from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
-from teamslam.sim.studies.experiments.curves import curves_task
 from teamslam.sim.studies.experiments.experiment import (
     Goal,
     Options,
-    Outcome,
-    Picture,
     Results,
-    Table,
 )
-from teamslam.sim.studies.experiments.output import to_json, write
-from teamslam.sim.studies.experiments.parameters import kinds_of
-from teamslam.sim.studies.experiments.runner import Concluded, planned
 from teamslam.sim.studies.experiments.team_runs import Figures, over_seeds
-from teamslam.sim.studies.experiments.xu import with_particles
 
 
 def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1) -> Figures:
@@ -75,70 +63,6 @@ def test_a_team_that_counts_measurements_twice_misses_the_goals():
 
 
 _POSES = {"final_pose_nees": 1.0, "online_pose_nees": 1.0, "each_once": True}
-
-
-def test_every_experiment_plans_runs_and_lives_without_any_result():
-    for entry in ENTRIES:
-        options = Options((1, 2), quick=True)
-        plan = planned(entry, options)
-        assert len({task.name for task in plan.tasks}) == len(plan.tasks)
-        outcome = plan.experiment.outcome(options, Results({}))
-        assert outcome.title
-        assert all(goal.passed is None for goal in outcome.goals)
-
-
-def concluded() -> Concluded:
-    table = Table("errors", ("rule", "rmse [m]"), (("join", "<0.5>"),), "of the map")
-    outcome = Outcome(
-        "a title",
-        {"rmse": float("nan"), "all": [1.0, float("inf")]},
-        (table,),
-        (Picture("curve", "a curve", lambda path: path.write_bytes(b"\x89PNG")),),
-        (Goal("nees", 1.3, 0.8, 1.2),),
-        ("a remark",),
-        ("a data set",),
-    )
-    return Concluded(Entry("some", "", "Something."), Options((3, 4)), outcome, 2, {"run": "why"})
-
-
-def test_the_json_has_the_figures_the_goals_and_what_is_missing_and_no_nan(tmp_path):
-    content = to_json(concluded(), {"version.numpy": "2"})
-    assert content["rmse"] is None
-    assert content["all"] == [1.0, None]
-    assert content["goals"][0]["passed"] is False
-    assert content["missing"] == ["a data set"]
-    assert content["failed"] == {"run": "why"}
-    assert content["seeds"] == [3, 4]
-    json.dumps(content, allow_nan=False)
-
-
-def test_the_page_stands_alone_and_escapes_what_it_shows(tmp_path):
-    page = write([concluded()], tmp_path, "index", {"version.numpy": "2"}).read_text()
-    assert "&lt;0.5&gt;" in page
-    assert "data:image/png;base64," in page
-    assert 'name="viewport"' in page
-    for said in ("a title", "a remark", "a data set", "MISSED", "version.numpy", "a curve"):
-        assert said in page
-    assert "http" not in page
-    assert (tmp_path / "some-curve.png").read_bytes() == b"\x89PNG"
-    assert json.loads((tmp_path / "some.json").read_text())["experiment"] == "some"
-
-
-def test_the_parameters_of_a_run_are_said_where_they_differ_from_its_scenario():
-    scenario = with_particles(with_options(load("thesis"), seed=7, robots=1), 50)
-    tasks = [curves_task(with_options(scenario, seed=seed), label="t") for seed in (1, 2)]
-    ((label, count, said),) = kinds_of(tasks)
-    assert (label, count) == ("t, hybrid + join", 2)
-    assert "world: thesis, robots.front_end.particles = 50, central.particles = 50" in said
-    ((_, _, said),) = kinds_of([curves_task(load("thesis"))])
-    assert said.endswith("thesis, as it is")
-
-
-def test_help_lists_every_experiment():
-    shown = CliRunner().invoke(app, ["experiment", "--help"], terminal_width=100)
-    assert shown.exit_code == 0
-    for entry in ENTRIES:
-        assert f" {entry.name} " in shown.output
 
 
 @pytest.mark.parametrize(

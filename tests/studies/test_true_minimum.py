@@ -3,24 +3,15 @@
 from dataclasses import replace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.errors import Path
-from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.experiments.plain_cost import PlainCost
-from teamslam.sim.studies.experiments.true_minimum import final_fold, judged, true_minimum
-from teamslam.team.config import FrontEnd
+from teamslam.sim.studies.experiments.true_minimum import judged
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
-from teamslam.team.estimation.map_joining.joining import solve_fold
-from teamslam.team.estimation.map_joining.marginals import joint_cost
 from teamslam.team.estimation.map_joining.minima import search_minima, solve_minimum
-from tests.estimation.sighting_world import joined_with, meeting, mirrored
+from tests.estimation.sighting_world import joined_with, mirrored
 from tests.estimation.submap_world import Team, team
-from tests.studies.test_experiment_runs import short
 
 OPTIONS = JoinSettings(robust=False)
 
@@ -86,27 +77,6 @@ def test_submaps_that_deny_the_truth_are_found():
     assert not found.wrong
 
 
-@pytest.mark.parametrize("biases", [(), FrontEnd().biases], ids=["without biases", "default"])
-def test_a_run_is_asked_for_its_own_final_map(biases):
-    scenario = short(80)
-    robots = tuple(
-        msgspec.structs.replace(
-            each, front_end=msgspec.structs.replace(each.front_end, biases=biases)
-        )
-        for each in scenario.robots
-    )
-    scenario = msgspec.structs.replace(scenario, robots=robots)
-    samples = list(run_team(scenario, streams_of(scenario)))
-    fold, published = final_fold(samples), final_map(samples).chi2
-    robust = solve_fold(fold, replace(fold.main.settings, robust=True))
-    rel = 0.05 if biases else 1e-6
-    assert joint_cost(robust).chi2 == pytest.approx(published, rel=rel)
-    assert fold.main.cost > (1.0 - 1e-6) * published, "plain squares bound the robust loss"
-    found = true_minimum(samples, evaluate(samples))
-    assert not found.wrong
-    assert not found.excluded
-
-
 def test_a_map_that_is_not_at_rest_is_wrong():
     """The map is judged as published, without a further solution by the team's solver."""
     _, island, landmarks, paths = world(2)
@@ -118,23 +88,3 @@ def test_a_map_that_is_not_at_rest_is_wrong():
     found = judged(replace(island, state=off), landmarks, paths)
     assert found.wrong
     assert found.lower == pytest.approx(3.0, abs=0.1)
-
-
-def test_the_judge_s_cost_is_the_map_joining_s():
-    """Two programs, one cost: with inter-robot measurements, pose nodes, an uncertain start."""
-    met = meeting(3)
-    starts = [replace(each, covariance=np.diag([0.04, 0.04, 0.01])) for each in met.starts]
-    island = joined_with(met.submaps, starts, met.sightings, OPTIONS).main
-    rng = np.random.default_rng(0)
-    fixed = np.zeros(len(island.state), dtype=np.bool_)
-    cost = PlainCost(island.graph, 1.0, fixed)
-    assert len(island.graph.sightings) > 4
-    for _ in range(3):
-        state = island.state + 0.3 * rng.normal(size=len(island.state))
-        assert cost.of(state) == pytest.approx(replace(island, state=state).cost, rel=1e-9)
-        J, h = cost.jacobian(state), 1e-6
-        gradient = 2.0 * J.T @ cost.residuals(state)
-        for k in rng.choice(len(state), 5, replace=False):
-            moved = h * np.eye(len(state))[k]
-            slope = (cost.of(state + moved) - cost.of(state - moved)) / (2.0 * h)
-            assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-3)

@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 
 from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
-from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments import xu, xu_localisation
-from teamslam.sim.studies.experiments.curves import a_step_late, curves_run
+from teamslam.sim.studies.experiments.curves import curves_run
 from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu_errors import FIGURE_4_4, FIGURE_5_2
@@ -56,13 +54,6 @@ def test_as_coded_the_errors_are_far_below_those_as_stated(runs):
     assert stated > 1.5 * exact > 3.0 * coded
 
 
-def test_the_poses_of_multi_fastslam_are_those_of_the_centres_filter(runs):
-    curve = runs["5.2 as coded", xu.MULTI_FASTSLAM.name]["poses"]["r1"]
-    # With exact odometry the robot's own dead reckoning would be exact.
-    assert max(curve["error_m"]) > 0.0
-    assert set(runs["5.2 as stated", xu.MULTI_FASTSLAM.name]["poses"]) == {"r1", "r2"}
-
-
 def scenario(**change: object) -> Scenario:
     made = with_options(load("thesis"), robots=1)
     return msgspec.structs.replace(made, world=msgspec.structs.replace(made.world, **change))
@@ -80,15 +71,6 @@ def test_the_coded_inputs_are_the_appendix_numbers():
     world = loads(msgspec.json.encode(parameters["world"]).decode())
     assert world.robots[0].motion.is_exact
     assert parameters["late"]
-
-
-def test_late_measurements_are_those_of_the_step_before():
-    streams = streams_of(scenario(steps=30, observe_at_start=True))
-    now, late = (s.streams[0].landmark_detections for s in (streams, a_step_late(streams)))
-    np.testing.assert_array_equal(late.stamps_ns, now.stamps_ns[1:])
-    for k in range(len(late.stamps_ns)):
-        np.testing.assert_array_equal(late.ids[late.rows(k)], now.ids[now.rows(k)])
-        np.testing.assert_array_equal(late.ranges[late.rows(k)], now.ranges[now.rows(k)])
 
 
 def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only():

@@ -16,7 +16,6 @@ from teamslam.team.estimation.consistency import chi2_interval, nees, state_erro
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
-from tests.estimation.estimator_runs import keyframes_of, map_errors, run, world
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)
 STANDING = Increment.identity()
@@ -134,20 +133,6 @@ def test_a_first_sight_adds_the_landmark_with_its_cross_terms_and_changes_nothin
     np.testing.assert_allclose(after.covariance[n:, :n], J[:, :n] @ state.covariance, atol=1e-7)
 
 
-def test_landmarks_are_reported_by_id_beside_the_pose():
-    state = some_state(np.random.default_rng(4))
-    ids, means, P = ekf_slam.landmark_gaussian(state)
-    assert (np.diff(ids.astype(int)) > 0).all()
-    for k, id_ in enumerate(ids):
-        slot = int(np.flatnonzero(state.ids == id_)[0])
-        np.testing.assert_array_equal(means[k], state.mean[3 + 2 * slot : 5 + 2 * slot])
-        assert P[2 * k, 2 * k + 1] == state.covariance[3 + 2 * slot, 4 + 2 * slot]
-    np.testing.assert_array_equal(ekf_slam.pose_gaussian(state).mean, state.mean[:3])
-    local = ekf_slam.local_map(state)
-    np.testing.assert_array_equal(local.covariance[3:, 3:], P)
-    np.testing.assert_array_equal(local.covariance[:3, :3], state.covariance[:3, :3])
-
-
 @functools.cache
 def short_run(seed, repeat):
     """NEES, NIS and their dofs of ten steps among six landmarks, each measurement `repeat`
@@ -183,31 +168,6 @@ def test_a_short_window_is_consistent_and_one_that_counts_measurements_twice_is_
         dof = runs[:, column + 1].sum()
         low, high = chi2_interval(int(dof), 0.999, 1)
         assert (low < runs[:, column].sum() / dof < high) == is_right
-
-
-def test_what_a_keyframe_shows_first_was_not_predicted():
-    state, motion = some_state(np.random.default_rng(3)), some_motion(np.random.default_rng(4))
-    unknown = np.array([91, 92], np.uint32)
-    assert (
-        ekf_slam.innovation(state, motion, SENSOR, unknown, np.ones(2), np.ones(2))
-        == innovations.NOTHING
-    )
-
-
-@pytest.mark.parametrize(("name", "at_least"), [("thesis", 3.0), ("thesis-b", 10.0)])
-def test_over_a_long_run_it_is_over_confident_by_nature(name, at_least):
-    # Measured over 20 runs: mean 6.4 with the coarse sensor and 68 with the accurate one.
-    values = []
-    for seed in range(1, 5):
-        robots, streams = world(name, seed)
-        for config, stream in zip(robots, streams.streams, strict=True):
-            state = ekf_slam.initial_state(stream.start.pose)
-            landmarks = ekf_slam.landmark_gaussian(
-                run(state, ekf_slam.filter_step, keyframes_of(config, stream), config)
-            )
-            error = map_errors(landmarks, streams)
-            values.append(nees(error, landmarks.covariance) / len(error))
-    assert np.mean(values) > at_least > chi2_interval(36, 0.999, len(values))[1]
 
 
 def test_a_state_whose_covariance_is_none_any_more_is_named_not_carried_on():

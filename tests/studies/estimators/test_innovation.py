@@ -1,18 +1,14 @@
 """The innovation of a keyframe: what it is, and that it tells right models from wrong ones."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.team.config import Sensor
-from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment, predicted
 from teamslam.team.estimation.se2 import compose, exponential
-from tests.estimation.hybrid_slam.test_window import ACCURATE, drive, driven, wrap
+from tests.estimation.hybrid_slam.test_window import wrap
 
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.02, bearing_sigma=0.03)
 FACTOR = np.array([[0.04, 0.0, 0.0], [0.01, 0.03, 0.0], [-0.01, 0.02, 0.05]])
@@ -74,39 +70,3 @@ def test_it_is_the_error_in_the_metric_of_the_mixtures_prediction(count):
     found = innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
     assert found.dof == 6
     assert found.squared == pytest.approx(error @ np.linalg.solve(S, error), rel=1e-3)
-
-
-def test_a_prediction_that_is_no_covariance_is_refused():
-    of = particles(7)
-    without_number = dataclasses.replace(of, covariances=np.full_like(of.covariances, np.nan))
-    with pytest.raises(NotACovarianceError, match="not finite"):
-        innovation(without_number, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
-    exact = Sensor(range_sigma=1e-12, bearing_sigma=1e-12)  # one landmark, seen twice
-    with pytest.raises(NotACovarianceError, match="not positive definite"):
-        innovation(of, INCREMENT, exact, IDS, RANGES, BEARINGS)
-
-
-def test_what_is_seen_for_the_first_time_was_not_predicted():
-    unknown = np.array([5, 6], np.uint32)
-    nothing = innovation(particles(7), INCREMENT, SENSOR, unknown, RANGES[:2], BEARINGS[:2])
-    assert nothing == NOTHING
-    assert nothing.per_dof is None
-    mixed = innovation(
-        particles(7), INCREMENT, SENSOR, np.array([5, 9], np.uint32), RANGES[:2], BEARINGS[:2]
-    )
-    alone = innovation(particles(7), INCREMENT, SENSOR, IDS[1:2], RANGES[1:2], BEARINGS[1:2])
-    assert mixed == alone
-    assert mixed.dof == 2
-
-
-def test_keyframes_add_up_and_a_window_has_their_sum():
-    run = drive(3, ACCURATE, steps=6)
-    window, total = driven(run, ACCURATE), NOTHING
-    for steps in range(1, 7):
-        part = dataclasses.replace(
-            run, motions=run.motions[:steps], keyframes=run.keyframes[:steps]
-        )
-        total = driven(part, ACCURATE).innovation
-    assert window.innovation == total
-    assert Innovation(1.5, 2).plus(Innovation(2.5, 6)) == Innovation(4.0, 8)
-    assert Innovation(4.0, 8).per_dof == 0.5

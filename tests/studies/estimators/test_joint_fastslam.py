@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from teamslam.sim.studies.estimators import joint_fastslam, plain_fastslam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
-from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.models import Increment
 from tests.estimation.team_rounds import LANDMARKS, OTHER, SENSOR, STARTS, team_run, wrap
@@ -73,22 +70,6 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
         np.testing.assert_array_equal(joint.poses[index], state.particles.poses)
 
 
-@settings(deadline=None, max_examples=15)
-@given(seed=st.integers(0, 10_000), proposal=st.sampled_from(PROPOSALS))
-def test_turns_in_one_step_are_turns_in_steps_of_their_own_but_for_resampling(seed, proposal):
-    rounds, _ = team_run(seed, steps=4)
-    apart = [[turn] for turns in rounds for turn in turns]
-    at_once, one_by_one, often = (
-        filtered(
-            each,
-            joint_fastslam.initial_state(STARTS, 30, proposal, below),
-            np.random.default_rng(seed),
-        )
-        for each, below in ((rounds, 0.0), (apart, 0.0), (rounds, 1.0))
-    )
-    assert bytes_of(at_once) == bytes_of(one_by_one) != bytes_of(often)
-
-
 def test_standing_robots_measurements_of_one_landmark_are_fused_as_gaussians():
     sees = np.array([0], np.uint32)
     turns, informations, weighted = [], [], []
@@ -109,39 +90,3 @@ def test_standing_robots_measurements_of_one_landmark_are_fused_as_gaussians():
     expected = np.linalg.inv(sum(informations))
     np.testing.assert_allclose(P, expected, rtol=0.02, atol=1e-5)
     np.testing.assert_allclose(means[0], expected @ sum(weighted), atol=2e-3)
-
-
-def short_run(seed, repeat):
-    """Compute the team map's NEES and dof; each measurement counts `repeat` times."""
-    rounds, _ = team_run(seed, steps=5)
-    rounds = [
-        [
-            turn._replace(
-                **{k: np.repeat(getattr(turn, k), repeat) for k in ("ids", "ranges", "bearings")}
-            )
-            for turn in turns
-        ]
-        for turns in rounds
-    ]
-    state = joint_fastslam.initial_state(STARTS, 300, "fastslam2", 0.5)
-    landmarks = joint_fastslam.landmark_gaussian(
-        filtered(rounds, state, np.random.default_rng(seed))
-    )
-    error = (landmarks.means - LANDMARKS[landmarks.ids]).ravel()
-    return nees(error, landmarks.covariance), len(error)
-
-
-def test_a_short_run_is_consistent_and_one_that_counts_measurements_twice_is_not():
-    honest, twice = (np.array([short_run(seed, k) for seed in range(80)]) for k in (1, 2))
-    low, high = chi2_interval(int(honest[:, 1].sum()), 0.999, 1)
-    assert low < honest[:, 0].sum() / honest[:, 1].sum() < high
-    assert not low < twice[:, 0].sum() / twice[:, 1].sum() < high
-
-
-def test_a_robot_that_the_team_does_not_know_is_refused():
-    rounds, _ = team_run(7, steps=1)
-    state = joint_fastslam.initial_state({"r1": np.zeros(3)}, 5, "fastslam1", 0.5)
-    with pytest.raises(ValueError):
-        joint_fastslam.filter_step(state, rounds[0], np.random.default_rng(0))
-    with pytest.raises(ValueError):
-        joint_fastslam.pose_gaussian(state, "r2")

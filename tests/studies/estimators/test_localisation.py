@@ -13,7 +13,6 @@ from teamslam.team.estimation.consistency import chi2_interval, nees, state_erro
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
-from tests.estimation.estimator_runs import keyframes_of, run, world
 
 IDS = np.array([2, 5, 9], np.uint32)
 LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
@@ -107,23 +106,6 @@ def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
     assert len(np.unique(particles.log_weights)) > 400
 
 
-def test_a_measurement_of_a_landmark_that_is_not_on_the_map_is_left_out():
-    state = localisation.initial_state(np.zeros(3), 50, IDS, LANDMARKS)
-    ranges, bearings = sights(np.array([1.0, 0.0, 0.2]))
-    known = (IDS, ranges, bearings)
-    more = (
-        np.array([1, *IDS, 12], np.uint32),
-        np.array([3.0, *ranges, 4.0]),
-        np.array([0.5, *bearings, 0.6]),
-    )
-    one, other = (
-        localisation.filter_step(state, MOTION, SENSOR, *keyframe, np.random.default_rng(0))
-        for keyframe in (known, more)
-    )
-    assert one.cloud.poses.tobytes() == other.cloud.poses.tobytes()
-    assert one.cloud.log_weights.tobytes() == other.cloud.log_weights.tobytes()
-
-
 @functools.cache
 def short_run(seed, repeat):
     """Compute NEES and NIS of eight steps; each measurement counts `repeat` times."""
@@ -150,22 +132,3 @@ def test_it_is_consistent_and_one_that_counts_measurements_twice_is_not(column):
         dof = runs[:, column + 1].sum()
         low, high = chi2_interval(int(dof), 0.999, 1)
         assert (low < runs[:, column].sum() / dof < high) == (repeat == 1)
-
-
-@pytest.mark.parametrize("name", ["thesis", "thesis-b"])
-def test_in_the_thesis_world_it_finds_itself_from_an_unknown_start(name):
-    robots, streams = world(name, 1)
-    config, stream = robots[0], streams.streams[0]
-    random = np.random.default_rng(4)
-    state = localisation.initial_state_anywhere(
-        np.zeros(2), np.full(2, 100.0), 20_000, streams.landmark_ids, streams.landmarks, random
-    )
-    lost = localisation.pose_gaussian(state)
-    assert min(np.diag(lost.covariance)[:2]) > 25.0**2
-    keyframes = keyframes_of(config, stream)[:150]
-    pose = localisation.pose_gaussian(
-        run(state, localisation.filter_step, keyframes, config, random)
-    )
-    error = state_error(pose.mean, stream.truth[150])
-    assert np.hypot(*error[:2]) < 2.0
-    assert nees(error, pose.covariance) < 25.0

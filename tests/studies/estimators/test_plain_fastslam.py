@@ -67,29 +67,6 @@ def test_the_map_is_the_mixture_of_the_particles_maps_by_id():
     assert np.abs(expected[:2, 2:]).max() > 1e-3
 
 
-def tagged(state):
-    """Give each particle a landmark 99, never measured, at the particle's number."""
-    count = len(state.particles.poses)
-    particles = dataclasses.replace(
-        state.particles,
-        ids=np.array([99], np.uint32),
-        means=np.tile(np.arange(count, dtype=float)[:, None, None], (1, 1, 2)),
-        covariances=np.ones((count, 1, 3)),
-    )
-    return dataclasses.replace(state, particles=particles)
-
-
-def test_the_threshold_says_when_a_step_begins_with_a_resampling():
-    told = drive(4, ACCURATE)
-    survivors = {}
-    for below in (0.0, 0.5, 1.0):
-        start = tagged(plain_fastslam.initial_state(np.zeros(3), 200, "fastslam1", below))
-        end = filtered(told, ACCURATE, start, np.random.default_rng(2)).particles
-        survivors[below] = len(np.unique(end.means[:, 0, 0]))
-    assert survivors[0.0] == 200 > 2 * survivors[0.5] > 0
-    assert survivors[1.0] < 100
-
-
 def short_run(seed, repeat):
     """Compute the map's NEES and dof; each measurement counts `repeat` times."""
     told = drive(seed, ACCURATE, steps=8)

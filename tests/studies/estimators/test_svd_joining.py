@@ -10,8 +10,6 @@ from teamslam.sim.studies.estimators import svd_joining
 from teamslam.sim.studies.estimators.svd_joining import PointPairs, TooFewPointsError
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.gaussian import LandmarkGaussian
-from teamslam.team.estimation.map_joining import joining
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth, team, wrap
@@ -80,19 +78,6 @@ def test_the_identity_gives_the_least_squares_map_and_its_covariance(robots):
         np.testing.assert_allclose([*difference[:2], wrap(difference[2])], 0.0, atol=1e-5)
 
 
-def test_the_full_covariance_is_the_joining_of_the_team():
-    made = team(4)
-    fold = EMPTY_FOLD
-    for start in made.starts:
-        fold = joining.add_start(fold, start)
-    for each in made.submaps:
-        fold = joining.fold_submaps(fold, [each], svd_joining.SETTINGS)
-    fold = joining.solve_fold(fold, svd_joining.SETTINGS)
-    state = joined(made, "full")
-    np.testing.assert_allclose(state.fold.main.state, fold.main.state, atol=1e-9)
-    assert svd_joining.variance_factor(state) == 1.0
-
-
 def map_nees(weighting, honest, runs=80):
     """NEES and dof of the map over many teams; spherical submaps are drawn as they are weighted."""
     values = []
@@ -125,12 +110,6 @@ def test_where_errors_are_spherical_the_map_is_consistent_and_where_they_are_not
     assert low < ratio < high
     ratio, (low, high) = map_nees("spherical", honest=False, runs=40)
     assert not low < ratio < high
-
-
-def test_the_identity_learns_its_scale_from_the_residuals():
-    ratio, (low, high) = map_nees("identity", honest=True)
-    # The scale is estimated from some hundred residuals, so NEES/dof is a little above 1.
-    assert low < ratio < 1.1 * high
 
 
 def two_maps(seed, sigma=0.1, common=4):
@@ -231,45 +210,6 @@ def full_maps(seed, common=4, sigma=0.05):
         means = each.means + error.reshape(-1, 2)
         maps.append(LandmarkGaussian(each.ids, means, mixed @ mixed.T))
     return maps, a_from_b, points
-
-
-@quick
-@given(st.integers(0, 10_000))
-def test_the_full_exchange_is_least_squares_in_both_maps_metrics(seed):
-    (a, b), _, _ = full_maps(seed)
-    merged = svd_joining.exchanged_fully(a, b)
-    ids = merged.landmarks.ids
-    of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
-    root_a, root_b = (np.linalg.inv(np.linalg.cholesky(x.covariance)) for x in (a, b))
-
-    def residuals(x):
-        points = x[3:].reshape(-1, 2)
-        c, s = np.cos(x[2]), np.sin(x[2])
-        seen = (points[of_b] - x[:2]) @ np.array([[c, -s], [s, c]])
-        left = (points[of_a] - a.means).ravel(), (seen - b.means).ravel()
-        return np.concatenate((root_a @ left[0], root_b @ left[1]))
-
-    start = np.concatenate((merged.a_from_b.mean, merged.landmarks.means), axis=None)
-    found = least_squares(residuals, start + 0.01, method="lm", xtol=1e-13, ftol=1e-13)
-    np.testing.assert_allclose(found.x, start, atol=1e-5)
-    P = np.linalg.inv(found.jac.T @ found.jac)
-    np.testing.assert_allclose(merged.landmarks.covariance, P[3:, 3:], rtol=1e-2, atol=1e-6)
-    np.testing.assert_allclose(merged.a_from_b.covariance, P[:3, :3], rtol=1e-2, atol=1e-6)
-
-
-def test_a_full_exchange_is_consistent_and_not_if_a_map_is_exchanged_twice():
-    honest, twice, dof = 0.0, 0.0, 0
-    for seed in range(80):
-        (a, b), _, points = full_maps(seed, common=6)
-        once = svd_joining.exchanged_fully(a, b).landmarks
-        again = svd_joining.exchanged_fully(once, b).landmarks
-        error = (once.means - points).ravel()
-        honest += nees(error, once.covariance)
-        twice += nees((again.means - points).ravel(), again.covariance)
-        dof += len(error)
-    low, high = chi2_interval(dof, 0.999, 1)
-    assert low < honest / dof < high
-    assert not low < twice / dof < high
 
 
 @pytest.mark.parametrize("form", ["spherical", "full"])

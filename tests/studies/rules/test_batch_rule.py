@@ -13,12 +13,10 @@ from teamslam.sim.studies.rules.batch_rule import taken_as_white
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, RobotConfig, Sensor
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.digest import configured
 from tests import build
 from tests.sim.reruns import messages, team_samples
-from tests.teams import config, of, published, stream
+from tests.teams import config, published, stream
 
 
 def team_run(world, fusion, estimator, steps):
@@ -72,38 +70,6 @@ def heard(configs, **options):
     return node, out + node.handle(end, 0)
 
 
-def pose_times(out, name):
-    return [o.message.stamp_ns // 10**9 for o in out if o.key == ch.CENTRAL_POSE.key(name)]
-
-
-def test_each_map_comes_with_the_newest_pose_of_every_robot_that_has_moved():
-    _, out = heard(robots())
-    assert {name: pose_times(out, name) for name in MEASUREMENTS} == {"r1": [4, 8, 9], "r2": [4, 7]}
-    _, out = heard(robots(pose_s=5.0))
-    assert pose_times(out, "r1") == [4, 9]
-
-
-def test_the_final_map_comes_with_whole_paths():
-    node, out = heard(robots())
-    paths = {path.robot: path for path in of(out, ch.TRAJECTORY)}
-    for name, measurements in MEASUREMENTS.items():
-        stamps, poses = translate.trajectory_of(paths[name])
-        assert (len(stamps), stamps[-1]) == (9 if name == "r1" else 7, measurements[-1].stamp_ns)
-        assert paths[name].digest == node.final.digest
-    *_, last = (o.message for o in out if o.key == ch.CENTRAL_POSE.key("r1"))
-    _, poses = translate.trajectory_of(paths["r1"])
-    np.testing.assert_array_equal(poses[-1], floats(last.pose, "pose"))
-
-
-def test_the_map_has_the_joint_cost():
-    node, _ = heard(robots())
-    every = [measurement for measurements in MEASUREMENTS.values() for measurement in measurements]
-    read = sum(len(x.ids) // 4 for x in every if isinstance(x, m.Observations))
-    assert node.final.dof == 2 * read - 2 * len(translate.landmarks_of(node.final)[0])
-    assert 0.5 < node.final.chi2 / node.final.dof < 1.5
-    assert node.status().figures["joint_cost_per_dof"] == node.final.chi2 / node.final.dof
-
-
 def test_a_final_map_that_has_not_converged_says_so(monkeypatch):
     node, _ = heard(robots())
     assert node.final.reasons == node.status().warnings == ()
@@ -128,11 +94,3 @@ def test_errors_that_persist_are_taken_as_white_and_that_is_said_once():
         "r3: errors that persist (range_white = 0.5; biases bearing) are taken as white, "
         "so the covariance is too small"
     ]
-
-
-def test_a_robust_scale_is_that_of_the_configuration():
-    plain, robust = (
-        heard(robots(), **options)[0].final for options in ({}, {"batch_robust_c": 1.0})
-    )
-    assert plain.chi2 != robust.chi2
-    assert robust.reasons == ()

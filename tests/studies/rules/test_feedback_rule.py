@@ -90,17 +90,6 @@ def test_the_last_map_of_one_who_ended_is_still_fused():
     assert translate.landmarks_of(fused)[1][0, 0] > 0.0
 
 
-def test_a_map_for_a_round_that_is_over_is_not_taken():
-    found, out = centre(), []
-    for robot in ROBOTS:
-        found.handle(estimate(robot, 1), 0)
-    found.handle(estimate("r1", 1, at=99.0), 0)
-    for robot in ROBOTS:
-        out += found.handle(estimate(robot, 2), 0)
-    (fused,) = of(out, ch.FUSED_MAP)
-    assert fused.exchange == 2
-
-
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_the_final_map_is_the_last_rounds(name):
     found, out = centre(name), []
@@ -122,13 +111,3 @@ def test_without_any_map_the_final_one_is_empty(name):
     (final,) = of(centre(name).publish_final(), ch.FINAL_MAP)
     assert (final.final, final.ids, final.members) == (True, b"", ())
     assert decoded(encoded(final)) == final
-
-
-def test_the_digest_names_the_maps_and_every_round_before():
-    digests = set()
-    for first, second in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-        found, out = centre(robots=["r1"]), []
-        for number, at in ((1, first), (2, second)):
-            out += found.handle(estimate("r1", number, at), 0)
-        digests.add(of(out, ch.FUSED_MAP)[-1].digest)
-    assert len(digests) == 3

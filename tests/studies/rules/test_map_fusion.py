@@ -1,7 +1,6 @@
 """Fusion of whole maps: one-dimensional cases by hand, and the properties of each rule."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,8 +11,6 @@ from teamslam.sim.studies.rules.map_fusion import (
 )
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from tests.estimation.submap_world import correlated
-
-RULES = [kalman, kalman_per_axis, covariance_intersection]
 
 
 def one(x, variance, id_=1):
@@ -81,49 +78,9 @@ def test_the_intersection_holds_for_inputs_that_share_their_error(seed):
     assert np.linalg.eigvalsh(claimed - true)[0] > -1e-8
 
 
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 2**32))
-def test_the_intersection_is_no_better_than_both_inputs_together_allow(seed):
-    a, b = random_map([1, 2], seed), random_map([1, 2], seed + 1)
-    fused = covariance_intersection([a, b])
-    information = np.linalg.inv(fused.covariance)
-    both = np.linalg.inv(a.covariance) + np.linalg.inv(b.covariance)
-    assert np.linalg.eigvalsh(both - information)[0] > -1e-8
-    sizes = [np.linalg.slogdet(each.covariance)[1] for each in (fused, a, b)]
-    assert sizes[0] <= min(sizes[1:]) + 1e-9
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_maps_without_common_landmarks_stand_side_by_side(rule):
-    fused = rule([one(2.0, 4.0, id_=9), one(7.0, 1.0, id_=3)])
-    np.testing.assert_array_equal(fused.ids, [3, 9])
-    np.testing.assert_allclose(fused.means[:, 0], [7.0, 2.0])
-    np.testing.assert_allclose(fused.covariance, np.diag([1.0, 1.0, 4.0, 1.0]))
-
-
-@pytest.mark.parametrize("rule", [kalman, covariance_intersection])
-def test_a_landmark_of_one_map_alone_follows_the_common_ones(rule):
-    spread = np.array([[1.0, 0.8], [0.8, 1.0]])
-    tied = LandmarkGaussian(
-        np.array([1, 2], np.uint32), np.zeros((2, 2)), np.kron(spread, np.eye(2))
-    )
-    sure = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 0.0]]), 1e-6 * np.eye(2))
-    for order in ([tied, sure], [sure, tied]):
-        fused = rule(order)
-        np.testing.assert_allclose(fused.means, [[1.0, 0.0], [0.8, 0.0]], atol=1e-4)
-        assert fused.covariance[2, 2] == pytest.approx(1.0 - 0.64, abs=1e-4)
-
-
 def test_the_per_axis_rule_drops_every_correlation():
     fused = kalman_per_axis([random_map([1, 2], 5), random_map([2, 3], 6)])
     np.testing.assert_array_equal(fused.covariance, np.diag(np.diag(fused.covariance)))
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_one_map_stays_itself_and_none_is_the_empty_map(rule):
-    a = random_map([1, 2], 7)
-    assert rule([a]) is a
-    assert len(rule([]).ids) == 0
 
 
 def test_a_fused_map_absorbed_and_sent_again_is_counted_again_by_kalman_only():

@@ -10,13 +10,11 @@ from teamslam.central.node import make_centre
 from teamslam.sim.studies.rules.map_fusion import kalman
 from teamslam.team import translate
 from teamslam.team.estimation.gaussian import LandmarkGaussian
-from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import packed, spd
-from tests.teams import of
 
 END = build.end(r1=9, r2=9)
 ALIVE = [m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True) for name in ("r1", "r2")]
@@ -86,15 +84,6 @@ def test_the_final_map_is_kalmans_of_the_last_maps_in_whatever_order_they_come(o
 
 
 @pytest.mark.parametrize("rule", ["latest", "alone"])
-def test_the_last_map_that_a_robot_speaks_of_is_waited_for(rule):
-    node, _ = heard(rule, [x for x in TEAM if x not in LAST])
-    assert not node.finished
-    for message in LAST:
-        node.handle(message, 0)
-    assert node.finished
-
-
-@pytest.mark.parametrize("rule", ["latest", "alone"])
 def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     messages = [x for x in TEAM if x != LAST[1] and x != done("r2", 6)]
     node, _ = heard(rule, messages)
@@ -114,32 +103,3 @@ def test_a_map_in_a_frame_of_its_own_is_left_out_and_named():
     assert node.final.members == build.version(r1=4)
     assert node.final.means == LAST[0].means
     assert node.final.reasons == ("r2: its start pose is not known",)
-
-
-def test_a_broadcast_comes_when_it_is_due_and_something_is_new():
-    maps = [estimate("r1", k) for k in range(1, 8)]
-    again = [
-        maps[-1],
-        build.progress(stamp_ns=60 * 10**9, node="robot/r1", measurements=5),
-    ]
-    _, out = heard("latest", [start("r1"), *maps, *again], broadcast_s=3.0)
-    said = [x.stamp_ns // 10**9 for x in of(out, ch.FUSED_MAP)]
-    assert said == [1, 4, 7]
-    assert not any(x.final for x in of(out, ch.FUSED_MAP))
-
-
-@pytest.mark.parametrize("joint", [True, False])
-def test_alone_the_map_of_one_robot_is_the_final_one(joint):
-    last = estimate("r1", 5, at=2.0, joint=joint)
-    messages = [start("r1"), estimate("r1", 4), last, done("r1", 5), build.end(r1=9)]
-    node, _ = heard("alone", messages, robots=["r1"])
-    assert (node.final.means, node.final.covariance) == (last.means, last.covariance)
-    assert (node.final.joint, node.final.reasons) == (joint, ())
-
-
-def test_alone_several_robots_have_no_common_map_and_it_says_so():
-    node, out = heard("alone", TEAM)
-    assert node.final.ids == b""
-    assert node.final.reasons == ("no fusion: each robot has its own map",)
-    assert [x.robot for x in node.final.members] == ["r1", "r2"]
-    assert not of(out, ch.FUSED_MAP)

@@ -23,7 +23,7 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import configured
 from tests import build
-from tests.teams import config, of, published, stream
+from tests.teams import config, published, stream
 
 PARTICLES = 20
 RULES = ["joint-fastslam", "batch"]
@@ -113,27 +113,6 @@ def test_its_map_and_poses_are_those_of_algorithm_1_on_the_teams_keyframes():
     for name in STREAMS:
         mine = [floats(o.message.pose, "pose") for o in out if o.key == ch.CENTRAL_POSE.key(name)]
         np.testing.assert_array_equal(mine, poses[name])
-
-
-@pytest.mark.parametrize("fusion", RULES)
-def test_maps_name_the_last_measurement_of_each_robot_in_them(fusion):
-    node, out = heard(fusion, everything())
-    assert len(of(out, ch.FUSED_MAP)) == 2
-    assert [x.sequence for x in node.final.members] == [len(r) - 1 for r in MEASUREMENTS.values()]
-    digests = {x.digest for x in (*of(out, ch.FUSED_MAP), node.final)}
-    assert len(digests) == 3
-
-
-@pytest.mark.parametrize("fusion", RULES)
-def test_it_waits_for_every_robots_models_start_and_last_measurement(fusion):
-    messages = everything()
-    start, measurement = MEASUREMENTS["r2"][0], MEASUREMENTS["r1"][5]
-    for last in (announced("r2"), start, measurement, LAST_WORDS[0], end()):
-        node, out = heard(fusion, (x for x in messages if x != last))
-        assert not node.finished
-        out += node.handle(last, 0)
-        assert node.finished
-        assert sorted(said(out)) == sorted(expected(fusion))
 
 
 @pytest.mark.parametrize("fusion", RULES)
