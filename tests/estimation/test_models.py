@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team import core
-from teamslam.team.config import Lens, MotionModel, MotionNoise, Sensor
+from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation import models
 from teamslam.team.estimation.models import Increment, increment_of
 from teamslam.team.estimation.randomness import generator
@@ -109,35 +109,6 @@ def test_two_wheels_make_one_error_of_way_and_turn_that_is_correlated_where_they
     )
 
 
-def test_equal_wheels_straight_on_err_in_way_and_turn_without_a_correlation():
-    equal = MotionModel(
-        kind="differential-drive", wheel_base=0.4, left_wheel=0.03, right_wheel=0.03
-    )
-    worn = msgspec.structs.replace(equal, right_wheel=0.06)
-    straight, pulled = (increment_of(each, 1.0, 2.0, 0.0).covariance for each in (equal, worn))
-    assert straight[0, 2] == 0.0
-    assert pulled[0, 2] == pytest.approx(0.5 * (0.06**2 - 0.03**2) * 2.0 / 0.4)
-    assert straight[2, 2] == pytest.approx(2 * 0.03**2 * 2.0 / 0.4**2)
-
-
-def test_standing_still_has_no_noise_of_ways_or_speeds():
-    model = MotionModel(
-        kind="differential-drive",
-        wheel_base=0.4,
-        left_wheel=0.1,
-        right_wheel=0.1,
-        alphas=(1.0,) * 6,
-    )
-    np.testing.assert_array_equal(increment_of(model, 1.0, 0.0, 0.0).covariance, np.zeros((3, 3)))
-
-
-def test_noise_of_wheels_without_wheels_is_refused():
-    with pytest.raises(ValueError, match="differential-drive needs wheel_base"):
-        MotionModel(kind="differential-drive")
-    with pytest.raises(ValueError, match="noises of differential-drive, not of velocity"):
-        MotionModel(left_wheel=0.1)
-
-
 @quick
 @given(distance=distances, turn=st.floats(-2e-3, 2e-3))
 def test_the_arc_goes_over_into_the_straight_line(distance, turn):
@@ -198,13 +169,6 @@ def test_composition_of_increments_is_associative_with_a_neutral_element(motions
     for same in (a.then(Increment.identity()), Increment.identity().then(a)):
         np.testing.assert_allclose(same.mean, a.mean, atol=1e-15)
         np.testing.assert_allclose(same.covariance, a.covariance, atol=1e-15)
-
-
-def test_scales_come_before_the_limit_of_the_yaw_rate():
-    model = MotionModel(forward_scale=1.1, yaw_scale=0.5, yaw_rate_limit=0.4)
-    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, 0.6).mean[2], 0.6)
-    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, -3.0).mean[2], -0.8)
-    np.testing.assert_allclose(increment_of(model, 2.0, 1.0, 0.0).mean, [2.2, 0.0, 0.0])
 
 
 def test_a_turn_drags_at_the_speed_and_never_turns_it_round():
@@ -279,31 +243,6 @@ def test_a_depth_along_the_optical_axis_becomes_the_distance():
     beside = 0.1 + np.radians([79.0, 81.0, -81.0, 100.0, 180.0])
     seen = models.scanned(sensor, np.ones(5), beside)[0]
     np.testing.assert_array_equal(seen, [True, False, False, False, False])
-
-
-def test_what_a_lens_bends_is_taken_back():
-    sensor = Sensor(bearing_offset=0.02, bearing_lens=Lens(linear=0.03, square=-0.05, cubic=-0.1))
-    raw = np.linspace(-0.6, 0.6, 7)
-    _, bearings = models.corrected(sensor, np.ones(7), raw)
-    np.testing.assert_allclose(bearings, raw - 0.02 - 0.03 * raw + 0.05 * raw**2 + 0.1 * raw**3)
-
-
-def test_readings_outside_the_sensors_reach_and_broken_ones_are_not_acceptable():
-    sensor = Sensor(min_range=0.5, max_range=10.0, field_of_view=np.pi, range_offset=0.6)
-    ranges = np.array([1.0, 0.55, 0.2, 11.0, 1.0, 1.0, np.nan, 1.0])
-    bearings = np.array([1.5, 0.0, 0.0, 0.0, 1.7, -2.0, 0.0, np.nan])
-    np.testing.assert_array_equal(models.scanned(sensor, ranges, bearings)[0], [True] + [False] * 7)
-
-
-def test_an_axis_measurement_of_a_whole_turn_is_in_the_narrowest_view():
-    sensor = Sensor(field_of_view=0.1)
-    seen = models.scanned(sensor, np.ones(3), np.array([2.0 * np.pi, -2.0 * np.pi, np.pi]))[0]
-    np.testing.assert_array_equal(seen, [True, True, False])
-
-
-def test_the_ranges_noise_grows_with_the_predicted_range():
-    sensor = Sensor(range_sigma=0.3, range_sigma_per_m=0.04, bearing_sigma=0.02)
-    np.testing.assert_allclose(models.noise(sensor, 10.0), (0.25, 0.0004))
 
 
 def test_each_window_has_random_numbers_of_its_own_that_come_again():

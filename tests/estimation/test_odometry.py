@@ -8,7 +8,7 @@ import pytest
 from teamslam.team.config import MotionModel, MotionNoise
 from teamslam.team.estimation.models import Increment, increment_of
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
-from teamslam.team.estimation.se2 import between, compose, exponential, logarithm
+from teamslam.team.estimation.se2 import between, exponential, logarithm
 
 SECOND = 1_000_000_000
 NOISY = MotionModel(
@@ -91,16 +91,3 @@ def test_shares_of_the_way_are_held_for_their_time_and_then_grow_as_it_does():
     np.testing.assert_allclose(np.sqrt(np.diag(held)), [0.14, 0.15, 0.0], atol=1e-12)
     twice = increment_of(car, 0.4, 5.0, 0.0).covariance
     np.testing.assert_allclose(twice, 2.0 * held, atol=1e-12)
-
-
-def test_what_can_not_be_configured_is_said():
-    with pytest.raises(ValueError, match="ackermann needs wheel_base"):
-        MotionModel("ackermann")
-    with pytest.raises(ValueError, match="are a car's, not of velocity"):
-        MotionModel(wheel_offset=0.5)
-
-
-def test_a_step_by_parts_ends_where_the_whole_does():
-    whole = interval([2.0, 0.5, 3.0])
-    half = whole.part(MotionModel(), SECOND // 2, SECOND // 2).mean
-    np.testing.assert_allclose(compose(half, half), [2.0, 0.5, 3.0], atol=1e-12)

@@ -13,7 +13,6 @@ from teamslam.team.estimation.scans import (
     point_scan,
     polar_scan,
     sensible,
-    together,
     unclaimed,
 )
 from tests.estimation.hybrid_slam import one_landmark
@@ -62,26 +61,6 @@ def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does
     K = SPREAD @ H.T @ np.linalg.inv(H @ SPREAD @ H.T + R)
     np.testing.assert_allclose(mean, MEAN + K @ (seen - [r, b]), atol=1e-12)
     np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
-
-
-def test_a_landmark_is_placed_with_the_covariance_of_its_point():
-    scan = point_scan(IDS, np.array([[2.5, 1.5]]), CLAIM[None])
-    seen = np.column_stack((scan.ranges, scan.bearings))
-    (mean,), (P,) = core.place(POSE, seen, (*SENSOR[:2], 1.0, SENSOR[2], 1.0), scan.own)
-    R = turn(POSE[2])
-    np.testing.assert_allclose(mean, POSE[:2] + R @ [2.5, 1.5], atol=1e-12)
-    np.testing.assert_allclose(full(P), R @ full(CLAIM) @ R.T, atol=1e-12)
-    placed = one_landmark.placed(POSE, (scan.ranges, scan.bearings), SENSOR, scan.own)
-    for one, other in zip(placed, (mean, P), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-14)
-
-
-def test_the_sensors_own_covariance_claimed_changes_nothing():
-    seen = np.array([4.0]), np.array([0.3])
-    claimed = polar_scan(IDS, *seen, np.array([[SENSOR[0], 0.0, SENSOR[2]]]))
-    bare = polar_scan(IDS, *seen)
-    for a, b in zip(updated(claimed), updated(bare), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_points_near_with_much_noise_place_a_landmark_without_a_bias():
@@ -153,12 +132,6 @@ def test_a_claim_is_carried_to_another_pose_as_the_plane_turns():
     bare = scan._replace(own=unclaimed(1))
     mixed = core.reduce_scans([bare, scan], np.array([back, back]))[3]
     np.testing.assert_array_equal(mixed, own, "a scan without covariances says nothing of them")
-
-
-def test_scans_of_which_only_some_claim_say_so_row_by_row():
-    own = together([(2, unclaimed(2)), (1, np.array([[0.1, 0.0, 0.2, POLAR]]))])
-    assert own[:, 3].tolist() == [-1.0, -1.0, POLAR]
-    assert together([(2, unclaimed(2)), (1, unclaimed(1))]).shape == (3, 0)
 
 
 def test_claims_beyond_the_bounds_are_named():

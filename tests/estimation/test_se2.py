@@ -1,7 +1,6 @@
 """SE(2) against its own laws and against 3 × 3 matrices."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -78,16 +77,3 @@ def test_a_wrapped_angle_is_the_same_direction_in_the_half_open_turn(angle):
     wrapped = se2.wrapped(angle)
     assert -np.pi < wrapped <= np.pi
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-12)
-
-
-def test_half_a_turn_is_plus_pi():
-    assert se2.wrapped(-np.pi) == np.pi
-    assert se2.wrapped(np.pi) == np.pi
-
-
-def test_poses_are_composed_row_by_row():
-    rows = np.random.default_rng(0).normal(size=(5, 3))
-    pose = np.array([1.0, -2.0, 3.0])
-    assert (se2.compose(pose, rows) == [se2.compose(pose, row) for row in rows]).all()
-    with pytest.raises(ValueError, match="three"):
-        se2.compose(pose, np.zeros((3, 2)))

@@ -22,14 +22,11 @@ from teamslam.team.estimation.association.landmark_sets import (
     NO_LANDMARKS,
     add_landmarks,
     merge_sets,
-    number_of,
 )
-from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
+from teamslam.team.estimation.association.member_log import MergeRecord
 from teamslam.team.estimation.association.visibility import (
-    mark_missed,
     mark_visible,
     pad_views,
-    renumber_views,
 )
 from teamslam.team.estimation.association.voting import PointSet, apply_motion, propose_alignments
 from teamslam.team.estimation.map_joining.auditing import fold_tick
@@ -172,28 +169,6 @@ def _left(one: np.ndarray, two: np.ndarray, points: np.ndarray) -> np.ndarray:
     return along[0] * to[:, 1] - along[1] * to[:, 0] > 0.0
 
 
-def test_the_views_of_a_window_are_the_largest_sets_of_three_or_more():
-    seen = np.array([[1, 1, 0, 1], [1, 1, 0, 1], [1, 0, 1, 1], [1, 0, 1, 0]], np.bool_)
-    found = Unnamed(np.full(4, 3, np.uint32), seen).views
-    assert [each.tolist() for each in found] == [[0, 1, 2, 3]]
-
-
-def test_views_lose_landmarks_that_are_left_out_and_views_of_fewer_than_three_go():
-    views = pad_views([np.array([0, 1, 2, 3]), np.array([1, 2, 4])])
-    to = np.array([10, 11, 12, -1, -1])
-    assert renumber_views(views, to).tolist() == [[10, 11, 12, -1]]
-
-
-def test_a_landmark_that_later_submaps_miss_is_missed_and_a_new_one_is_not():
-    """All but the last submap look at landmarks 0 and 1; 2 is false, 3 elsewhere, 4 new."""
-    sees = np.zeros((7, 5), np.bool_)
-    sees[:6, :2] = True
-    sees[1, 2] = sees[6, 3] = sees[5, 4] = True
-    assert mark_missed(sees).tolist() == [False, False, True, False, False]
-    assert not mark_missed(sees[:3]).any(), "three submaps are no evidence"
-    assert mark_missed(np.zeros((0, 3), np.bool_)).tolist() == [False] * 3
-
-
 def _points(mean: np.ndarray) -> PointSet:
     return PointSet(mean, np.full(len(mean), 0.1))
 
@@ -218,21 +193,6 @@ def test_a_pattern_that_stands_twice_gives_two_alignments_of_equal_size():
     first, second = propose_alignments(_points(room), _points(twice), 0.3, 15.0)[:2]
     assert len(first.first) == len(second.first) == 10
     assert abs(first.motion[0] - second.motion[0]) > 29.0
-
-
-def test_two_maps_of_one_point_have_no_alignment():
-    assert propose_alignments(_points(np.zeros((1, 2))), _points(np.zeros((5, 2))), 0.3, 15.0) == []
-
-
-def test_votes_that_are_counted_cell_by_cell_and_sorted_votes_give_the_same_alignments(monkeypatch):
-    points = np.random.default_rng(4).uniform(0.0, 9.0, (30, 2))
-    counted = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
-    monkeypatch.setattr(voting, "MOST_COUNTED", 0)
-    ordered = propose_alignments(_points(points[:20]), _points(points), 0.3, 15.0)
-    assert len(counted) == len(ordered) > 0
-    for one, two in zip(counted, ordered, strict=True):
-        np.testing.assert_array_equal(one.motion, two.motion)
-        np.testing.assert_array_equal(one.second, two.second)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -260,16 +220,6 @@ def _tie(into: int) -> MergeRecord:
     return MergeRecord("track", into, 5.0, 0.0, 0.1, 0)
 
 
-def test_each_unnamed_landmark_is_a_set_of_its_own_with_a_number_derived_from_its_name():
-    (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
-    landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
-    assert numbers[submap.key] == [number_of(LocalLandmark("r1", 1, 0, k)) for k in range(3)]
-    assert all(number >= UNNAMED for number in numbers[submap.key])
-    assert [landmarks.sets[number] for number in numbers[submap.key]] == [
-        (LocalLandmark("r1", 1, 0, k),) for k in range(3)
-    ]
-
-
 def test_a_set_has_the_number_of_its_smallest_member_in_any_order_of_merges():
     path = circle((0.0, 0.0), 5.0, 1, 0.05)
     submaps = [drive(robot, path, WORLD, np.random.default_rng(1))[0][0] for robot in ("r1", "r2")]
@@ -279,13 +229,3 @@ def test_a_set_has_the_number_of_its_smallest_member_in_any_order_of_merges():
         found, becomes = merge_sets(landmarks, [(a, _tie(b)), (b, _tie(c))])
         assert {found.identity(member) for member in found.sets[one]} == {one}
         assert becomes == {two: one, three: one}
-
-
-def test_a_set_with_a_name_keeps_the_name():
-    (submap,), _ = drive("r1", circle((0.0, 0.0), 5.0, 1, 0.05), WORLD, np.random.default_rng(1))
-    landmarks, numbers = add_landmarks(NO_LANDMARKS, [submap])
-    number = numbers[submap.key][0]
-    for ties in ([(7, _tie(number))], [(number, _tie(7))]):
-        found, becomes = merge_sets(landmarks, ties)
-        assert becomes == {number: 7}
-        assert found.sets[7] == (LocalLandmark("r1", 1, 0, 0),)

@@ -9,7 +9,7 @@ import pytest
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import UNNAMED, AssociationSettings
 from teamslam.team.estimation.association.certainty import marginals
-from teamslam.team.estimation.association.classes import compare_classes, stack_classes
+from teamslam.team.estimation.association.classes import compare_classes
 from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.gating import (
@@ -17,7 +17,6 @@ from teamslam.team.estimation.association.gating import (
     Joint,
     evaluate_pairs,
     gate_pairs,
-    match_best_first,
     match_scan,
 )
 from teamslam.team.estimation.association.joint_compatibility import (
@@ -30,11 +29,6 @@ from teamslam.team.estimation.association.scans import UNASSIGNED
 from teamslam.team.estimation.association.voting import PointSet, propose_alignments
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.association.test_clustering import pairs, window
-
-
-def test_the_best_pair_comes_first_and_each_is_matched_once():
-    squared = np.array([[1.0, 0.5], [2.0, 0.1], [30.0, 40.0]])
-    assert match_best_first(squared < 13.8, squared).tolist() == [0, 1, UNASSIGNED]
 
 
 def test_a_name_matches_at_any_distance_and_only_its_own_landmark():
@@ -127,13 +121,6 @@ def test_the_evidence_is_that_of_the_posterior_over_equally_frequent_classes():
     assert np.allclose(compare_classes(one, two), compare_classes(one + 7.0, two - 90.0))
 
 
-def test_rows_without_classes_and_with_fewer_are_stacked():
-    assert stack_classes([(2, None), (3, np.empty((3, 0)))]) is None
-    found = stack_classes([(1, None), (1, reported([1], 2)), (1, reported([2]))])
-    assert found[0].tolist() == [0.0, 0.0, 0.0]
-    assert np.allclose(found[1], np.log([1.0 - P, P, 1.0 - P]))
-
-
 def joint(classes: np.ndarray | None) -> Joint:
     mean = np.array([[0.0, 0.0], [0.02, 0.0], [5.0, 0.0]])
     return Joint(mean, 1e-4 * np.eye(6), np.zeros((3, 3), np.bool_), classes=classes)
@@ -149,13 +136,6 @@ def test_landmarks_of_contradicting_classes_are_not_in_the_gate():
     assert len(gate_pairs(joint(reported([1, 1, 0])), *pair, profile)[0]) == 1
     assert len(gate_pairs(joint(reported([1, 2, 0])), *pair, profile)[0]) == 0
     assert len(gate_pairs(joint(None), *pair, profile)[0]) == 1
-
-
-def test_a_merged_landmark_has_the_evidence_of_both():
-    before = joint(reported([1, 1, 0]))
-    after = condition_on_pair(before, 0, 1, AssociationProfile())
-    assert np.array_equal(after.classes[1], before.classes[0] + before.classes[1])
-    assert np.array_equal(before.classes[1], reported([1])[0])
 
 
 def test_of_two_places_of_equal_shape_the_one_of_equal_classes_gets_the_votes():
@@ -190,12 +170,6 @@ def exact(weights: np.ndarray) -> np.ndarray:
 def test_marginals_are_those_of_all_joint_associations(seed):
     weights = np.exp(np.random.default_rng(seed).normal(1.0, 2.0, (3, 3)))
     assert np.allclose(marginals(weights), exact(weights), atol=0.1)
-
-
-def test_the_marginals_of_one_detection_or_one_landmark_are_exact():
-    for shape in ((1, 4), (4, 1)):
-        weights = np.exp(np.random.default_rng(5).normal(0.0, 2.0, shape))
-        assert np.allclose(marginals(weights), exact(weights))
 
 
 def test_a_poor_sensor_gives_fewer_landmarks_and_not_wrong_ones():
@@ -323,11 +297,6 @@ def test_neighbours_are_distinguished_jointly_where_each_by_itself_is_not():
     assert not alone.pairs
     found = assign_jointly(joint, one, two, DENSE, 0.5)
     assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
-
-
-def test_one_of_two_neighbours_alone_is_not_merged():
-    joint, one, two = _twins([0], common=0.15)
-    assert not assign_jointly(joint, one, two, DENSE, 0.5).pairs
 
 
 def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():

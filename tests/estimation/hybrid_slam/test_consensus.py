@@ -126,11 +126,6 @@ def test_a_landmark_under_another_ones_name_is_not_taken():
     assert np.delete(taken, [4, 12]).all()
 
 
-def test_a_landmark_beside_another_one_is_taken():
-    window = drive(2, np.vstack([PLACES, PLACES[0] + [0.4, -0.3]]))
-    assert window.judged().all()
-
-
 def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
     window = drive(4)
     window.measurements[[5, 17, 30]] += [1.5, 0.4]
@@ -144,28 +139,6 @@ def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
         window.measurements[order],
     )
     np.testing.assert_array_equal(other.judged(), taken[order])
-
-
-def test_the_only_measurement_of_a_window_is_taken():
-    window = drive(5)
-    for count in (0, 1):
-        few = Drive(
-            window.motions,
-            window.keyframes[:count],
-            window.ids[:count],
-            window.measurements[:count],
-        )
-        for by in ("agreeing", "confirmed"):
-            assert few.judged(by).tolist() == count * [True]
-
-
-def test_keyframes_without_measurements_change_nothing():
-    window = drive(6)
-    window.measurements[[5, 17]] += [1.5, 0.4]
-    still = Increment.identity()
-    motions = [each for motion in window.motions for each in (motion, still)]
-    sparse = Drive(motions, 2 * window.keyframes, window.ids, window.measurements)
-    np.testing.assert_array_equal(sparse.judged(), window.judged())
 
 
 def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
@@ -267,35 +240,3 @@ def test_good_measurements_far_from_the_odometry_of_a_long_window_are_kept() -> 
     sensor = Sensor(range_sigma=0.2, bearing_sigma=0.035)
     taken = [long_drive(seed).judged(outlier_share=0.01, sensor=sensor) for seed in range(120)]
     assert np.concatenate(taken).mean() > 0.999
-
-
-WRONG = {
-    "a share of none": lambda noise: core.Consensus(noise, 10.0, 6.0, 0.0),
-    "a share of all": lambda noise: core.Consensus(noise, 10.0, 6.0, 1.0),
-    "a sensor without reach": lambda noise: core.Consensus(noise, 0.0, 6.0, 0.3),
-    "a sensor without noise": lambda noise: core.Consensus((0.0, *noise[1:]), 10.0, 6.0, 0.3),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_sensor_or_a_share_out_of_its_range_is_refused(name):
-    with pytest.raises(ValueError, match="must be"):
-        WRONG[name](noise_of(SENSOR))
-
-
-def test_measurements_that_do_not_fit_or_are_not_finite_are_refused_and_change_nothing():
-    consensus = core.Consensus(noise_of(SENSOR), 10.0, 6.0, 0.3)
-    motion = np.zeros(3), np.zeros((3, 3))
-    ids, one, none = np.array([3], np.uint32), np.array([2.0]), unclaimed(1)
-    for wrong in (
-        (ids, one, np.empty(0), none),
-        (ids, one, one, unclaimed(2)),
-        (ids, one * np.nan, one, none),
-        (ids, one, one * np.inf, none),
-        (ids, one, one, np.full((1, 4), np.nan)),
-    ):
-        with pytest.raises(ValueError, match="must"):
-            consensus.add(*motion, *wrong)
-    assert not len(consensus.agreeing())
-    with pytest.raises(TypeError):
-        consensus.add(*motion, ids.astype(np.int64), one, one, none)

@@ -6,11 +6,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from teamslam.team import core
-from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.config import Sensor
 from teamslam.team.core import moments, semidefinite_factor
-from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.models import Increment, Noise, increment_of
+from teamslam.team.estimation.models import Increment, Noise
 from teamslam.team.estimation.scans import unclaimed
 
 quick = settings(deadline=None, max_examples=60)
@@ -175,14 +174,6 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
     assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])
 
 
-def test_without_noise_of_motion_both_proposals_are_the_same():
-    motions, keyframes = simulated(3, covariance=np.zeros((3, 3)))
-    one, two = (filtered(motions, keyframes, 8, p)[0] for p in ("fastslam1", "fastslam2"))
-    for field in ("poses", "log_weights", "means", "covariances"):
-        np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
-    np.testing.assert_allclose(one.log_weights, -np.log(8.0), atol=1e-12)
-
-
 def test_a_keyframe_of_first_sights_and_one_without_measurements_leave_the_weights():
     _, keyframes = simulated(4)
     particles, _, _ = filtered([MOTION], keyframes[1:2], 50, "fastslam2")
@@ -246,26 +237,6 @@ def test_a_covariance_of_any_rank_is_the_product_of_its_factor(entries, rank, sc
     assert (np.triu(L, 1) == 0.0).all()
     deviation = np.sqrt(np.diag(covariance))
     assert (np.abs(L @ L.T - covariance) <= 5e-5 * np.outer(deviation, deviation) + 1e-12).all()
-
-
-def test_the_motion_of_a_robot_that_turns_almost_on_the_spot_has_a_factor():
-    motion = MotionModel(
-        forward=MotionNoise(per_s=0.03, per_m=0.04), turn=MotionNoise(per_s=0.02, per_rad=0.05)
-    )
-    for speed, rate in ((4.678630965422314e-05, 0.17615888152099612), (1e-5, 0.5127916521356728)):
-        covariance = increment_of(motion, 1.0, speed, rate).covariance
-        L = semidefinite_factor(covariance)
-        np.testing.assert_allclose(np.diag(L @ L.T), np.diag(covariance), rtol=1e-6)
-
-
-@pytest.mark.parametrize("covariance", [np.diag([1.0, -1.0, 1.0]), np.full((3, 3), np.nan)])
-def test_motion_without_a_covariance_is_refused_by_name(covariance):
-    with pytest.raises(NotACovarianceError, match="the motion"):
-        fastslam.propagated(
-            fastslam.at_poses(np.zeros((4, 3))),
-            Increment(np.zeros(3), covariance),
-            np.random.default_rng(0),
-        )
 
 
 def test_a_particle_s_step_depends_neither_on_its_place_nor_on_the_others():

@@ -34,24 +34,6 @@ def total(keyframes, rest):
     return motion.then(rest)
 
 
-def small_steps(forward, yaw_rate, pieces=20_000):
-    """The mean and covariance of the noisy arc by brute force: many small steps in the plane."""
-    dt = 1.0 / pieces
-    a = 0.05**2 * dt + 0.1**2 * abs(forward) * dt
-    b = (0.03**2 + 0.02**2 * abs(forward) + 0.1**2 * abs(yaw_rate)) * dt
-    heading = yaw_rate * (np.arange(pieces) + 0.5) * dt
-    path = np.cumsum(np.exp(1j * heading)) * forward * dt
-    to_end = path[-1] - path  # a turn at k swings what is left of the way
-    end = np.exp(-1j * yaw_rate)
-    along = np.exp(1j * heading) * end
-    swing = 1j * to_end * end
-    columns = np.zeros((3, 2 * pieces))
-    columns[:2, :pieces] = np.sqrt(a) * np.array([along.real, along.imag])
-    columns[:2, pieces:] = np.sqrt(b) * np.array([swing.real, swing.imag])
-    columns[2, pieces:] = np.sqrt(b)
-    return np.array([path[-1].real, path[-1].imag, yaw_rate]), columns @ columns.T
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(st.integers(0, SECOND), max_size=6),
@@ -86,27 +68,6 @@ def test_splitting_a_straight_interval_keeps_the_covariance_of_white_noise_forwa
         density = motion.forward if row == 0 else motion.final_turn
         expected = density.per_s**2 + density.per_m**2 * abs(forward)
         assert found[row, row] == pytest.approx(expected, abs=1e-9)
-
-
-@pytest.mark.parametrize(("forward", "yaw_rate"), [(1.5, 0.0), (1.5, 0.8), (-1.0, -1.2)])
-def test_the_finer_the_split_the_nearer_to_noise_that_is_white_within_the_interval(
-    forward, yaw_rate
-):
-    """One interval takes its turn noise as one constant; split, it tends to the white limit."""
-    motion = MotionModel(forward=WHITE.forward, turn=WHITE.turn)
-    mean, covariance = small_steps(forward, yaw_rate)
-    errors = []
-    for pieces in (1, 4, 16):
-        segmenter = Segmenter(motion, Sensor(), 0.0)
-        segmenter.begin(0)
-        for k in range(1, pieces):
-            segmenter.observe(k * SECOND // pieces, *NOTHING)
-        keyframes = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
-        found = total(keyframes, segmenter.cut(SECOND)[1])
-        np.testing.assert_allclose(found.mean, mean, atol=1e-8)
-        errors.append(np.abs(found.covariance - covariance).max())
-    assert errors[0] < 0.2 * np.abs(covariance).max()
-    assert errors[2] < 0.05 * errors[0] + 1e-7
 
 
 def test_an_observation_waits_for_the_odometry_that_covers_it():
@@ -160,19 +121,6 @@ def keyframe(scans, forward=0.0, yaw_rate=0.0):
         segmenter.observe(stamp_ns, *rows)
     (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
     return keyframe
-
-
-def test_a_keyframe_holds_the_median_of_each_landmark():
-    stamps = [SECOND // 5 * k for k in (1, 2, 3)]
-    ranges, bearings = [4.0, 9.0, 4.2], [0.3, 0.1, -2.0]
-    scans = [
-        (stamp, scan((7, r, b), (3, 2.0, 1.0)))
-        for stamp, r, b in zip(stamps, ranges, bearings, strict=True)
-    ]
-    found = keyframe(scans)
-    assert found.ids.tolist() == [3, 7]
-    np.testing.assert_allclose(found.ranges, [2.0, 4.2])
-    np.testing.assert_allclose(found.bearings, [1.0, 0.1], atol=1e-12)
 
 
 @settings(deadline=None, max_examples=40)

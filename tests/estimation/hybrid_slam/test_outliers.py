@@ -75,26 +75,6 @@ def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(mo
     assert sum(s.gated for s in submaps(config(), published(stream("r1", 20)))) == 0
 
 
-def test_a_robot_that_was_started_again_gates_the_same_measurements():
-    measurements = published(spoilt(stream("r1", 20)))
-    of = robot()
-    whole = submaps(of, measurements)
-    node = RobotNode(of)
-    node.resume(measurements[0], whole[:2])
-    sent = driven(node, measurements[whole[1].last_measurement + 1 :])
-    again = [each.message for each in sent if isinstance(each.message, m.Submap)]
-    assert again == whole[2:]
-
-
-def test_the_status_tells_how_many_measurements_were_gated():
-    node = RobotNode(robot())
-    driven(node, published(spoilt(stream("r1", 20))))
-    assert node.status().figures["gated"] >= 5.0
-    plain = RobotNode(robot())
-    driven(plain, published(stream("r1", 20)))
-    assert "gated" not in plain.status().figures
-
-
 def world_with(kind: str, steps: int = 200) -> Scenario:
     """The thesis' world B in longer steps, three in ten measurements outliers."""
     scenario = load("thesis-b")

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.team import core, translate
+from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted
-from teamslam.team.estimation.mount import of_base, of_sensor
+from teamslam.team.estimation.models import increment_of, predicted
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import polar_scan
 from teamslam.team.estimation.se2 import compose
@@ -105,31 +104,6 @@ def test_a_window_does_not_depend_on_what_was_read_before_it():
     assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
 
 
-@pytest.mark.parametrize("other", [(config(seed=2), 1), (config("r2"), 1), (config(), 2)])
-def test_a_window_depends_on_its_seed_its_robot_and_its_incarnation(other):
-    assert not same(fed(HybridSlam(*other), MEASUREMENTS)[0], fed(fresh(), MEASUREMENTS)[0])
-
-
-def test_what_no_odometry_covers_is_counted_at_the_end():
-    measurements = published(stream("r1", 4, beyond=3))
-    slam = fresh()
-    closed = fed(slam, measurements)
-    ended, uncovered = slam.finish()
-    assert uncovered == 3
-    assert ended.last_measurement == measurements[-1].number
-    assert ended.first_measurement == closed[-1].last_measurement + 1
-    assert ended.end_ns == 4_000_000_000
-
-
-def test_a_stream_without_odometry_has_no_window_and_covers_nothing():
-    measurements = published(stream("r1", 4, drives=False))
-    slam = fresh()
-    assert fed(slam, measurements) == []
-    ended, uncovered = slam.finish()
-    assert ended is None
-    assert uncovered == sum(isinstance(r, m.Observations) for r in measurements)
-
-
 def standing(window_m):
     """A robot that stands for 45 s, then drives for 15 s, in odometry intervals of a second."""
     front_end = FrontEnd(particles=8, window_s=10.0, window_m=window_m, standing_s=30.0, node_s=5.0)
@@ -195,27 +169,6 @@ def test_the_submap_of_a_mounted_sensor_is_the_bases():
     assert sigmas.max() < 0.1
     wrong, _ = closed(sensor_mount=(0.0, 0.0, 0.0))
     assert not len(wrong.ids), "without the mount the window rejects them: they contradict its path"
-
-
-def test_the_sensors_motion_is_the_bases_seen_from_the_sensor_and_back():
-    step = increment_of(STEADY, 1.0, 1.0, 0.2)
-    mount = np.array(MOUNT)
-    back = of_base(of_sensor(step, mount), mount)
-    np.testing.assert_allclose(back.mean, step.mean, atol=1e-12)
-    np.testing.assert_allclose(back.covariance, step.covariance, atol=1e-12)
-
-
-def test_a_window_of_the_base_has_the_bases_poses_and_landmarks():
-    still, unclaimed = np.zeros((3, 3)), np.empty((1, 0))
-    step, mount = increment_of(STEADY, 1.0, 1.0, 0.2).mean, np.array(MOUNT)
-    moved = of_sensor(Increment(step, still), mount).mean
-    r, b = predicted(compose(mount, moved), PLACES[0])
-    window = core.Window(1, noise_of(Sensor()), True, MOUNT)
-    seen = np.array([3], np.uint32), np.array([r]), np.array([b]), unclaimed
-    window.advance(moved, still, *seen, None, np.zeros((1, 3)))
-    poses, _, _, means, _ = window.of_base().particles()
-    np.testing.assert_allclose(poses[0], step, atol=1e-12)
-    np.testing.assert_allclose(means[0, 0], PLACES[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("mount", [MOUNT, (0.0, 0.0, 0.0)])

@@ -16,7 +16,6 @@ from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.rejection import Rejection
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 
@@ -49,13 +48,6 @@ def arc(seconds, forward=0.6, yaw_rate=0.25):
     angle = yaw_rate * seconds
     middle = forward / yaw_rate * (np.exp(1j * angle) - 1.0) / 1j
     return np.array([middle.real, middle.imag, angle])
-
-
-@pytest.mark.parametrize("step_ns", [SECOND, 300_000_000, 7 * SECOND])
-def test_each_grid_time_within_the_window_is_a_keyframe_of_its_own(step_ns):
-    _, segmenter = initial_state(at_ns=500_000_000)
-    nodes = [each.stamp_ns for each in drive(segmenter, 20.0, step_ns) if each.is_node]
-    assert nodes == [2 * SECOND, 4 * SECOND, 6 * SECOND]
 
 
 @settings(deadline=None, max_examples=40)
@@ -122,15 +114,6 @@ def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
     assert second.measurement[0] == pytest.approx(3.15)
 
 
-@pytest.mark.parametrize(
-    ("stamp_s", "near_s"),
-    [(0.9, 1.0), (2.9, 0.5), (7.6, 1.0)],
-)
-def test_a_sighting_without_a_node_near_it_in_the_window_is_rejected(stamp_s, near_s):
-    grid, _ = initial_state(msgspec.structs.replace(FRONT, sighting_s=near_s))
-    assert grid.observe(round(stamp_s * SECOND), 1, look()) == "no pose node near it"
-
-
 def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
     sensor = Sensor(range_offset=0.1, range_scale=2.0, marker_range_offset=0.5, max_range=9.0)
     grid, segmenter = initial_state(sensor=sensor)
@@ -140,17 +123,6 @@ def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
     (found,) = grid.sightings()
     assert (found.teammate, found.measurement[0]) == ("r2", pytest.approx(1.5))
     assert grid.observe(4 * SECOND, 2, look("r3", 9.5)) == "outside the sensor's limits"
-
-
-def test_a_window_begins_without_the_sightings_of_the_one_before():
-    grid, segmenter = initial_state()
-    grid.observe(1_500_000_000, 1, look())
-    drive(segmenter, 4.0)
-    grid.observe(5_900_000_000, 2, look())
-    segmenter.begin(4 * SECOND)
-    assert grid.sightings() == ()
-    drive(segmenter, 8.0)
-    assert grid.sightings() == ()
 
 
 def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
@@ -174,17 +146,6 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
     ]
 
 
-def test_a_slam_rejects_what_odometry_has_passed():
-    slam = HybridSlam(config(front_end=msgspec.structs.replace(config().front_end, node_s=1.5)), 1)
-    position = CarriedPoint(np.zeros(2), np.eye(2))
-    assert slam.fix(SECOND, 1, position) == slam.sight(SECOND, 1, look()) == Rejection.OLDER
-    for k in (1, 2):
-        slam.drive(OdometryInterval(k * SECOND, SECOND, 0.5, 0.1))
-    late_ns = 1_600_000_000
-    assert slam.fix(late_ns, 2, position) == slam.sight(late_ns, 2, look()) == Rejection.OLDER
-    assert slam.fix(2 * SECOND, 3, position) is None
-
-
 def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
     """Two sensors with different latencies, before odometry has covered either time."""
     found = []
@@ -197,11 +158,6 @@ def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
     (one,), (other,) = found
     assert one.measurements == other.measurements == (18, 25)
     assert one.measurement == pytest.approx(other.measurement, abs=1e-12)
-
-
-def test_a_slam_without_nodes_does_not_use_sightings():
-    slam = HybridSlam(config(), 1)
-    assert slam.sight(SECOND, 1, look()) == Rejection.NO_NODES
 
 
 STEP = Increment(np.array([0.5, 0.0, 0.2]), np.diag([0.03, 0.01, 0.02]) ** 2)
@@ -235,18 +191,6 @@ def off(poses, mean):
     return np.column_stack([apart.real, apart.imag, turn])
 
 
-def test_a_node_is_the_weighted_mean_of_the_particles_of_its_keyframe_on_se2():
-    window = driven({1, 3})
-    local = windows.gaussian(window)
-    weights = np.exp(window.particles.log_weights)
-    assert local.node_stamps.tolist() == [1000, 3000]
-    for node, keyframe in zip(local.nodes, (1, 3), strict=True):
-        poses = window.paths[keyframe]
-        np.testing.assert_allclose((weights @ off(poses, node))[:2], 0.0, atol=1e-12)
-        direction = np.angle(weights @ np.exp(1j * poses[:, 2]))
-        np.testing.assert_allclose(wrap(node[2] - direction), 0.0, atol=1e-12)
-
-
 def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     window = driven({1, 2})
     local = windows.gaussian(window)
@@ -259,14 +203,6 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
     expected += np.diag(np.tile(POSE_JITTER, 3))
     np.testing.assert_allclose(local.covariance[:9, :9], expected, atol=1e-12)
-
-
-def test_marking_nodes_changes_nothing_else_in_the_submap():
-    plain, marked = (windows.gaussian(driven(marks)) for marks in (set(), {0, 2}))
-    bare = marked.without_nodes
-    assert bare.ids.tobytes() == plain.ids.tobytes()
-    assert bare.mean.tobytes() == plain.mean.tobytes()
-    np.testing.assert_allclose(bare.covariance, plain.covariance, rtol=1e-15, atol=1e-18)
 
 
 def test_a_running_gaussian_is_the_windows_without_its_pose_nodes():

@@ -138,14 +138,6 @@ def test_its_covariance_is_what_the_truth_is_off_by():
     assert np.mean(found) < 2.0  # of 24 numbers, once in a thousand
 
 
-def test_no_two_paths_have_an_ancestor_in_common():
-    keyframes, _ = drive(3)
-    window = window_of(keyframes, 1).particles
-    assert len(np.unique(window.paths[0], axis=0)) == 100
-    assert window.paths[-1].tobytes() == window.particles.poses.tobytes()
-    assert np.exp(window.particles.log_weights).sum() == pytest.approx(1.0)
-
-
 PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
 LANDMARK = np.array([4.0, 2.5])
 IDS = np.array([7], np.uint32)
@@ -195,25 +187,6 @@ def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlat
     np.testing.assert_allclose(means[0, 0], point, atol=1e-4)
     expected = covariance[[0, 0, 1], [0, 1, 1]]
     np.testing.assert_allclose(covariances[0, 0], expected, rtol=2e-3, atol=1e-7)
-
-
-def test_repeating_a_measurement_leaves_the_constant_part_of_its_error():
-    sizes = []
-    for repeats in (1, 1000):
-        _, covariances = landmarks_along_paths(
-            IDS,
-            LANDMARK.reshape(1, 1, 2),
-            np.array([[[1.0, 0.0, 1.0]]]),
-            PATH[:1, None, :],
-            np.zeros(repeats, dtype=np.int64),
-            IDS.repeat(repeats),
-            np.tile(predicted(PATH[0], LANDMARK), (repeats, 1)),
-            unclaimed(repeats),
-            Noise(0.0125, 0.0, 0.2, 5e-4, 0.5),
-        )
-        xx, xy, yy = covariances[0, 0]
-        sizes.append(xx * yy - xy * xy)
-    assert sizes[1] / sizes[0] == pytest.approx(0.8 * 0.5, rel=2e-3)
 
 
 SEEDS = 8

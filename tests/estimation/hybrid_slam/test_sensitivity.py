@@ -8,13 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
-from teamslam.team import core, translate
+from teamslam.team import core
 from teamslam.team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation import se2
-from teamslam.team.estimation.consistency import nees
-from teamslam.team.estimation.contribution import InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.joining import (
@@ -25,10 +21,7 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.models import increment_of, model_of, noise_of
 from teamslam.team.estimation.randomness import random_numbers
-from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
 from tests.estimation.submap_world import local_truth, team, wrap
-from tests.teams import config, driven, of, published
 
 SIGMA = {
     "bearing": 0.01,
@@ -107,35 +100,6 @@ def test_the_clocks_derivative_changes_as_the_curvature_states():
     spread = [np.ptp((each - true.mean)[3:].reshape(-1, 2), axis=0) for each in (linear, bent)]
     assert (spread[1] < 0.4 * spread[0]).all()
     assert not np.delete(off.curvature, clock, axis=0).any()
-
-
-def test_a_window_at_calibrated_speed_has_no_column_for_the_speed():
-    front = FrontEnd(particles=10, biases=BIASES)
-    window, random = windows.open_window(front, Sensor()), random_numbers(1, "r1", 0, 0)
-    motion = msgspec.structs.replace(MOTION, calibrated_speed=(0.5, 2.0))
-    seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
-    step, column = (
-        increment_of(motion, 1.0, 1.0, 0.1),
-        np.append(model_of(motion).forward_column(1.0, 1.0, 0.1), 1.0),
-    )
-    windows.advance(window, step, *seen, random, column)
-    local = windows.gaussian(window)
-    assert local.biases == ("bearing", "clock_offset", "range_offset", "range_scale")
-    assert local.sensitivity.shape == (4, 5)
-
-
-def test_columns_change_nothing_else():
-    seen = np.array([3], np.uint32), np.array([4.0]), np.array([0.5])
-    made = []
-    for biases in ((), BIASES):
-        front = FrontEnd(particles=10, biases=biases)
-        window, random = windows.open_window(front, Sensor()), random_numbers(1, "r1", 0, 0)
-        step = increment_of(MOTION, 1.0, 1.0, 0.1)
-        windows.advance(window, step, *seen, random)
-        made.append(windows.gaussian(window))
-    assert np.array_equal(made[0].mean, made[1].mean)
-    assert np.array_equal(made[0].covariance, made[1].covariance)
-    assert made[0].biases == ()
 
 
 def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
@@ -260,21 +224,6 @@ def wrap_pose(difference):
     return np.array([*difference[:2], wrap(difference[2])])
 
 
-def test_a_window_without_keyframes_has_no_answer_and_a_mean_of_another_one_is_refused():
-    window = core.Window(5, noise_of(SMOOTHED))
-    rows, _, fault = window.sensitivity(np.zeros(3), True)
-    assert rows.shape == (5, 3)
-    assert not rows.any()
-    assert fault == 0
-    assert not window.has_shifts
-    full, _ = some_window(0, SMOOTHED)
-    assert full.has_shifts
-    mean = full.close()[1]
-    for wrong in (mean[:-1], np.append(mean, 0.0), np.where(mean == mean[0], np.nan, mean)):
-        with pytest.raises(ValueError, match="mean must be"):
-            full.sensitivity(wrong, False)
-
-
 @settings(deadline=None)
 @given(
     st.floats(0.2, 2.0),
@@ -384,72 +333,9 @@ def test_biases_stay_when_islands_merge():
     }
 
 
-def test_the_cost_counts_a_bias_with_its_robot():
-    world, submaps, _ = biased_team(6)
-    fold = fold_of(world, submaps, JoinSettings(bias_sigma=SIGMA))
-    graph, agreement = fold.main.graph, marginals.joint_cost(fold)
-    priors = sum(len(prior.mean) for prior in graph.priors)
-    assert agreement.dof == pytest.approx(graph.dimensions.sum() + priors - graph.unknowns)
-
-
 # --- a simulated team with a biased camera ---
 
 BEARING, RANGE = 0.01, 0.01
-
-
-def camera_team(seed, biases):
-    """Two robots whose cameras are off; their submaps as Contributions, the truth, the starts."""
-    world = SimulatedWorld(
-        steps=60, size_m=25.0, landmark_count=12, visible_from_m=1.0, visible_to_m=10.0
-    )
-    front = FrontEnd(particles=60, window_s=6.0, biases=biases)
-    motion = MotionModel(forward=MotionNoise(per_s=0.02), turn=MotionNoise(per_s=0.01))
-    believed = [
-        config(name, motion=motion, sensor=Sensor(0.05, bearing_sigma=0.01), front_end=front)
-        for name in ("r1", "r2")
-    ]
-    off = [
-        msgspec.structs.replace(
-            each,
-            sensor=msgspec.structs.replace(
-                each.sensor, bearing_offset=sign * BEARING, range_scale=1.0 + sign * RANGE
-            ),
-        )
-        for each, sign in zip(believed, (1.0, -1.0), strict=True)
-    ]
-    streams = simulated(world, off, seed)
-    submaps, starts = [], []
-    for stream, robot in zip(streams.streams, believed, strict=True):
-        sent = of(driven(RobotNode(robot), published(stream)), ch.SUBMAP)
-        submaps += [translate.contribution_of(submap) for submap in sent]
-        starts.append(InitialPoseFactor(robot.id, sent[0].incarnation, stream.start.pose))
-    return streams, sorted(submaps, key=lambda each: each.key), starts
-
-
-def nees_per_dof(seed, biases, options):
-    streams, submaps, starts = camera_team(seed, biases)
-    fold = joining.EMPTY_FOLD
-    for start in starts:
-        fold = add_start(fold, start)
-    fold = solve_fold(fold_submaps(fold, submaps, options), options)
-    found = marginals.landmark_map(fold)
-    truth = streams.landmarks[found.ids.astype(int) - 1]
-    error = (found.means - truth).ravel()
-    return nees(error, found.covariance) / len(error), marginals.bias_estimates(fold)
-
-
-def test_a_team_with_biased_cameras_is_consistent_with_bias_states_only():
-    options = JoinSettings(bias_sigma=SIGMA)
-    seeds = range(1, 7)
-    known = [nees_per_dof(seed, ("bearing", "range_scale"), options) for seed in seeds]
-    blind = [nees_per_dof(seed, (), options)[0] for seed in seeds]
-    assert 0.6 < np.mean([value for value, _ in known]) < 1.5
-    assert np.mean(blind) > 2.0
-    for _, estimates in known:
-        for (robot, _), bias, value, sigma in estimates:
-            truth = (BEARING if bias == "bearing" else RANGE) * (1.0 if robot == "r1" else -1.0)
-            assert abs(value - truth) < 4.0 * sigma
-            assert sigma < 0.5 * SIGMA[bias]
 
 
 def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_its_costs():

@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 
 from teamslam.team.estimation.contribution import InitialPoseFactor, moment
 from teamslam.team.estimation.map_joining.alignment import (
-    SharedPoints,
-    align,
     procrustes,
-    refusal,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import solve_fold
@@ -112,25 +109,6 @@ def test_maps_that_disagree_are_not_merged():
     reason = fold.reasons[("r1", 0)]
     assert "landmarks disagree: chi²" in reason
     assert "(99.9 %)" in reason
-
-
-def test_landmarks_close_together_do_not_give_a_heading():
-    in_a = np.array([[0.0, 0.0], [0.3, 0.0]])
-    found = align(in_a, np.eye(4), in_a + 5.0, np.eye(4))
-    reason = refusal(SharedPoints(2), found, 0.3)
-    assert reason is not None
-    assert "too close together" in reason
-    apart = align(10.0 * in_a, 0.01 * np.eye(4), 10.0 * in_a, 0.01 * np.eye(4))
-    assert refusal(SharedPoints(2), apart, 0.3) is None
-
-
-def test_an_island_that_is_not_merged_does_not_disturb_the_main_one():
-    world = team(4, robots=2, submaps=6)
-    apart = seeing_only(world.submaps, "r1", [2])
-    alone = [each for each in apart if each.robot == "r0"]
-    with_it, without = joined(apart, world.starts[:1], 2), joined(alone, world.starts[:1], 1)
-    assert with_it.main.state.tobytes() == without.main.state.tobytes()
-    assert landmark_map(with_it).covariance.tobytes() == landmark_map(without).covariance.tobytes()
 
 
 def test_without_any_start_the_smallest_stream_is_the_gauge_whoever_came_first():

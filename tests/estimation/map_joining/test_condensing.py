@@ -17,27 +17,21 @@ from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
 from teamslam.team.estimation.map_joining.gauss_newton import (
     age_factors,
-    degrees_of_freedom,
-    final_cost,
     take_step,
 )
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
-    Fold,
     JoinSettings,
     Tick,
     add_start,
     fold_submaps,
 )
-from teamslam.team.estimation.map_joining.memory import MOST, Memory, Observed
-from teamslam.team.estimation.map_joining.relinearising import is_due, restore_submaps
+from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from tests.estimation.association.unnamed_worlds import (
     circle,
     drive,
-    duplicates,
     ring,
-    wrong,
 )
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import team
@@ -95,16 +89,6 @@ def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
     assert theirs.chi2 / theirs.dof == pytest.approx(mine.chi2 / mine.dof, rel=0.05)
     assert {each.stream for each in theirs.submaps} == {("r0", 0), ("r1", 0)}
     assert marginals.confirmed(bounded, 3) == marginals.confirmed(full, 3)
-
-
-def test_without_noise_of_linearisation_nothing_is_lost():
-    """Nearly exact submaps: the full fold's map, covariance, cost and degrees of freedom."""
-    full, bounded = both(team(3, submaps=12, sigmas=(1e-4, 1e-5, 1e-4)), JoinSettings())
-    a, b = marginals.landmark_map(full), marginals.landmark_map(bounded)
-    assert np.allclose(a.means, b.means, atol=1e-7)
-    assert np.allclose(a.covariance, b.covariance, rtol=1e-4, atol=1e-14)
-    assert final_cost(bounded.main) == pytest.approx(final_cost(full.main), rel=1e-4)
-    assert degrees_of_freedom(bounded.main) == degrees_of_freedom(full.main)
 
 
 def test_a_submap_that_is_condensed_twice_is_not_consistent():
@@ -169,12 +153,6 @@ def test_an_iteration_that_would_hardly_move_a_condensed_fold_is_left_out(
     assert apart(full, bounded) < 1e-3
 
 
-def test_it_is_due_when_a_size_is_passed_and_not_again():
-    passed = [size for size in range(2, 3000, 2) if is_due(size - 2, size)]
-    assert passed == [192, 288, 432, 648, 972]
-    assert is_due(100, 700)
-
-
 def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monkeypatch):
     """Inter-robot measurements connect the runs of one robot with those of others."""
     world = meeting(3, robots=3, submaps=9)
@@ -215,48 +193,6 @@ def laps():
     return submaps, truth, full, bounded
 
 
-def _members(fold: Fold) -> set[frozenset[object]]:
-    return {frozenset(each) for each in fold.landmarks.sets.values()}
-
-
-def _apart(one: Fold, other: Fold) -> float:
-    """Compute the distance of two maps in σ² per degree of freedom."""
-    a, b = marginals.landmark_map(one), marginals.landmark_map(other)
-    assert a.ids.tolist() == b.ids.tolist()
-    difference = (a.means - b.means).ravel()
-    return float(difference @ np.linalg.solve(a.covariance, difference) / len(difference))
-
-
-def test_the_bounded_fold_unites_the_same_landmarks_as_the_full_one(laps):
-    submaps, truth, full, bounded = laps
-    assert bounded.condensed_count > 0.5 * len(submaps)
-    assert wrong(bounded.landmarks, truth) == duplicates(bounded.landmarks, truth) == 0
-    assert _members(bounded) == _members(full)
-    assert _apart(full, bounded) < 1e-2
-    variances = [np.diag(marginals.landmark_map(each).covariance) for each in (full, bounded)]
-    assert np.allclose(*variances, rtol=0.1)
-    assert marginals.confirmed(bounded, 3) == marginals.confirmed(full, 3)
-
-
-def test_what_is_remembered_is_the_newest_submaps_of_each_landmark(laps):
-    *_, bounded = laps
-    graph = bounded.main.graph
-    seen = np.concatenate([each.landmarks for each in graph.memory.submaps])
-    counts = np.bincount(seen, minlength=len(graph.fixed))
-    assert counts.max() > MOST
-    once = Memory(graph.memory.submaps).shortened(len(graph.fixed), most=1)
-    twice = Memory(graph.memory.submaps).shortened(len(graph.fixed), most=2)
-    assert 0 < len(once.submaps) < len(twice.submaps) < len(graph.memory.submaps)
-    newest: dict[int, Observed] = {}
-    for each in graph.memory.submaps:
-        newest |= dict.fromkeys(each.landmarks.tolist(), each)
-    assert set(map(id, newest.values())) == set(map(id, once.submaps))
-    assert once.distinct.all()  # one keyframe saw all of each submap
-    pairs = set(map(tuple, once.pairs.tolist()))
-    gone = next(each for each in graph.memory.submaps if each not in once.submaps)
-    assert tuple(sorted(gone.landmarks[:2].tolist())) in pairs
-
-
 def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
     """The same point costs the same as one node and as two that are equal."""
     *_, bounded = laps
@@ -276,12 +212,3 @@ def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
 def _cost_of(condensed, values):
     d = condensed.moved(values, np.arange(len(values)))
     return condensed.cost + 2.0 * condensed.slope @ d + d @ condensed.information @ d
-
-
-def test_what_is_linearised_again_has_the_identities_that_were_found(laps):
-    submaps, _, full, bounded = laps
-    again = restore_submaps(bounded, submaps, [])
-    assert again.condensed_count == 0
-    assert not again.main.graph.memory.submaps
-    assert _apart(full, again) < 1e-6
-    assert _members(condense_submaps(again, Limits(30, lag=4))) == _members(full)

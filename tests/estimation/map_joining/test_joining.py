@@ -16,13 +16,11 @@ from teamslam.team.estimation.map_joining.joining import (
     LateStartError,
     NotCanonicalError,
     add_start,
-    compact_fold,
     fold_submaps,
     solve_fold,
 )
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
-    landmark_blocks,
     landmark_map,
     main_priors,
     prior_for,
@@ -124,29 +122,6 @@ def test_every_order_of_arrival_sorted_canonically_gives_the_same_bytes(random):
         assert one.tobytes() == other.tobytes()
 
 
-def test_taking_submaps_leaves_the_fold_before_as_it_was():
-    world = team(2)
-    before = joined(world.submaps[:8], world.starts)
-    state, blocks = before.main.state.copy(), landmark_blocks(before).covariances.copy()
-    on = fold_submaps(before, world.submaps[8:], EXACTLY)
-    again = fold_submaps(before, world.submaps[8:], EXACTLY)
-    assert before.main.state.tobytes() == state.tobytes()
-    assert landmark_blocks(before).covariances.tobytes() == blocks.tobytes()
-    assert on.main.state.tobytes() == again.main.state.tobytes()
-
-
-def test_a_lean_fold_goes_on_to_the_same_bytes():
-    world = team(2)
-    before = joined(world.submaps[:8], world.starts)
-    landmark_map(before)
-    on, lean_on = (
-        fold_submaps(each, world.submaps[8:], EXACTLY) for each in (before, compact_fold(before))
-    )
-    assert on.main.state.tobytes() == lean_on.main.state.tobytes()
-    assert landmark_map(on).covariance.tobytes() == landmark_map(lean_on).covariance.tobytes()
-    assert "posterior" not in vars(compact_fold(before).main)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     world = team(seed, robots=3, submaps=10)
@@ -226,17 +201,6 @@ def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():
 # --- redundancy ---
 
 
-def test_the_redundancies_of_submaps_and_priors_add_up_to_the_joint_degrees_of_freedom():
-    world = team(8, robots=3)
-    starts = [world.starts[0], *(replace(s, covariance=np.eye(3)) for s in world.starts[1:])]
-    fold = solve_fold(joined(world.submaps, starts), EXACTLY)
-    agreement, graph = joint_cost(fold), fold.main.graph
-    assert agreement.dof == pytest.approx(graph.dimensions.sum() + 6 - graph.unknowns)
-    assert sum(dof for _, dof in agreement.robots.values()) == pytest.approx(agreement.dof)
-    assert sum(chi2 for chi2, _ in agreement.robots.values()) == pytest.approx(agreement.chi2)
-    assert [each.sequence for each in agreement.submaps] == [c.sequence for c in world.submaps]
-
-
 @pytest.mark.parametrize("gate", [13.8, np.inf], ids=["landmarks by themselves", "as a whole"])
 def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_its_weight(gate):
     """Σ (dim − w tr(JᵀP⁻¹J Σ)) = Σ dim − unknowns: Σ is the inverse of Σ w JᵀP⁻¹J."""
@@ -263,41 +227,6 @@ def test_with_a_robust_loss_the_redundancies_add_up_too_since_each_counts_with_i
 # --- marginals ---
 
 
-def test_blocks_and_trajectory_are_the_blocks_of_the_joint_covariances():
-    world = team(9, robots=2)
-    fold = joined(world.submaps, world.starts)
-    whole, blocks = landmark_map(fold), landmark_blocks(fold)
-    for k, block in enumerate(blocks.covariances):
-        span = slice(2 * k, 2 * k + 2)
-        np.testing.assert_allclose(block, whole.covariance[span, span], rtol=1e-9)
-    prior, path = prior_for(fold, "r1", 0), trajectory(fold, "r1", 0)
-    np.testing.assert_allclose(
-        path.covariances[-1], prior.covariance[:3, :3], rtol=1e-9, atol=1e-15
-    )
-    np.testing.assert_array_equal(path.poses[-1], prior.pose)
-    np.testing.assert_allclose(prior.covariance[3:, 3:], whole.covariance, rtol=1e-9)
-
-
-def test_a_prior_for_some_landmarks_is_the_marginal_of_the_prior_for_all():
-    fold = joined(*(lambda world: (world.submaps, world.starts))(team(9)))
-    everything = prior_for(fold, "r0", 0)
-    some = prior_for(fold, "r0", 0, everything.ids[[1, 3]].tolist())
-    keep = np.array([0, 1, 2, 5, 6, 9, 10])
-    np.testing.assert_allclose(
-        some.covariance, everything.covariance[np.ix_(keep, keep)], rtol=1e-9
-    )
-
-
-def test_the_priors_of_all_streams_together_are_the_priors_of_each():
-    world = team(9, robots=3)
-    fold = joined(world.submaps, world.starts)
-    together = main_priors(fold, sorted(fold.main.graph.streams))
-    assert sorted(together) == [("r0", 0), ("r1", 0), ("r2", 0)]
-    for (robot, incarnation), prior in together.items():
-        for one, other in zip(prior[:4], prior_for(fold, robot, incarnation)[:4], strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
-
-
 def test_of_many_landmarks_a_prior_has_the_nearest():
     world = team(9, robots=3)
     fold = joined(world.submaps, world.starts)
@@ -311,14 +240,6 @@ def test_of_many_landmarks_a_prior_has_the_nearest():
         same = prior_for(fold, robot, incarnation, prior.ids.tolist())
         for one, other in zip(prior[:4], same[:4], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)
-
-
-def test_a_known_start_stays_exactly_where_it_is():
-    world = team(9, robots=2)
-    island = solve_fold(joined(world.submaps, world.starts), EXACTLY).main
-    for start in world.starts:
-        begin = island.graph.offset[island.graph.streams[start.stream][0]]
-        assert island.state[begin : begin + 3].tobytes() == start.pose.tobytes()
 
 
 def test_an_uncertain_start_is_composed_with_the_submap_that_leaves_it():
@@ -373,16 +294,6 @@ def test_one_wrong_submap_in_forty_moves_the_map_much_unless_the_loss_is_robust(
 
     assert moved(JoinSettings(robust=False)) > 2.0
     assert moved(JoinSettings()) < 0.3
-
-
-def test_the_wrong_submap_is_the_one_with_discounted_landmarks_and_the_large_cost():
-    world = team(11, robots=2, submaps=20)
-    options = JoinSettings()
-    fold = solve_fold(joined(with_outlier(world, 15), world.starts, options), options)
-    costs = joint_cost(fold).submaps
-    weights = np.split(fold.main.estimate.landmark_weights, fold.main.graph.landmark_start[1:-1])
-    assert min(range(40), key=lambda k: weights[k].min(initial=1.0)) == 15
-    assert costs[15].chi2 > 10.0 * costs[15].dof
 
 
 def test_a_true_loop_closure_is_not_taken_for_an_outlier():

@@ -118,13 +118,6 @@ def test_beyond_its_gate_a_landmark_counts_by_the_gate_over_its_chi_square():
     assert replace(island, state=far).estimate.landmark_weights.min() == 1e-6
 
 
-def test_without_a_robust_loss_every_landmark_counts():
-    world = team(4)
-    island = fold_of(world, mistaken(world, 4), JoinSettings(robust=False)).main
-    assert (island.estimate.landmark_weights == 1.0).all()
-    np.testing.assert_array_equal(island.estimate.whole_chi2, island.estimate.chi2)
-
-
 def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
     world = team(2)
     graph = fold_of(world, world.submaps, JoinSettings()).main.graph
@@ -186,19 +179,6 @@ def test_the_cost_of_an_iteration_falls_with_the_robust_cost():
         )
 
 
-def test_the_joint_cost_leaves_out_what_is_discounted_and_no_more():
-    ratios = []
-    for wrong in (True, False):
-        chi2 = dof = 0.0
-        for seed in range(10):
-            world = team(seed, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
-            submaps = mistaken(world, seed) if wrong else world.submaps
-            agreement = joint_cost(fold_of(world, submaps, ROBUST, solved))
-            chi2, dof = chi2 + agreement.chi2, dof + agreement.dof
-        ratios.append(chi2 / dof)
-    assert ratios[0] == pytest.approx(ratios[1], rel=0.12)
-
-
 ANNEALED = JoinSettings()
 AT_ONCE = replace(ANNEALED, robust_start=1.0)
 """The mutant: a factor is judged at its final scale from the first iteration on."""
@@ -257,25 +237,6 @@ def test_a_full_solution_anneals_what_has_been_judged_anew():
     assert off_m(solved) < 0.3
     assert change < ANNEALED.step_tolerance
     assert (solved.scale == 1.0).all(), "it ends at the final scale"
-
-
-def test_the_scale_of_a_factor_falls_by_its_decay_with_each_iteration_until_it_is_one():
-    options = replace(ANNEALED, robust_start=4.0, robust_decay=0.5)
-    island = closed_loop(options)
-    for age, scale in ((0, 4.0), (1, 2.0), (2, 1.0), (3, 1.0), (50, 1.0)):
-        aged = replace(island, age=np.full(2, age), sighting_age=np.full(1, age))
-        assert aged.scale.tolist() == [scale, scale]
-        assert aged.sighting_scale.tolist() == [scale]
-    assert np.isinf(replace(island, settings=JoinSettings(robust=False)).scale).all()
-
-
-@pytest.mark.parametrize("per_tick", [1, 3])
-def test_a_factor_is_as_old_as_the_iterations_that_it_has_been_in(per_tick):
-    island = closed_loop(replace(ANNEALED, iterations_per_tick=per_tick))
-    assert island.age.tolist() == [0, 0]
-    island = after(4, island)
-    assert island.age.tolist() == [4 * per_tick, 4 * per_tick]
-    assert island.sighting_age.tolist() == [4 * per_tick]
 
 
 def dense(pattern, values):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
-from teamslam.team.estimation.map_joining import gauss_newton, minima
+from teamslam.team.estimation.map_joining import gauss_newton
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, is_suspicious
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -115,36 +115,6 @@ def test_a_long_curved_valley_is_gone_along_to_its_end(seed, monkeypatch):
     creeping = solve_minimum(island)
     assert creeping.iterations == OPTIONS.max_iterations, "the mutant damps at once"
     assert creeping.cost > found.cost + 10.0
-
-
-def test_a_map_that_is_not_settled_is_said(monkeypatch):
-    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
-    island = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
-    hasty = replace(island, settings=replace(OPTIONS, max_iterations=1))
-    assert any(
-        "is not settled: after 1 iterations" in text for text in warnings(search_minima([hasty]))
-    )
-
-
-def test_a_solution_that_is_stuck_is_told_from_one_that_has_converged(monkeypatch):
-    lost = thrown(island_of(team(1, robots=1, submaps=20, landmarks=3)), 1)
-    monkeypatch.setattr(gauss_newton, "HALVINGS", 0)
-    monkeypatch.setattr(gauss_newton, "MOST_DAMPING", 1e-4)
-    stuck = solve_minimum(lost)
-    assert stuck.iterations < OPTIONS.max_iterations
-    assert stuck.change > 1.0, "the mutant says 0"
-    assert any("is not settled" in text for text in warnings(Search(stuck, 0.0, None)))
-
-
-def test_what_has_not_settled_is_solved_on(monkeypatch):
-    far = {"size": 100.0, "reach": 20.0, "sigmas": (0.02, 0.3, 3.0)}
-    island = island_of(team(1, robots=1, submaps=30, landmarks=3, **far))
-    state = relax_headings(island.graph, island.state)
-    hasty = replace(island, state=state, settings=replace(OPTIONS, max_iterations=6))
-    assert solve_minimum(hasty).change > minima.SETTLED_M
-    assert search_minima([hasty]).best.change <= minima.SETTLED_M
-    monkeypatch.setattr(minima, "MORE_SOLUTIONS", 0)
-    assert search_minima([hasty]).best.change > minima.SETTLED_M, "the mutant leaves it"
 
 
 @pytest.mark.parametrize(("landmark_sigma", "said"), [(6.0, True), (0.2, False)])

@@ -9,7 +9,6 @@ from teamslam.team.estimation.map_joining import nonlinearity
 from teamslam.team.estimation.map_joining.gauss_newton import (
     JoinSettings,
     joint_marginal,
-    solve_with_fixed,
 )
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -17,7 +16,6 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
     solve_fold,
 )
-from teamslam.team.estimation.map_joining.minima import search_minima, solve_minimum, warnings
 from teamslam.team.estimation.map_joining.nonlinearity import understated_uncertainty
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import drawn, local_truth
@@ -55,19 +53,6 @@ def start_node(fold):
     return fold.main.graph.streams["r1", 0][0]
 
 
-def test_a_number_is_held_where_the_rest_has_the_least_cost():
-    fold = latecomer(blind=10)
-    island = solve_minimum(fold.main).island
-    at = int(island.graph.offset[start_node(fold)]) + 2
-    found = solve_with_fixed(island, at, 0.3, 12)
-    assert found.state[at] - island.state[at] == pytest.approx(0.3)
-    gradient = found.estimate.gradient
-    assert abs(gradient[at]) > 0.1
-    others = np.delete(gradient, at)
-    scale = np.sqrt(np.delete(found.estimate.normal_equations[0][found.graph.pattern.diagonal], at))
-    assert np.abs(others / scale).max() < 1e-3, "no other number could lower the cost"
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
     fold = latecomer(blind=14, seed=seed)
@@ -97,18 +82,6 @@ def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
     assert fold.warnings == ()
     monkeypatch.setattr(nonlinearity, "STRAIGHT_RAD", 0.0)
     assert understated_uncertainty(fold.main, start_node(fold)) is None, "nor is it bent"
-
-
-def test_a_straight_valley_is_no_bend_however_wide():
-    wide = InitialPoseFactor("r1", 0, np.zeros(3), np.diag([4.0, 4.0, 0.25]))
-    fold = add_start(add_start(EMPTY_FOLD, InitialPoseFactor("r0", 0, np.zeros(3))), wide)
-    rng = np.random.default_rng(1)
-    submaps = [seeing("r0", 0, np.zeros(3), rng)]
-    fold = fold_submaps(fold, submaps, OPTIONS)
-    local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), 1e-4 * np.eye(3))
-    fold = fold_submaps(fold, [Contribution("r1", 0, 0, 2000, local)], OPTIONS)
-    assert understated_uncertainty(fold.main, start_node(fold)) is None
-    assert not [text for text in warnings(search_minima([fold.main])) if "farther off" in text]
 
 
 def test_a_robot_whose_initial_pose_is_given_costs_no_profile(monkeypatch):

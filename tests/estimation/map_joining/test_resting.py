@@ -20,7 +20,6 @@ from tests.estimation.submap_world import team
 
 ROBUST = JoinSettings()
 NEVER = 1_000_000
-STREAMS = (("r0", 0), ("r1", 0))
 
 
 def world(seed, submaps=24):
@@ -77,29 +76,6 @@ def last():
     """The last fold with landmarks at rest."""
     *_, fold = folds(world(4), JoinSettings(), 1)
     return fold
-
-
-def test_blocks_and_priors_are_those_of_the_joint_covariance(last):
-    whole, blocks = marginals.landmark_map(last), marginals.landmark_blocks(last)
-    own = np.array(
-        [whole.covariance[k : k + 2, k : k + 2] for k in range(0, len(whole.ids) * 2, 2)]
-    )
-    assert np.allclose(blocks.covariances, own, rtol=1e-9)
-    assert np.array_equal(blocks.means, whole.means)
-    for prior in marginals.main_priors(last, STREAMS, 12).values():
-        at = np.searchsorted(whole.ids, prior.ids)
-        numbers = (2 * at[:, None] + np.arange(2)).ravel()
-        assert set(prior.ids.tolist()) & at_rest(last)
-        assert np.allclose(prior.covariance[3:, 3:], whole.covariance[np.ix_(numbers, numbers)])
-        assert np.linalg.eigvalsh(prior.covariance)[0] > 0.0
-
-
-def test_the_pose_in_a_prior_goes_with_landmarks_at_rest_as_with_nodes(last):
-    *_, never = folds(world(4), JoinSettings(), NEVER)
-    for stream in STREAMS:
-        one = marginals.prior_for(never, *stream)
-        other = marginals.prior_for(last, *stream)
-        assert np.allclose(one.covariance, other.covariance, rtol=1e-4, atol=1e-8)
 
 
 def test_what_wakes_without_the_others_being_conditioned_on_it_is_seen():

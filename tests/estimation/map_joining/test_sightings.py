@@ -22,7 +22,6 @@ from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map, trajectory
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential, inverse, transformed
-from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import seen_from, wrap
 
@@ -75,30 +74,6 @@ def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised(
             assert (up - down) / 4e-6 == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
-def test_pose_nodes_without_sightings_change_nothing_in_the_map():
-    world = meeting(4, robots=3)
-    bare = [replace(each, local=each.local.without_nodes) for each in world.submaps]
-    with_nodes, without = (
-        landmark_map(solve_fold(joined_with(each, world.starts, [], EXACTLY), EXACTLY))
-        for each in (world.submaps, bare)
-    )
-    np.testing.assert_allclose(with_nodes.means, without.means, atol=1e-7)
-    np.testing.assert_allclose(with_nodes.covariance, without.covariance, atol=1e-9)
-
-
-def test_a_submap_without_its_nodes_is_the_marginal():
-    local = meeting(4).submaps[0].local
-    n = len(local.mean)
-    kept = [0, 1, 2, *range(6, n)]
-    bare = local.without_nodes
-    assert bare.node_stamps.size == 0
-    assert bare.mean.tolist() == local.mean[kept].tolist()
-    assert bare.covariance.tolist() == local.covariance[np.ix_(kept, kept)].tolist()
-    assert bare.landmarks.tolist() == local.landmarks.tolist()
-    assert local.nodes.tolist() == [local.mean[3:6].tolist()]
-    assert bare.without_nodes is bare
-
-
 # --- redundancy ---
 
 
@@ -118,15 +93,6 @@ def test_sightings_shrink_the_trajectories_covariance_and_their_redundancy_count
 
 
 # --- the set decides ---
-
-
-def test_a_sighting_waits_until_the_teammates_node_is_there():
-    world = meeting(6)
-    late = [each for each in world.submaps if each.robot == "r0" or each.sequence < 3]
-    fold = joined_with(late, world.starts, world.sightings, EXACTLY)
-    assert len(fold.main.graph.sightings) == 6
-    assert {(each.robot, each.teammate) for each in fold.waiting} == {("r0", "r1")}
-    assert [each.stamp_ns for each in fold.waiting] == [3500, 4500, 5500]
 
 
 def test_the_fold_without_a_robot_does_not_know_that_it_was_seen():
@@ -251,9 +217,3 @@ def test_looks_about_one_direction_reduce_to_their_middle_on_the_circle(distance
         assert measurement[0] == pytest.approx(distance)
         assert wrap(measurement[1] - bearing) == pytest.approx(0.0, abs=1e-9)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
-
-
-def test_a_submap_needs_no_nodes():
-    local = LocalMap(np.empty(0, np.uint32), np.zeros(3), np.eye(3))
-    assert local.nodes.shape == (0, 3)
-    assert local.landmarks.shape == (0, 2)

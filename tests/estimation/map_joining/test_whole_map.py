@@ -55,33 +55,6 @@ def test_joining_one_after_the_other_equals_the_joint_solution_in_the_linear_cas
     )
 
 
-def test_the_first_local_map_is_composed_onto_the_start():
-    world = team(4, robots=1, submaps=1)
-    whole, local = whole_of(world), world.submaps[0].local
-    x, y, heading = world.starts[0].pose
-    points = (x + 1j * y) + np.exp(1j * heading) * (local.landmarks @ np.array([1.0, 1j]))
-    np.testing.assert_allclose(whole.mean[3::2] + 1j * whole.mean[4::2], points)
-    np.testing.assert_array_equal(whole.ids, local.ids)
-
-
-def test_ids_stay_ascending_when_new_landmarks_lie_between_known_ones():
-    world = team(5, robots=1, submaps=8, landmarks=30, reach=5.0)
-    whole = whole_of(world)
-    assert (np.diff(whole.ids.astype(int)) > 0).all()
-    assert len(whole.ids) > len(world.submaps[0].local.ids)
-    assert np.abs(whole.mean[3:].reshape(-1, 2) - world.landmarks[whole.ids]).max() < 2.0
-
-
-def test_absorbing_its_own_marginal_changes_nothing():
-    whole = whole_of(team(6, robots=1, submaps=5))
-    again = absorb_fused_map(
-        whole, whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:]
-    )
-    np.testing.assert_array_equal(again.ids, whole.ids)
-    np.testing.assert_allclose(again.mean, whole.mean, rtol=1e-12)
-    np.testing.assert_allclose(again.covariance, whole.covariance, rtol=1e-9, atol=1e-14)
-
-
 def test_the_pose_follows_the_absorbed_landmarks_by_regression():
     whole = whole_of(team(7, robots=1, submaps=5))
     ids = whole.ids[1:3]
@@ -137,21 +110,3 @@ def test_a_map_whose_shared_landmarks_have_no_covariance_has_no_end_pose():
     whole, local = whole_of(world, 3), world.submaps[3].local
     with pytest.raises(NotACovarianceError, match="not positive definite"):
         join_end_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), local)
-
-
-def test_a_map_keeps_its_numbers_and_refuses_others():
-    mean, covariance = np.arange(5.0), np.eye(5)
-    whole = WholeMap(np.array([7], np.uint32), mean, covariance)
-    mean[0] = 9.0
-    assert whole.mean[0] == 0.0
-    with pytest.raises(ValueError, match="read-only"):
-        whole.mean[0] = 1.0
-    for ids, n in (([7], 7), ([7, 7], 7), ([8, 7], 7), ([7], 3)):
-        with pytest.raises(ValueError, match=r"must"):
-            WholeMap(np.array(ids, np.uint32), np.zeros(n), np.eye(n))
-        with pytest.raises(ValueError, match=r"must"):
-            whole.joined(np.array(ids, np.uint32), np.zeros(n), np.eye(n))
-    with pytest.raises(ValueError, match="covariance must"):
-        whole.end_pose(whole.ids, whole.mean, np.eye(4), 1.0)
-    with pytest.raises(TypeError):
-        whole.joined(np.array([7.0]), whole.mean, covariance)
