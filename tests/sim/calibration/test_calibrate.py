@@ -1,7 +1,6 @@
 """Calibration: what was put into measurements comes out of them, within its own uncertainty."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path as File
 from typing import Any
@@ -13,11 +12,10 @@ from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.calibrate import Calibration, calibrate_models
-from teamslam.sim.calibration.data import Reference, poses_at
+from teamslam.sim.calibration.data import Reference
 from teamslam.sim.calibration.figures import (
     CalibrationError,
     Figure,
-    groups_of,
     jackknife,
     with_figures,
 )
@@ -158,55 +156,6 @@ def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty()
     assert found["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
     assert found["bearing_white"].value > 0.9
     assert found["bearing_outliers"].value == pytest.approx(0.03, abs=0.01)
-
-
-@pytest.mark.parametrize("seed", [5, 11])
-def test_white_errors_are_not_taken_for_a_correlation_that_is_gone_by_the_next_measurement(seed):
-    assert fit_sensor([seeing(seed)])["bearing_white"] > 0.9
-
-
-def test_leaving_out_gives_the_standard_error_of_a_mean(bases):
-    marks = {each.name: float(i**2) for i, each in enumerate(bases)}
-    (figure,) = jackknife(
-        lambda part: {"mean": float(np.mean([marks[each.name] for each in part]))},
-        bases,
-        {"mean": "m"},
-    )
-    values = np.array(list(marks.values()))
-    assert figure.value == pytest.approx(values.mean())
-    assert figure.sigma == pytest.approx(values.std(ddof=1) / np.sqrt(len(values)))
-
-
-def test_what_hangs_on_one_group_is_no_figure(bases):
-    def fit(part: Sequence[Reference]) -> dict[str, float]:
-        marker = {"marker": 2.0} if bases[0].name in [each.name for each in part] else {}
-        return {"scale": float(len(part)), **marker}
-
-    assert [figure.name for figure in jackknife(fit, bases, {"scale": "", "marker": "m"})] == [
-        "scale"
-    ]
-
-
-def test_one_robots_log_is_cut_into_stretches_that_lose_no_measurement(bases):
-    groups = groups_of(bases[:1])
-    ends = np.concatenate([part.intervals.end_ns for group in groups for part in group])
-    np.testing.assert_array_equal(ends, bases[0].intervals.end_ns)
-    cut = seeing(1).between(SECOND, 3 * SECOND)
-    assert cut.seen.stamps_ns[0] == SECOND
-    assert cut.seen.stamps_ns[-1] < 3 * SECOND
-    assert len(cut.seen.ids) == cut.seen.offsets[-1] == 8 * len(SEEN)
-
-
-def test_a_path_is_known_neither_in_a_gap_nor_beside_a_jump_of_its_heading():
-    path = Path(
-        np.array([0, 1, 5, 6, 7]) * SECOND,
-        np.array([[0, 0, 3.1], [1, 0, -3.1], [2, 0, -3.1], [3, 0, 0.0], [4, 0, 0.1]]),
-    )
-    at = np.array([-1.0, 0.5, 3.0, 5.5, 6.5, 8.0])
-    poses, known = poses_at(path, (at * SECOND).astype(np.int64), 2 * SECOND)
-    np.testing.assert_array_equal(known, [False, True, False, False, True, False])
-    assert abs(on_circle(poses[1, 2:])[0]) == pytest.approx(np.pi)
-    np.testing.assert_allclose(poses[4], [3.5, -0.5 * np.tan(0.025), 0.05])
 
 
 def spinning(seed: int, *, turns_first: bool) -> Reference:

@@ -47,11 +47,6 @@ def test_the_factors_of_what_is_claimed_are_learnt(told):
     assert found == pytest.approx(4.0, rel=0.1)
 
 
-def test_without_claims_there_is_no_factor():
-    data = seen(odometry_claims=False, landmark_claims=None)
-    assert odometry_factor(data) == landmark_factor(data, ROBOTS[0].sensor) == {}
-
-
 def test_a_mount_that_is_not_the_scenarios_is_told_and_where_it_is():
     assert mount_note(seen(), ROBOTS[0].sensor) == ()
     wrong = msgspec.structs.replace(ROBOTS[0].sensor, mount=(0.0, 0.0, 0.3))
@@ -66,9 +61,3 @@ def test_a_place_that_the_view_does_not_determine_is_refused_by_name():
         object.__setattr__(each, "seen", each.seen.only(0, 3 + k))
     (note,) = mount_note(data, ROBOTS[0].sensor)
     assert note.startswith("mount: the sensor's place on the base is not learnt")
-
-
-def test_what_a_depth_can_not_say_is_left_out_of_the_mount():
-    behind = msgspec.structs.replace(ROBOTS[0].sensor, range_is_depth=True, optical_axis=2.5)
-    (note,) = mount_note(seen(), behind)
-    assert note.startswith("mount: the sensor's place on the base is not learnt (± 0.0")

@@ -10,10 +10,8 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import join_settings
 from teamslam.sim.calibration.consistency import covariance_factor, disagreements, landmark_sigma
 from teamslam.team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
     Fold,
     JoinSettings,
-    fold_submaps,
     solve_fold,
 )
 from tests.estimation.sighting_world import joined_with
@@ -55,14 +53,6 @@ def test_the_factor_makes_up_for_covariances_that_are_too_small():
     factor = covariance_factor(folds_of(range(12), 0.4), CentralConfig())
     assert factor.value == pytest.approx(2.5, rel=0.2)
     assert 0.0 < factor.sigma < 0.4
-
-
-def test_the_factor_is_never_below_one_and_one_robot_says_nothing_of_it():
-    factor = covariance_factor(folds_of(range(5), 4.0), CentralConfig())
-    assert factor.value == 1.0
-    world = team(1, robots=1, sigmas=SIGMAS)
-    alone = solve_fold(fold_submaps(EMPTY_FOLD, world.submaps, JoinSettings()), JoinSettings())
-    assert covariance_factor([alone], CentralConfig()) is None
 
 
 def test_how_far_all_robots_see_landmarks_from_their_survey_is_learnt_by_the_truth():

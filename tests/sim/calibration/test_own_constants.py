@@ -76,11 +76,6 @@ def test_each_cameras_own_constants_come_out_where_they_differ():
     assert max(f.value for f in own.strays if f.name.endswith("range_scale")) < 0.003
 
 
-def test_cameras_that_are_alike_have_nothing_of_their_own():
-    alike = dict.fromkeys(CAMERAS, CAMERAS["r1"])
-    assert own_constants(team(alike), depth=True).robots == {}
-
-
 def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have():
     data = team(CAMERAS | {"r4": CAMERAS["r1"]})
     before = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}

@@ -1,9 +1,5 @@
 """`teamslam log`: output, files, refusals and exit status."""
 
-import json
-import subprocess
-import sys
-
 import msgspec
 import numpy as np
 import pytest
@@ -21,7 +17,6 @@ from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.messages import Increment
 from tests.sim.logs import scenario, streams, world_log
-from tests.support import ROOT
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
@@ -62,17 +57,6 @@ def test_info_names_each_key_and_sends_no_control_sequence_to_the_terminal(log, 
     assert ("source/r1/odometry" if options else "odometry") in out
 
 
-def test_the_figures_of_info_are_written_for_machines(log, tmp_path):
-    assert run("info", log, "--json", tmp_path / "info.json")[0] == 0
-    figures = json.loads((tmp_path / "info.json").read_text())
-    odometry = next(each for each in figures["keys"] if each["key"] == "source/r1/odometry")
-    assert (odometry["messages"], odometry["rate_hz"]) == (20, pytest.approx(1.0))
-    assert (figures["team"], figures["complete"], figures["metadata"]["seed"]) == (
-        "small", True, "1",
-    )  # fmt: skip
-    assert figures["span_ns"] == [0, 20 * 10**9]
-
-
 def test_check_ends_with_1_and_a_line_for_each_finding(log, tmp_path):
     assert run("check", log)[:2] == (0, f"{log}: nothing wrong\n")
     lost = tmp_path / "lost.mcap"
@@ -86,16 +70,6 @@ def test_check_ends_with_1_and_a_line_for_each_finding(log, tmp_path):
     stream = "source/r1: 2 measurements of incarnation 1 missing: 7–8"
     assert {stream, "truth/r1: 1 message missing: 3"} <= set(out.splitlines())
     assert all(" missing: " in line for line in out.splitlines())
-
-
-def test_parts_by_the_command_merge_to_a_sound_log(log, tmp_path):
-    a, b, m = (tmp_path / f"{name}.mcap" for name in "abm")
-    assert run("cut", log, "-o", a, "--to", 7.5)[0] == 0
-    assert run("cut", log, "-o", b, "--from", 7.5)[0] == 0
-    status, out, _ = run("merge", a, b, "-o", m)
-    assert (status, out.split(": ")[1].split()[0]) == (0, str(len(published())))
-    assert list(open_log(m).samples()) == sorted(open_log(log).samples(), key=lambda s: s.stamp_ns)
-    assert run("check", m)[0] == 0
 
 
 def test_a_log_that_is_cut_off_is_repaired(log, tmp_path):
@@ -116,15 +90,6 @@ def test_the_exported_data_set_is_the_one_that_the_world_would_write(log, tmp_pa
     assert names == sorted(path.name for path in (tmp_path / "log").iterdir())
     for name in names:
         assert (tmp_path / "log" / name).read_bytes() == (tmp_path / "world" / name).read_bytes()
-
-
-def test_chosen_channels_are_exported_as_csv(log, tmp_path):
-    status, out, _ = run("export", log, "-o", tmp_path / "out", "--channels", "odometry, truth")
-    assert status == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "odometry.csv", "truth.csv",
-    ]  # fmt: skip
-    assert "odometry.csv: 40 rows" in out
 
 
 def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(log, tmp_path):
@@ -187,17 +152,6 @@ def test_what_a_user_gets_wrong_ends_with_2_and_leaves_nothing(
     assert status == 2
     assert told in " ".join(err.split())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_program_itself_ends_with_2_and_one_line(tmp_path):
-    (tmp_path / "hello.mcap").write_bytes(b"hello")
-    done = subprocess.run(
-        [sys.executable, "-m", "teamslam", "log", "check", str(tmp_path / "hello.mcap")],
-        cwd=ROOT, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"error: {tmp_path / 'hello.mcap'}: not an MCAP file; give a log")
-    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from teamslam.sim.cli.help import SECTIONS
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.plain import parse_plainly
 from teamslam.sim.cli.steps import Steps
-from teamslam.sim.scenarios.scenario import builtin_names
 from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import joined_log, scenario
 from tests.test_architecture import unknown
@@ -36,16 +35,6 @@ def test_every_command_is_in_one_section_and_has_an_example_that_it_understands(
             assert unknown(line.removeprefix("teamslam ")) is None
 
 
-def test_help_has_the_sections_in_order_and_fits_80_columns():
-    text = RUN.invoke(app, ["--help"], terminal_width=80).output
-    places = [text.index(f"\n{title}:\n") for title in SECTIONS]
-    assert places == sorted(places)
-    launch = RUN.invoke(app, ["launch", "--help"], terminal_width=80).output
-    assert launch.index("Options:") < launch.index("Rarely needed:") < launch.index("Network and")
-    assert "teamslam launch waypoints --view\n" in launch
-    assert max(map(len, (text + launch).splitlines())) <= 80
-
-
 def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():
     for words, meant in (
         (["lunch"], "'launch'"),
@@ -57,11 +46,6 @@ def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():
         assert result.exit_code == 2
         assert f"id you mean {meant}?" in result.output
     assert "did you mean `waypoints`?" in str(RUN.invoke(app, ["launch", "waypoint"]).exception)
-
-
-def test_an_option_unlike_any_other_has_no_suggestion():
-    output = RUN.invoke(app, ["launch", "--zzzz"]).output
-    assert "No such option: --zzzz\n" in output
 
 
 @pytest.mark.parametrize(
@@ -144,11 +128,3 @@ def test_one_run_and_a_picture_of_no_kind_are_refused(tmp_path):
     assert (alone.exit_code, "two or more" in alone.output) == (2, True)
     wrong = CliRunner().invoke(app, ["compare", "a", "b", "-o", str(tmp_path / "x.jpeg")])
     assert (wrong.exit_code, ".svg" in wrong.output) == (2, True)
-
-
-def test_the_list_of_scenarios_describes_each_in_one_line():
-    lines = RUN.invoke(app, ["scenarios"], env={"COLUMNS": "80"}).output.splitlines()
-    assert [line.split()[0] for line in lines] == list(builtin_names())
-    assert all(len(line) <= 80 and len(line.split()) > 4 for line in lines)
-    (waypoints,) = (line for line in lines if line.startswith("waypoints "))
-    assert "3 robots   Three different robots drive to random" in waypoints

@@ -1,7 +1,6 @@
 """The end of a launch: interruption, full disk, and a router killed as the run ends."""
 
 import errno
-import json
 import os
 from io import StringIO
 
@@ -16,7 +15,6 @@ from teamslam.central.desk.report import page
 from teamslam.central.desk.report.run import Run
 from teamslam.sim.cli import launch
 from teamslam.sim.cli.main import app
-from teamslam.sim.cli.options import write_json
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.launch.launch import Outcome
 from teamslam.sim.scenarios.scenario import dumps
@@ -41,16 +39,6 @@ def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_
     assert ended.exit_code == 130, ended.output
     assert f"interrupted: the run is in {log}" in ended.stderr
     assert not figures.exists()
-
-
-def test_figures_are_written_whole_or_not_at_all(tmp_path):
-    file = tmp_path / "figures.json"
-    file.write_text("old")
-    launch._check_writable(file)
-    assert file.read_text() == "old"
-    write_json(file, {"new": 1})
-    assert [each.name for each in tmp_path.iterdir()] == ["figures.json"]
-    assert json.loads(file.read_text()) == {"new": 1}
 
 
 def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_elsewhere(

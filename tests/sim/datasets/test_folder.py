@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder import folder
-from teamslam.sim.datasets.folder_writer import seconds, write_folder
+from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -19,12 +19,10 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.config import FolderWorld
 from teamslam.sim.world.streams import FIXES as FIXES_KIND
-from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved
+from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire.arrays import floats
 from tests import teams
-
-HOUR = "1248272272.841"
 
 
 def data_set(path: Path, **tables: str) -> Path:
@@ -87,14 +85,6 @@ def test_a_simulated_world_keeps_its_bits_with_its_empty_scans_and_sightings(tmp
     assert same(read(tmp_path, *(each.robot for each in world.streams)), world)
 
 
-def test_stamps_keep_their_nanoseconds(tmp_path):
-    text = f"t_s,landmark,range_m,bearing_rad\n{HOUR}000001,7,1,0\n{HOUR}000002,7,1,0\n"
-    stamps = only(data_set(tmp_path, observations=text)).landmark_detections.stamps_ns
-    assert stamps.tolist() == [1248272272841000001, 1248272272841000002]
-    assert seconds(1248272272841000001) == f"{HOUR}000001"
-    assert [seconds(each) for each in (0, -1, 10 * 10**9)] == ["0", "-0.000000001", "10"]
-
-
 def test_speeds_hold_until_the_next_row_or_for_a_duration(tmp_path):
     held = only(data_set(tmp_path, odometry=SPEEDS, observations=SEEN)).intervals
     assert held.end_ns.tolist() == [10**9, 3 * 10**9]
@@ -125,24 +115,6 @@ def test_increments_come_with_their_covariances(tmp_path):
     assert driven.covariances[0].tolist() == [[4, 1, 2], [1, 5, 3], [2, 3, 6]]
     assert driven.duration_ns.tolist() == [2 * 10**9, 2 * 10**9]
     assert stream.notes[0] == "the first increment is taken to last as long as the second"
-
-
-def test_a_car_s_wheel_and_steering_hold_until_the_next_row(tmp_path):
-    text = "t_s,wheel_speed_m_s,steering_rad\n0,1,0.1\n1,0,0\n"
-    world = read(data_set(tmp_path, odometry=text))
-    assert 'r1: wheel speed and steering can not be used: give kind = "acker' in world.notes[1]
-    driven = world.streams[0].intervals
-    assert (driven.steered, driven.forward.tolist(), driven.yaw_rate.tolist()) == (True, [1], [0.1])
-
-
-def test_points_stay_points_and_have_their_range_and_bearing(tmp_path):
-    text = "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,7,3,4,2,0.5,1\n1,8,-1,0,1,0,1\n1,9,1,1,1,2,1\n"
-    stream = only(data_set(tmp_path, observations=text))
-    seen = stream.landmark_detections
-    assert (seen.ranges.tolist(), seen.bearings.tolist()) == ([5, 1], [np.arctan2(4, 3), np.pi])
-    assert seen.points.tolist() == [[3, 4], [-1, 0]]
-    assert seen.covariances.tolist() == [[2, 0.5, 1], [1, 0, 1]]
-    assert "1 measurement dropped: its covariance is not positive definite" in stream.notes[1]
 
 
 def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path):
@@ -203,46 +175,6 @@ def test_what_is_hardly_meant_is_noted(tmp_path):
     assert "r3: neither odometry.csv nor observations.csv in it: left out" in said
 
 
-def general(robot: RobotStream, form: str) -> RobotStream:
-    """The robot with measurements in a general form."""
-    intervals, seen = robot.intervals, robot.landmark_detections
-    ends, durations, count = intervals.end_ns, intervals.duration_ns, len(intervals.end_ns)
-    steps = np.column_stack([intervals.forward, 0.1 * intervals.forward, intervals.yaw_rate])
-    claims = np.tile([0.1, 1e-3, 1 / 3], (len(seen.ids), 1))
-    if form == "steered":
-        return dataclasses.replace(
-            robot,
-            intervals=dataclasses.replace(intervals, steered=True),
-            landmark_detections=dataclasses.replace(seen, covariances=claims),
-        )
-    points = seen.ranges[:, np.newaxis] * np.column_stack([np.cos(seen.bearings)] * 2)
-    taken = dataclasses.replace(
-        seen,
-        points=points,
-        ranges=np.hypot(*points.T),
-        bearings=np.arctan2(points[:, 1], points[:, 0]),
-        covariances=claims if form == "claimed" else None,
-    )
-    own = np.tile(np.diag([0.1, 0.2, 1 / 3]), (count, 1, 1)) if form == "claimed" else None
-    moves = moved(ends, durations, steps, own)
-    return dataclasses.replace(robot, intervals=moves, landmark_detections=taken)
-
-
-@pytest.mark.parametrize("form", ["steered", "plain", "claimed"])
-def test_general_measurements_keep_their_bits(tmp_path, form):
-    robot = dataclasses.replace(general(teams.stream("r9", 9), form), teammates=("r1", "r9"))
-    other = dataclasses.replace(teams.stream("r1", 9), teammates=("r1", "r9"))
-    world = WorldStreams((other, robot), np.empty(0, np.uint32), None, "test")
-    write_folder(world, tmp_path)
-    assert same(read(tmp_path, "r1", "r9").streams[1], robot)
-
-
-def test_tables_of_one_robot_may_lie_in_the_folder_itself(tmp_path):
-    (tmp_path / "odometry.csv").write_text(SPEEDS)
-    stream = only(tmp_path)
-    assert (stream.robot, stream.start) == ("r1", None)
-
-
 def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
     seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
     stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
@@ -258,19 +190,6 @@ def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
         "no truth.csv: its trajectory's error can not be computed",
     )
     assert stream.landmark_detections.ids.tolist() == [9, 7, 3, 7]
-
-
-def test_sightings_of_strangers_and_of_itself_are_dropped(tmp_path):
-    text = "t_s,teammate,range_m,bearing_rad\n1,r2,1,0\n1,r9,1,0\n1,r1,1,0\n"
-    data_set(tmp_path, odometry=SPEEDS, sightings=text)
-    (tmp_path / "r2").mkdir()
-    (tmp_path / "r2" / "odometry.csv").write_text(SPEEDS)
-    stream = read(tmp_path, "r1", "r2").streams[0]
-    assert Source(stream).message(1).teammates == ("r2",)
-    assert [note.partition(" (")[0] for note in stream.notes[1:3]] == [
-        "1 sighting dropped: of itself",
-        "1 sighting dropped: of a robot that is not in the team",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -360,13 +279,6 @@ def test_fixes_are_read_within_the_odometry_and_keep_their_bits(tmp_path):
     ]
     write_folder(WorldStreams((stream,), np.empty(0, np.uint32), None, "test"), tmp_path / "b")
     assert same(only(tmp_path / "b"), stream)
-
-
-def test_only_a_part_is_read_when_asked(tmp_path):
-    data_set(tmp_path, odometry=SPEEDS, observations=SEEN)
-    stream = only(tmp_path, duration_s=1.5)
-    assert stream.intervals.end_ns.tolist() == [10**9]
-    assert stream.landmark_detections.stamps_ns.tolist() == [10**9]
 
 
 def two_robots(path: Path) -> Scenario:
@@ -495,9 +407,3 @@ def test_tables_as_other_programs_write_them_are_the_same(tmp_path, odometry):
     plain = only(data_set(tmp_path / "a", odometry=SPEEDS, observations=SEEN))
     other = only(data_set(tmp_path / "b", odometry=odometry, observations=SEEN))
     assert same(plain, other)
-
-
-def test_ranges_that_are_hardly_metres_are_noted(tmp_path):
-    far = SEEN.replace("2.5", "2500").replace("1.5,", "1500,").replace("2.4", "2400")
-    notes = only(data_set(tmp_path, odometry=SPEEDS, observations=far)).notes
-    assert any("the median range is 2,400 m" in note for note in notes)

@@ -94,14 +94,6 @@ def test_g2o_and_toro_state_the_information(tmp_path, text):
     assert stream.start.pose.tolist() == ([5.0, 1.0, 0.0] if text is G2O else [0.0, 0.0, 0.0])
 
 
-def test_an_errorless_twin_is_the_truth(tmp_path):
-    path = written(tmp_path, ISAM)
-    written(tmp_path, ISAM.replace(" 2 0 1.5", " 2.5 0 1.5"), "graph_groundtruth.txt")
-    world = streams(path)
-    assert np.allclose(world.landmarks, [[1.5, 3.0]])
-    assert np.allclose(world.streams[0].truth[:, :2], [[0.0, 0.0], [2.5, 0.0], [2.5, 1.0]])
-
-
 def test_pyfg_has_robots_times_priors_and_the_truth(tmp_path):
     world = streams(written(tmp_path, PYFG), robots=2)
     first, second = world.streams
@@ -178,13 +170,6 @@ def test_what_is_written_is_read_back(tmp_path):
             assert np.allclose(seen.covariance, old_seen.covariance)
 
 
-def test_robots_of_numbered_poses_end_where_no_edge_leads_on(tmp_path):
-    two = ISAM.replace("EDGE2 1 2", "EDGE2 4 5").replace("LANDMARK 2", "LANDMARK 5")
-    world = streams(written(tmp_path, two.replace("EDGE2 2 0", "EDGE2 5 0")), robots=2)
-    assert [len(stream.intervals.end_ns) for stream in world.streams] == [1, 1]
-    assert [stream.start is None for stream in world.streams] == [False, True]
-
-
 @pytest.mark.parametrize(
     ("line", "defect"),
     [
@@ -204,12 +189,6 @@ def test_a_malformed_line_is_named_with_its_remedy(tmp_path, line, defect):
     assert status == 2
     assert "graph.txt, line 4" in text
     assert defect in text
-
-
-def test_a_graph_without_landmarks_is_refused(tmp_path):
-    poses = "".join(f"{line}\n" for line in ISAM.splitlines() if not line.startswith("LANDMARK"))
-    with pytest.raises(DatasetError, match="give a graph with landmarks"):
-        streams(written(tmp_path, poses))
 
 
 def test_import_writes_tables_of_a_graph(tmp_path):

@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.calibration.source import measurements_of
-from teamslam.sim.cli.launch import _time_warnings
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
@@ -141,22 +140,6 @@ def test_pieces_have_each_measurement_once_begin_together_and_know_no_initial_po
         assert np.array_equal(np.concatenate(together), whole.landmark_detections.ranges)
 
 
-def test_labels_are_identities_where_they_are_asked_for(steps):
-    (stream,) = streams(steps, identities="known").streams
-    assert stream.landmark_detections.hidden is None
-    assert stream.landmark_detections.ids.tolist() == [3] * 12
-
-
-def test_the_command_lines_options_make_the_pieces(steps):
-    assert (
-        streams_of(with_options(load("recorded"), dataset=steps, robots=2)).streams[0].start is None
-    )
-    scenario = with_options(load("dlr"), dataset=steps, robots=3, identities="known")
-    found = streams_of(scenario)
-    assert len(found.streams) == 3
-    assert found.streams[2].landmark_detections.hidden is None
-
-
 @pytest.mark.parametrize(
     ("table", "text", "why"),
     [
@@ -205,15 +188,6 @@ def test_launch_checks_a_log_of_one_robot_before_any_process_starts(steps, car):
     assert "12 odometry intervals can not be cut into 13 pieces" in cut
 
 
-def test_times_in_milliseconds_are_warned_of_before_the_launch(car):
-    rows = [f"{100 * i},1.0,0.1" for i in range(1, 41)]
-    (car / "odometry.csv").write_text("t_s,rear_wheel_speed_m_s,steering_rad\n" + "\n".join(rows))
-    (warning,) = _time_warnings(streams(car))
-    assert warning.startswith(
-        "r1: most rows of its odometry are 100 s apart: times are taken for s"
-    )
-
-
 def written(place: Path, tagged: float) -> tuple:
     scenario = with_options(load("thesis-b"), robots=2, identities="hidden")
     world = msgspec.structs.replace(
@@ -241,11 +215,3 @@ def test_what_is_written_is_read_as_it_was(tmp_path, tagged):
         assert np.array_equal(hidden, np.repeat(read.hidden, np.diff(read.offsets)))
         assert hidden.any()
         assert (tagged > 0.0) == (not hidden.all())
-
-
-def test_labels_that_are_not_row_by_row_are_refused(tmp_path):
-    _, scenario = written(tmp_path / "set", 0.0)
-    labels = tmp_path / "set" / "r1" / "labels.csv"
-    labels.write_text("landmark\n1\n")
-    with pytest.raises(DatasetError, match=r"r1/labels\.csv.*1 rows"):
-        streams_of(scenario)

@@ -21,7 +21,6 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options
 from teamslam.sim.scenarios.source import (
-    open_data_set,
     scenario_beside,
     streams_of,
     with_present_robots,
@@ -115,25 +114,6 @@ def test_a_set_of_another_rig_brings_its_own_models(folder):
     assert [stream.robot for stream in streams.streams] == ["r1", "r2", "r3"]
 
 
-def test_more_robots_than_the_rig_had_can_be_written_and_read(tmp_path):
-    given = streams_of(with_options(load("thesis-b"), robots=7))
-    write_utias(given, tmp_path)
-    found = read(tmp_path, 7)
-    assert landmark_shift(given) == 7
-    for a, b in zip(given.streams, found.streams, strict=True):
-        assert_same_measurements(a, b, 7)
-
-
-def test_what_was_read_and_written_is_read_the_same(folder, tmp_path):
-    first = read(folder)
-    write_utias(first, tmp_path / "again")
-    second = read(tmp_path / "again")
-    assert landmark_shift(first) == 0
-    for a, b in zip(first.streams, second.streams, strict=True):
-        assert a.landmark_detections.ranges.tobytes() == b.landmark_detections.ranges.tobytes()
-        assert np.array_equal(a.stamps_ns, b.stamps_ns)
-
-
 @pytest.mark.parametrize("inside", ["", "MRSLAM_Dataset4/", "a/b/"])
 def test_a_zip_is_read_as_its_folder_whatever_the_folder_is_called(folder, tmp_path, inside):
     archive = tmp_path / "set.zip"
@@ -144,10 +124,6 @@ def test_a_zip_is_read_as_its_folder_whatever_the_folder_is_called(folder, tmp_p
     for a, b in zip(expected.streams, found.streams, strict=True):
         assert np.array_equal(a.stamps_ns, b.stamps_ns)
         assert np.array_equal(a.landmark_detections.ranges, b.landmark_detections.ranges)
-
-
-def test_the_folder_above_the_set_will_do(folder):
-    assert len(read(folder.parent).streams) == 3
 
 
 def test_odometry_acts_later_by_its_delay(folder):
@@ -174,21 +150,6 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
     assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000
 
 
-def test_a_simulated_clock_offset_is_written_as_the_odometry_stamps_it(folder, tmp_path):
-    scenario = load("waypoints")
-    off = msgspec.structs.replace(scenario.robots[0], clock_offset_s=0.25)
-    late = msgspec.structs.replace(scenario, robots=(off, *scenario.robots[1:]))
-    write_utias(streams_of(late), tmp_path / "late")
-    first = [
-        float((each / "Robot1_Odometry.dat").read_text().splitlines()[2].split()[0])
-        for each in (folder, tmp_path / "late")
-    ]
-    assert first == [0.0, 0.0], "the world began 0.25 s later, the odometry's clock reads 0 there"
-    found = utias(UtiasWorld(path=str(tmp_path / "late")), [off, *team(3)[1:]])
-    given = streams_of(late)
-    assert_same_measurements(given.streams[0], found.streams[0], 5)
-
-
 @pytest.mark.parametrize("name", ["waypoints", "downs-100"])
 def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(name, tmp_path):
     done = CliRunner().invoke(app, ["simulate", name, "-o", str(tmp_path / "set")])
@@ -205,29 +166,9 @@ def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(name, tmp_path
         assert len(before.landmark_detections.ids) == len(after.landmark_detections.ids)
 
 
-def test_a_simulated_set_that_the_format_can_not_have_is_tables(tmp_path):
-    general = tmp_path / "general.toml"
-    general.write_text(
-        'base = "waypoints"\n[world]\nodometry = "increments"\nlandmark_form = "points"\n'
-    )
-    done = CliRunner().invoke(app, ["simulate", str(general), "-o", str(tmp_path / "set")])
-    assert done.exit_code == 0, done.output
-    assert (tmp_path / "set" / "r1" / "odometry.csv").read_text().startswith("t_s,duration_s,dx_m")
-    found = streams_of(load(tmp_path / "set" / "scenario.toml")).streams
-    for before, after in zip(streams_of(load(str(general))).streams, found, strict=True):
-        assert np.array_equal(before.intervals.increments, after.intervals.increments)
-        assert np.array_equal(before.landmark_detections.points, after.landmark_detections.points)
-
-
 def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder):
     start = read(folder, start_sigma_m=0.05, start_sigma_rad=0.03).streams[0].start
     assert np.allclose(start.covariance, np.diag([0.0025, 0.0025, 0.0009]))
-
-
-def test_the_start_poses_of_a_data_set_can_be_kept_from_the_team(folder):
-    told = read(folder, unknown_starts=("*", "!r1")).streams
-    assert [each.start is None for each in told] == [False, True, True]
-    assert all(each.truth is not None for each in told)
 
 
 def test_a_start_heading_survives_the_fault_of_resampled_truth_at_the_wrap():
@@ -253,27 +194,6 @@ def test_a_cut_ends_the_whole_team_at_one_time(folder, simulated):
 
 def read_forward(stream: RobotStream) -> np.ndarray:
     return np.array([float(f"{value:.9f}") for value in stream.intervals.forward])
-
-
-def test_rows_out_of_order_are_sorted_and_counted(folder):
-    expected = read(folder).streams[0]
-    for kind in ("Odometry", "Groundtruth"):
-        edited(folder / f"Robot1_{kind}.dat", lambda rows: [*rows[:7], rows[8], rows[7], *rows[9:]])
-    found = read(folder).streams[0]
-    assert np.array_equal(found.intervals.forward, expected.intervals.forward)
-    assert np.array_equal(found.truth, expected.truth)
-    assert "1 odometry row earlier than the row before: sorted by time" in found.notes
-    assert "1 ground truth row earlier than the row before: sorted by time" in found.notes
-
-
-def test_an_odometry_row_that_lasts_no_time_is_dropped_and_counted(folder):
-    expected = read(folder).streams[0]
-    twice = "2.000000 9.0 9.0"
-    edited(folder / "Robot1_Odometry.dat", lambda rows: [*rows[:2], twice, *rows[2:]])
-    found = read(folder).streams[0]
-    assert np.array_equal(found.intervals.end_ns, expected.intervals.end_ns)
-    assert np.array_equal(found.intervals.forward, expected.intervals.forward), "the later acts"
-    assert any(note.startswith("1 odometry row dropped: another row has") for note in found.notes)
 
 
 def test_measurements_that_mean_nothing_are_dropped_and_counted(folder):
@@ -306,12 +226,6 @@ def time_of(row: str) -> float:
     return float(row.split()[0])
 
 
-def test_a_bearing_is_brought_onto_the_circle(folder):
-    edited(folder / "Robot1_Measurement.dat", lambda rows: ["0.5 106 2.0 -3.5", *rows])
-    found = read(folder).streams[0].landmark_detections
-    assert found.bearings[0] == pytest.approx(2 * np.pi - 3.5)
-
-
 def test_sightings_of_robots_outside_the_team_are_dropped_and_counted(folder):
     whole, part = read(folder, 3).streams[1], read(folder, 2).streams[1]
     met = whole.teammate_detections.ids
@@ -337,14 +251,6 @@ def test_a_robot_without_a_table_gives_what_the_other_one_has(folder, kind, lost
     assert found[1].kinds[0] == START
     assert note in found[1].notes
     assert len(found[0]) == len(expected[0])
-
-
-def test_without_its_truth_a_robots_start_is_unknown_and_it_is_said(folder):
-    (folder / "Robot2_Groundtruth.dat").unlink()
-    found = read(folder).streams
-    assert (found[1].start, found[1].truth, found[1].truth_ns) == (None, None, None)
-    assert "no ground truth at its first measurement: its start pose is not known" in found[1].notes
-    assert found[0].start is not None
 
 
 def test_a_team_maps_a_set_without_truth_and_without_one_robots_odometry(folder):
@@ -390,31 +296,6 @@ def mapped_by_waypoints(path):
     )
     world = msgspec.structs.replace(scenario.world, odometry_delay_s=0.0, duration_s=25.0)
     return msgspec.structs.replace(scenario, robots=robots, world=world)
-
-
-def test_truth_that_ends_early_is_said(folder):
-    edited(folder / "Robot2_Groundtruth.dat", lambda rows: rows[:100])
-    found = read(folder).streams[1]
-    assert len(found.truth) == 100
-    assert "ground truth ends 201 s before the odometry" in found.notes
-
-
-def test_long_gaps_are_said(folder):
-    for kind in ("Odometry", "Groundtruth"):
-        edited(folder / f"Robot1_{kind}.dat", lambda rows: rows[:20] + rows[25:])
-    notes = read(folder).streams[0].notes
-    assert "odometry has a gap of 6.0 s: its last velocities hold over it" in notes
-    assert "ground truth has gaps, the longest of 6.0 s" in notes
-
-
-def test_a_set_without_a_survey_has_no_true_landmarks_but_the_same_measurements(folder):
-    expected = read(folder)
-    (folder / "Landmark_Groundtruth.dat").unlink()
-    found = read(folder)
-    assert found.landmarks is None
-    assert len(found.landmark_ids) == 0
-    assert found.notes == ("no landmark ground truth: the map's error can not be computed",)
-    assert len(found.streams[2]) == len(expected.streams[2])
 
 
 def landmarks_seen(streams: WorldStreams) -> np.ndarray:
@@ -502,22 +383,6 @@ def test_damage_is_named_with_file_line_and_text(folder, damage, said):
     assert said in str(refused.value)
 
 
-def test_a_missing_set_is_named_and_it_is_said_what_is_expected(tmp_path):
-    with pytest.raises(DatasetError) as refused:
-        read(tmp_path / "MRCLAM1.zip")
-    assert str(refused.value).startswith(f"{tmp_path / 'MRCLAM1.zip'}: no such file or folder; ")
-    assert "It is not shipped with this program" in str(refused.value)
-    with pytest.raises(DatasetError, match="no data set given: name it with --dataset or world"):
-        streams_of(load("utias"))
-
-
-def test_a_file_that_is_no_zip_is_refused(tmp_path):
-    path = tmp_path / "set.zip"
-    path.write_text("not a zip")
-    with pytest.raises(DatasetError, match=r"set\.zip: not a zip, or a damaged one"):
-        read(path)
-
-
 def test_a_zip_with_a_damaged_member_is_refused(folder, tmp_path):
     path = tmp_path / "set.zip"
     with zipfile.ZipFile(path, "w") as target:
@@ -581,13 +446,3 @@ def test_in_the_real_set_1_landmarks_11_and_17_are_put_right():
     for landmark in (11, 17):
         assert np.percentile(np.abs(range_errors(mended, landmark)), 90) < 0.5
         assert np.percentile(np.abs(range_errors(raw, landmark)), 50) > 0.5
-
-
-def test_all_robots_of_a_set_are_read_also_beyond_five(tmp_path):
-    world = with_options(load("waypoints"), robots=6)
-    world = msgspec.structs.replace(world, world=msgspec.structs.replace(world.world, steps=3))
-    write_utias(streams_of(world), tmp_path)
-    streams, scenario, missing = open_data_set(tmp_path)
-    assert missing is None
-    assert [each.robot for each in streams.streams] == [f"r{k}" for k in range(1, 7)]
-    assert len(scenario.robots) == 6

@@ -37,14 +37,6 @@ def test_a_reference_is_proposed_as_the_truth_and_never_as_odometry(tmp_path, na
     assert "[odometry]" not in alone
 
 
-def test_columns_of_a_reference_are_no_odometry(tmp_path):
-    said = proposal(tmp_path / "a", robot="t,gt_x,gt_y,gt_yaw\n0,0,0,0\n")
-    assert "[odometry]" not in said
-    assert '[truth]\nfiles = ["robot.csv"]\n[truth.columns]\nt_s = "t"\nx_m = "gt_x"' in said
-    both = proposal(tmp_path / "b", robot="t,v,w,gt_x,gt_y,gt_yaw\n0,0,0,0,0,0\n")
-    assert 'forward_m_s = "v"\nyaw_rate_rad_s = "w"\n\n[truth]\nfiles = ["robot.csv"]' in both
-
-
 def test_odometry_is_the_wheels_own_where_there_is_a_choice(tmp_path):
     said = proposal(tmp_path / "a", a_path=TRACK, ekf_odom=TRACK, wheels=TRACK)
     assert '[odometry]\nfiles = ["wheels.csv"]' in said
@@ -86,15 +78,6 @@ def test_detections_without_identities_are_proposed_and_imported(tmp_path, form)
             jacobian = np.array([[c, s], [-s / at, c / at]])
             moved = jacobian @ np.array([[0.01, 0.002], [0.002, 0.04]]) @ jacobian.T
             np.testing.assert_allclose(packed, moved[np.triu_indices(2)], rtol=1e-12)
-
-
-def test_observations_without_identities_are_told_their_table(tmp_path):
-    (tmp_path / "odom.csv").write_text(TRACK)
-    (tmp_path / "columns.toml").write_text(
-        ODOMETRY + '[observations]\nfiles = ["cones.csv"]\n[observations.columns]\nt_s = "t"\n'
-    )
-    result = run(tmp_path, "-o", tmp_path / "set", "--columns", tmp_path / "columns.toml")
-    assert "measurements without identities are [detections]" in str(result.exception)
 
 
 def test_the_truth_of_several_robots_has_its_remedy_named(tmp_path):
@@ -157,14 +140,6 @@ def test_robots_with_other_columns_have_tables_of_their_own_in_one_map(tmp_path,
     columns.write_text(unknown.replace("[robots.eve", "[robots.Bob"))
     refused = run(logs, "-o", tmp_path / "bob", "--columns", columns)
     assert "[robots.Bob]: no robot's name" in str(refused.exception)
-
-
-def test_a_robot_whose_files_no_table_of_the_map_has_is_refused_with_its_tables(tmp_path):
-    logs, columns = team_files(tmp_path / "logs", "{robot}/{name}.csv"), tmp_path / "columns.toml"
-    columns.write_text(ODOMETRY)
-    refused = run(logs, "-o", tmp_path / "set", "--columns", columns).exception
-    assert "bob: the map names no odometry among its files" in str(refused)
-    assert '[robots.bob.odometry]\nfiles = ["wheels.csv"]' in str(refused)
 
 
 def test_a_robot_is_added_to_a_data_set(tmp_path):

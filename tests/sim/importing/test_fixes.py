@@ -75,17 +75,6 @@ def test_a_bags_fixes_become_a_table_in_the_plane_of_the_first_or_of_a_stated_da
     np.testing.assert_allclose(np.diff(moved["first"], axis=0), [[2.0, 1.0]], atol=1e-3)
 
 
-def test_the_antenna_is_where_its_frame_is(tmp_path):
-    antenna = static("/tf_static", ("base_link", "gps", ros.vector(0.8, -0.5, 1.0), LEVEL))
-    bag = ros.write_bag(tmp_path / "bag", [*antenna, *drive(), *fixes(frame="gps")])
-    assert run(bag, "-o", tmp_path / "set").exit_code == 0
-    (robot,) = load(scenario_beside(tmp_path / "set")).robots
-    assert robot.gnss.antenna == (0.8, -0.5)
-    lost = ros.write_bag(tmp_path / "lost", [*drive(), *fixes(frame="gps")])
-    result = run(lost, "-o", tmp_path / "other")
-    assert "no transform from gps to base_link: the antenna is taken to be at the" in result.output
-
-
 def test_of_two_receivers_the_user_decides_and_a_filtered_one_is_left_out(tmp_path):
     two = ros.write_bag(tmp_path / "two", [*drive(), *fixes("/left/fix"), *fixes("/right/fix")])
     refused = run(two, "-o", tmp_path / "set")
@@ -107,13 +96,3 @@ def test_fixes_of_an_added_robot_are_in_the_plane_of_the_data_set(tmp_path):
     np.testing.assert_allclose(other - one, [[30.0, 0.0], [30.0, 0.0]], atol=1e-3)
     robots = load(scenario_beside(tmp_path / "set")).robots
     assert [each.gnss.antenna for each in robots] == [(0.8, -0.5), (0.8, -0.5)]
-
-
-def test_a_robot_with_fixes_of_another_datum_is_not_added(tmp_path):
-    bag = ros.write_bag(tmp_path / "bag", [*drive(), *fixes()])
-    assert run(bag, "-o", tmp_path / "set", "--robot", "ann").exit_code == 0
-    topics = topics_with_datum(tmp_path / "topics.toml")
-    topics.write_text(topics.read_text().replace("robots.r1", "robots.bob"))
-    refused = run(bag, "-o", tmp_path / "set", "--robot", "bob", "--ros2", topics)
-    assert "its [central.datum] is not that of bob's fixes" in str(refused.exception)
-    assert not (tmp_path / "set" / "bob").exists()

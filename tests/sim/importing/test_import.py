@@ -1,8 +1,6 @@
 """`teamslam import`: bags, CSV files with names of their own and logs become the same tables."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.importing.proposal import propose_map
 from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import load, with_options
@@ -104,13 +101,6 @@ def test_tags_on_tf_are_seen_from_where_the_camera_sits(tmp_path):
     np.testing.assert_allclose([float(cell) for cell in text[1].split(",")], [1, 7, 2, 1])
     scenario = load(scenario_beside(tmp_path / "set"))
     np.testing.assert_allclose(scenario.robots[0].sensor.mount, [0.3, 0.1, 0.0], atol=1e-12)
-
-
-def test_damage_is_counted_with_the_first_message(tmp_path):
-    bad: Any = ros.cdr(ODOMETRY, drive()[0][3])[:-9]
-    bag = ros.write_bag(tmp_path / "bag", [*drive(), (3 * S, "/odom", ODOMETRY, bad)])
-    result = run(bag, "-o", tmp_path / "set")
-    assert "/odom: 1 of 4 messages dropped: damaged (first: message 4: no sound" in result.output
 
 
 def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path):
@@ -273,23 +263,6 @@ def test_names_as_labs_give_them_are_proposed(header, row, expected):
     assert [each for each in expected.split("|") if each not in text] == []
 
 
-def test_intervals_that_are_hardly_seconds_and_data_without_odometry_are_said(tmp_path):
-    odometry = tmp_path / "odometry.csv"
-    head = "t_s,forward_m_s,yaw_rate_rad_s\n"
-    odometry.write_text(head + "0,1,0\n20,1,0\n40,1,0\n")
-    assert (
-        "most rows of its odometry are 20 s apart" in run(tmp_path, "-o", tmp_path / "slow").output
-    )
-    odometry.write_text(head + "0,1,0\n0.1,1,0\n0.2,1,0\n")
-    assert "most rows of" not in run(tmp_path, "-o", tmp_path / "good").output
-    odometry.unlink()
-    (tmp_path / "observations.csv").write_text("t_s,landmark,range_m,bearing_rad\n0,7,2,0\n")
-    refused = run(tmp_path, "-o", tmp_path / "still").exception
-    assert isinstance(refused, DatasetError)
-    assert "no robot has odometry" in str(refused)
-    assert not (tmp_path / "still").exists()
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -345,18 +318,6 @@ def test_folders_of_csv_files_with_other_names_are_robots(tmp_path):
     assert "Ann: no robot's name" in str(run(logs, "-o", tmp_path / "x", *mapped).exception)
 
 
-def test_a_data_set_keeps_its_tables_and_takes_an_initial_pose(tmp_path):
-    write_folder(teams.world_of(teams.stream("r1", 3)), tmp_path / "set")
-    result = run(tmp_path / "set", "-o", tmp_path / "again", "--start", "1,2,3,0.5,0.1")
-    assert result.exit_code == 0, result.output
-    (stream,) = read(tmp_path / "again").streams
-    assert stream.start.covariance is not None
-    assert stream.start.pose.tolist() == [1, 2, 3]
-    assert np.diag(stream.start.covariance).tolist() == pytest.approx([0.25, 0.25, 0.01])
-    other = run(tmp_path / "set", "-o", tmp_path / "other", "--robot", "ann")
-    assert "--robot: " in str(other.exception)
-
-
 def test_truth_comes_from_a_trajectory_of_tum(tmp_path):
     bag = ros.write_bag(tmp_path / "bag", [m for m in drive() if "truth" not in m[1]])
     tum = tmp_path / "truth.txt"
@@ -367,30 +328,6 @@ def test_truth_comes_from_a_trajectory_of_tum(tmp_path):
     tum.write_text("0.5 1 2 0 0 0 0 1\n1.5 2 2 0 0 0 x 0\n")
     result = run(bag, "-o", tmp_path / "bad", "--truth", tum)
     assert "truth.txt, line 2: expected t x y z qx qy qz qw" in str(result.exception)
-
-
-def test_odometry_comes_from_a_trajectory_of_tum(tmp_path):
-    tum, seen = tmp_path / "wheels.tum", tmp_path / "observations.csv"
-    tum.write_text("# poses\n0 1 2 9 0 0 0 1\n1 2 2 9 0 0 1 0\n2 1 2 9 0 0 1 0\n")
-    seen.write_text("t_s,landmark,range_m,bearing_rad\n1,7,2.0,0.5\n")
-    result = run(tum, seen, "-o", tmp_path / "set")
-    assert result.exit_code == 0, result.output
-    (stream,) = read(tmp_path / "set").streams
-    assert stream.intervals.increments is not None
-    assert np.allclose(stream.intervals.increments, [[1, 0, np.pi], [1, 0, 0]])
-    assert stream.landmark_detections.ids.tolist() == [7]
-
-
-def test_a_utias_set_becomes_tables_with_the_scenario_that_runs_it(tmp_path):
-    streams = [replace(teams.stream(name, 9), teammates=("r2", "r1")) for name in ("r1", "r2")]
-    write_utias(teams.world_of(*streams), tmp_path / "utias")
-    result = run(tmp_path / "utias", "-o", tmp_path / "set")
-    assert result.exit_code == 0, result.output
-    scenario = with_options(load("utias"), dataset=tmp_path / "utias", robots=2)
-    again = load(scenario_beside(tmp_path / "set"))
-    assert again.robots == scenario.robots
-    assert again.central == scenario.central
-    assert same(read(tmp_path / "set"), streams_of(scenario))
 
 
 def test_wrong_use_is_said(tmp_path):

@@ -14,7 +14,6 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 from tests.support import ROOT
 
@@ -51,22 +50,6 @@ def test_the_thesis_team_ends_with_a_map_of_finite_values(estimator, fusion):
             consumed[name] = message.measurements
     (end,) = (opened(s)[2] for s in samples if s.key == ch.END.key())
     assert consumed == {s.robot: s.measurements for s in end.streams}
-
-
-def test_a_recorder_gets_what_it_would_get_of_processes():
-    samples = run("hybrid", "join", steps=20)
-    keys = {sample.key for sample in samples}
-    assert {"world/config", "central/config", "robot/r1/config", "world/end"} <= keys
-    assert {"robot/r1/alive", "central/alive", "truth/r1", "truth_landmarks"} <= keys
-    for sample in samples:
-        channel, _, message = opened(sample)
-        assert channel.recorded
-        assert isinstance(message, m.Message)
-
-
-def test_a_run_without_a_final_map_says_so():
-    with pytest.raises(LookupError, match="without a final map"):
-        final_map([])
 
 
 def test_a_team_pose_is_at_most_a_window_ahead_of_its_prior():

@@ -1,6 +1,5 @@
 """The plain lines of a run."""
 
-import time
 from io import StringIO
 
 import msgspec
@@ -132,40 +131,6 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
     assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
 
 
-def test_a_warning_is_printed_once_whatever_its_figures(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    out = StringIO()
-    lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=("r1",))
-    watch.statuses["world"] = status("world", "publishing", measurements=1.0, of=2.0)
-    for cost in ("8.8", "9.1", "9.4"):
-        warning = f"r5: submap 20 disagrees with the rest, cost {cost} per degree of freedom"
-        watch.statuses["central"] = status("central", "joining", warning)
-        lines.show(watch)
-    assert "submap 20" not in out.getvalue()  # it could be taken back
-    monkeypatch.setattr(live, "SETTLED_S", 0.0)
-    lines.show(watch)
-    lines.show(watch)
-    lines.end()
-    assert out.getvalue().count("submap 20 disagrees") == 1
-
-
-def test_what_is_taken_back_is_no_line_and_what_is_warned_of_in_the_end_is_one():
-    out = StringIO()
-    lines = live._Lines(Console(file=out, width=100))
-    watch = Watch(robots=("r1",), began=-1e9)
-    watch.statuses["world"] = status("world", "waiting")
-    watch.statuses["world"] = status("world", "waiting", "waiting for robot/r2")
-    lines.show(watch)
-    watch.statuses["world"] = status("world", "ended")
-    watch.statuses["central"] = status("central", "joining", "two maps disagree")
-    lines.show(watch)
-    assert "warning" not in out.getvalue()
-    lines.end()
-    said = [line for line in out.getvalue().splitlines() if "warning" in line]
-    assert [line.partition("warning: ")[2] for line in said] == ["central: two maps disagree"]
-
-
 def test_who_joins_whom_is_one_line_and_who_waits_no_warning(monkeypatch):
     lines, out = impatient(monkeypatch)
     watch = told(3)
@@ -195,21 +160,6 @@ def test_who_joins_whom_is_one_line_and_who_waits_no_warning(monkeypatch):
     assert any("not joined yet: r2: with r1 evidence 9" in line for line in printed(watch, 100))
 
 
-def test_of_warnings_that_differ_in_numbers_three_are_printed_and_old_ones_are_not(monkeypatch):
-    lines, out = impatient(monkeypatch)
-    watch = told(2)
-    for k in range(6):
-        slip = f"the odometry slipped by 0.1{k} m, -{k}° before {k}.00 s"
-        watch.statuses["robot/r1"] = build.status(node="robot/r1", warnings=(slip,))
-        lines.show(watch)
-    warnings = [line for line in out.getvalue().splitlines() if "slipped" in line]
-    assert len(warnings) == 3
-    assert warnings[-1].endswith("; more like this: in the report")
-    watch.last_message["robot/r1"] = time.monotonic() - 8.0
-    assert progress.warnings(watch) == [f"robot/r1: {slip}"]
-    assert progress.warnings(watch, silent_s=5.0) == []
-
-
 def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such():
     watch = Watch()
     watch.statuses["world"] = world = build.status(
@@ -224,12 +174,3 @@ def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such():
     assert progress.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
     watch.fused = fused_map(stamp_ns=305 * 10**9)
     assert progress.times(watch, world) == "team time 300 s"
-
-
-def test_a_run_that_has_ended_gives_the_reason():
-    watch = Watch()
-    assert watch.end_reason == "all processes have ended, without a final map"
-    watch.given_up.append("central")
-    assert watch.end_reason == "central was given up"
-    watch.fused = fused_map(final=True)
-    assert watch.end_reason == "the final map is there"

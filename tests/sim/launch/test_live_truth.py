@@ -5,12 +5,11 @@ import pytest
 from scipy.stats import chi2
 
 from teamslam.sim.launch.truth import LiveErrors
-from teamslam.sim.launch.watch import Watch
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
-from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
+from teamslam.team.wire.bus import Outgoing
 from tests import build
 from tests.sim.logs import samples
 from tests.support import fused_map
@@ -49,18 +48,6 @@ def test_the_nees_of_poses_is_against_the_truth_between_its_samples():
     tally = errors.of("r1")
     assert tally.mean == pytest.approx(np.mean(expected) / 3)
     assert tally.coverage == np.mean(np.array(expected) <= chi2.ppf(0.95, 3))
-
-
-def test_a_pose_that_comes_behind_its_truth_is_judged_too():
-    errors = LiveErrors()
-    for start in range(0, 40, 4):
-        seconds = [start + 0.5 * k for k in range(9)]
-        errors.take(ch.TRUTH, truth(seconds, line(seconds)))
-        for at in (start + 0.25, start + 1.5):
-            errors.take(ch.TEAM_POSE, pose(at, line([at])[0]))
-    assert errors.of("r1").count == 20
-    assert errors.of("r1").mean == pytest.approx(0.0, abs=1e-12)
-    assert errors.of("r1").coverage == 1.0
 
 
 def test_poses_given_the_map_replace_those_of_the_robot_alone():
@@ -105,17 +92,3 @@ def test_the_newest_map_is_judged_by_its_joint_covariance_if_there_is_one(joint)
     expected = whole @ np.linalg.solve(P, whole) / 6 if joint else np.mean(alone) / 2
     assert errors.landmarks.mean == pytest.approx(expected)
     assert errors.landmarks.count == 3
-
-
-def test_a_watch_without_truth_has_the_robots_own_figures_only():
-    bus, others = (MemoryBus(network := MemoryNetwork()), MemoryBus(network))
-    for channel in (ch.STATUS, *LiveErrors.listens):
-        bus.subscribe(channel)
-    status = build.status(node="robot/r1", figures={"nis_per_dof": 1.02}, warnings=())
-    others.publish(Outgoing(ch.STATUS, "robot/r1", status))
-    others.publish(Outgoing(ch.TEAM_POSE, "r1", pose(1.0, np.zeros(3))))
-    watch = Watch(robots=("r1",))
-    watch.take(bus)
-    assert watch.statuses["robot/r1"].figures["nis_per_dof"] == 1.02
-    assert watch.errors.of("r1").mean is None
-    assert watch.errors.of("r1").coverage is None

@@ -2,16 +2,14 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
 
 from teamslam.sim.launch import launch as launching
 from teamslam.sim.launch.launch import entered
-from teamslam.sim.launch.processes import Process, Starter
-from teamslam.sim.launch.supervision import FEW, Silence, supervise
+from teamslam.sim.launch.processes import Starter
+from teamslam.sim.launch.supervision import Silence, supervise
 from teamslam.sim.launch.supervisor import Child, Supervised, end_all
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
@@ -33,12 +31,6 @@ class Stopped(Quiet):
     """A process that does not run."""
 
     is_stopped = True
-
-
-class Busy(Quiet):
-    """A process that computes."""
-
-    is_computing = True
 
 
 class Service(Supervised):
@@ -66,40 +58,6 @@ class Team:
         self.now, known = self.now + seconds, len(self.watch.notes)
         self.silence.look(self.services, self.watch)
         return self.watch.notes[known:]
-
-
-def test_a_few_silent_processes_are_named_each_once_a_minute(monkeypatch):
-    team = Team(monkeypatch, FEW)
-    team.hears(*range(FEW))
-    assert team.after(9.0) == []
-    said = team.after(2.0)
-    assert [f"robot-r{k} (pid {100 + k}) is there and has sent no message for 11 s" in text
-            for k, text in enumerate(said)] == [True] * FEW  # fmt: skip
-    assert team.after(5.0) == [], "one line a silence"
-    team.hears(0)
-    assert team.after(11.0) == [], "it was named half a minute ago"
-    team.hears(0)
-    assert team.after(0.0) == []
-    assert len(team.after(60.0)) == 1
-
-
-def test_nobody_is_advised_to_end_a_process_that_computes(monkeypatch):
-    team = Team(monkeypatch, 2)
-    team.services[1].child = Busy(101)
-    team.hears(0, 1)
-    idle, busy = team.after(11.0)
-    assert "kill" not in idle, "a healthy process may be slow to start"
-    assert "robot-r1 (pid 101) is computing and has sent no message for 11 s" in busy
-    assert "kill" not in busy
-    team.hears(0, 1)
-    team.after(0.0)
-    team.services[0].child = Stopped(100)
-    assert team.after(11.0)[0].endswith("kill -9 100")
-    team.hears(0)
-    team.after(0.0)
-    team.services[0].child = Quiet(100)
-    team.now += 59.0
-    assert team.after(2.0)[0].endswith("kill -9 100")
 
 
 def test_of_many_silent_processes_one_line_says_how_many(monkeypatch):
@@ -162,27 +120,6 @@ def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_ha
     assert len(turns) == 4
     assert turns[-1] == ["operator.pem has expired"]
     assert all(service.over for service in services)
-
-
-BALLAST_BYTES = 200_000_000
-WAITS = "print('ready', flush=True); input()"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a share of memory")
-def test_the_peak_of_a_process_is_its_own_and_not_that_of_who_started_it():
-    ballast = bytearray(b"x") * BALLAST_BYTES
-    started = subprocess.Popen(
-        [sys.executable, "-S", "-c", WAITS], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    with started.stdin, started.stdout:
-        process = Process(started)
-        assert started.stdout.readline() == b"ready\n"
-        process.measure()
-        started.stdin.write(b"\n")
-    assert process.wait(20.0)
-    assert len(ballast) == BALLAST_BYTES
-    assert process.used.pss_mb is not None
-    assert 1.0 < process.used.pss_mb < process.used.peak_rss_mb < 100.0
 
 
 def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(

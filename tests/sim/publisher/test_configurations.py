@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.publisher.configurations import Configurations, differences
+from teamslam.sim.publisher.configurations import Configurations
 from teamslam.sim.publisher.main import expected_configurations
 from teamslam.sim.publisher.node import WorldNode, expected_nodes
 from teamslam.sim.scenarios.scenario import load, with_options
@@ -80,22 +80,6 @@ def test_a_robot_that_is_not_in_the_scenario_is_named():
     assert not configurations.forbid, "whoever that is, the team does not wait for it"
     (warning,) = configurations.mismatches
     assert warning.startswith("robot/r9 is not in the world's scenario, which has central, robot/r")
-
-
-def test_where_nothing_is_expected_nothing_is_compared():
-    configurations = Configurations({})
-    configurations.take(expected_configurations(SCENARIO)["robot/r1"])
-    assert configurations.mismatches == ()
-    assert configurations.unheard(["robot/r1"]) == []
-
-
-def test_differences_are_named_at_every_depth():
-    one, two = '{"a": {"b": 1, "c": []}, "d": null}', '{"a": {"b": 2, "c": []}, "e": {}}'
-    assert differences(one, two) == [
-        "a.b is 1 there and 2 here",
-        "d is null there and absent here",
-        "e is absent there and {} here",
-    ]
 
 
 def test_what_a_team_of_the_scenario_announces_is_what_is_expected():

@@ -1,9 +1,5 @@
 """The world's node: order, credit, and answers to requests for missed measurements."""
 
-from dataclasses import replace
-from itertools import pairwise
-
-import msgspec
 import numpy as np
 import pytest
 
@@ -13,9 +9,8 @@ from teamslam.team.driver import source
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
-from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
-from tests.support import fused_map
 from tests.teams import of, stream, world_of
 
 SCENARIO = build.configuration(node="world", incarnation=0)
@@ -73,19 +68,6 @@ def test_measurements_come_by_stamp_then_robot_and_count_from_0():
         assert [r.number for r in mine] == list(range(len(each)))
         assert {r.incarnation for r in mine} == {1}
         assert isinstance(mine[0], m.InitialPose)
-
-
-def test_a_batch_spans_no_more_than_it_may():
-    node = world(batch_s=0.4)
-    batches = []
-    while not node.ended:
-        batches.append([r.stamp_ns for r in measurements(node.publish(0.0))])
-    in_order = [stamp_ns for batch in batches for stamp_ns in batch]
-    assert in_order == [r.stamp_ns for r in measurements(all_of(world()))]
-    assert all(batches)
-    assert max(max(batch) - min(batch) for batch in batches) < 400_000_000
-    for batch, later in pairwise(batches):
-        assert min(later) - min(batch) >= 400_000_000
 
 
 def test_every_message_is_on_its_channel_and_passes_the_door():
@@ -173,31 +155,6 @@ def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(m
         assert node.unrecorded == 0, "who is not there is not waited for"
 
 
-def test_who_holds_the_team_up_is_named(monkeypatch):
-    monkeypatch.setattr(world_node, "CREDIT_MEASUREMENTS", 5)
-    node = world()
-    alive(node, "robot/r1")
-    for clock in (0.0, 4.0):
-        node.publish(clock)
-        assert node.status().warnings == ()
-    node.publish(6.0)
-    assert node.status().warnings == ("robot/r1 blocks the team: no progress for 6 s",)
-    node.handle(progress("r1", 5), 0)
-    node.publish(7.0)
-    assert node.status().warnings == ()
-
-
-def test_at_a_given_speed_it_publishes_what_is_due():
-    node = world(speed=2.0)
-    last = [max((r.stamp_ns for r in measurements(node.publish(100.0))), default=None)]
-    for clock in (100.25, 101.0, 102.0):
-        due = measurements(node.publish(clock))
-        assert all(r.stamp_ns <= (clock - 100.0) * 2e9 for r in due)
-        last.append(max((r.stamp_ns for r in due), default=None))
-    assert last == [0, None, 2_000_000_000, 4_000_000_000]
-    assert not node.ended
-
-
 def wanted(node, robot="r1", incarnation=1, first=0, last=-1):
     return list(
         node.measurements(
@@ -231,11 +188,6 @@ def test_only_what_was_published_is_answered_and_in_portions(monkeypatch):
         assert len(part) <= 3
         got += part
     assert got == out
-
-
-def test_a_query_that_is_damaged_is_an_error_that_says_so():
-    with pytest.raises(WireError):
-        list(world().measurements(b"\x93nonsense"))
 
 
 def test_who_asks_for_what_is_no_longer_kept_gets_a_new_incarnation_at_a_free_pose(monkeypatch):
@@ -287,29 +239,6 @@ def test_the_truth_comes_whole_in_batches_and_on_its_own_channels_only():
     assert others == {"truth", "truth_landmarks"}
 
 
-def test_without_truth_there_is_none():
-    silent = (replace(s, truth=None, truth_ns=None) for s in STREAMS.streams)
-    node = world(
-        replace(
-            STREAMS,
-            landmark_ids=np.zeros(0, np.uint32),
-            landmarks=None,
-            streams=tuple(silent),
-        )
-    )
-    out = [*node.begin(), *all_of(node)]
-    assert not [o for o in out if o.channel in (ch.TRUTH, ch.TRUTH_LANDMARKS)]
-
-
-def test_it_is_finished_with_the_final_map():
-    node = world()
-    fused = fused_map(frame="")
-    node.handle(fused, 0)
-    assert not node.finished
-    node.handle(msgspec.structs.replace(fused, final=True), 0)
-    assert node.finished
-
-
 def again(r1: int, r2: int, recorder=None, **options):
     """A world that is started anew while its robots have so many measurements."""
     expected = expected_nodes(["r1", "r2"], recorder=recorder is not None)
@@ -336,20 +265,6 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
         m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
     )
     assert [decoded(reply).number for reply in node.measurements(request)] == list(range(26))
-
-
-def test_a_world_that_is_started_again_gives_the_recorder_what_it_lacks():
-    out = measurements(all_of(again(7, 5, recorder=3)))
-    assert min(r.number for r in out if not isinstance(r, m.InitialPose)) == 3
-
-
-def test_a_world_that_is_started_again_is_paced_from_where_it_goes_on():
-    node = again(12, 12, speed=2.0)
-    first = [r for r in measurements(node.publish(100.0)) if not isinstance(r, m.InitialPose)]
-    begins_ns = min(r.stamp_ns for r in first)
-    assert begins_ns > 4_000_000_000
-    later = measurements(node.publish(101.0))
-    assert max(r.stamp_ns for r in later) == begins_ns + 2_000_000_000
 
 
 def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_ever():

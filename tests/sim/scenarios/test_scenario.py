@@ -20,9 +20,6 @@ from teamslam.team import former_names
 from teamslam.team.association import AssociationProfile
 from teamslam.team.driver.measurement_messages import MeasurementError, observations
 from teamslam.team.pairs import PAIRS
-from teamslam.team.wire import messages as m
-from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import configured
 from tests import build
 
 SMALL = """
@@ -72,11 +69,6 @@ def test_a_users_file_is_named_after_itself_and_may_change_a_built_in_one(tmp_pa
     assert len(scenario.world.landmarks) == 18
     assert [robot.sensor.range_sigma for robot in scenario.robots] == [1.0] * 4
     assert scenario.robots[0].sensor.bearing_sigma == load("thesis").robots[0].sensor.bearing_sigma
-
-
-def test_a_data_sets_path_is_relative_to_the_file_that_names_it(tmp_path):
-    scenario = load(written(tmp_path, 'base = "utias"\nworld = { path = "set2.zip" }\n'))
-    assert Path(scenario.world.path) == tmp_path / "set2.zip"
 
 
 def test_a_command_line_changes_what_it_names_and_nothing_else():
@@ -197,12 +189,6 @@ def test_a_mistake_in_a_file_is_named_with_file_place_and_remedy(tmp_path, text,
     assert said in str(refused.value)
 
 
-def test_a_small_place_is_one_where_robots_have_paths_or_few_way_points(tmp_path):
-    small = "robot_count = 1\n" + SMALL + "size_m = 1.0\n"
-    load(written(tmp_path, small + "paths = [[[0, 0], [1, 1]]]"))
-    load(written(tmp_path, small + "way_point_count = 3"))
-
-
 def test_a_folder_is_no_scenario_and_may_be_a_data_set(tmp_path):
     with pytest.raises(ScenarioError, match=r"a folder, .* a data set goes with --dataset"):
         load(tmp_path)
@@ -225,11 +211,6 @@ def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path):
     noisy = "[[robots]]\nmotion = { turn = { per_rad = 0.1 } }\n[[robots]]\n"
     (said,) = scenario_warnings(load(written(tmp_path, SMALL + noisy)))
     assert said.startswith("r2: odometry without noise")
-
-
-@pytest.mark.parametrize("name", builtin_names())
-def test_a_built_in_scenario_is_not_doubted(name):
-    assert scenario_warnings(load(name)) == []
 
 
 def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor():
@@ -264,13 +245,6 @@ def test_a_logs_configurations_with_former_names_are_read_with_todays():
     announced = build.configuration(node="robot/r1", configuration=former)
     recorded = Recorded(configured={announced.node: announced})
     assert recorded.robot_config("r1") == (today, announced.digest)
-
-
-def test_the_scenario_of_a_team_of_a_hundred_robots_is_understood_on_the_wire():
-    scenario = with_options(load("dlr"), robots=100)
-    announced = configured("world", 0, 0, scenario)
-    heard = decoded(encoded(announced), m.Configuration)
-    assert loads(heard.configuration) == scenario
 
 
 def test_a_file_that_is_not_there_is_told_as_a_file(tmp_path):

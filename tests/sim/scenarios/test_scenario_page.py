@@ -100,9 +100,3 @@ def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path):
     file = tmp_path / "waypoints.toml"
     file.write_text(shown.stdout, encoding="utf-8")
     assert load(file) == load("waypoints")
-
-
-def test_a_scenario_that_is_not_built_in_can_not_be_shown():
-    refused = CliRunner().invoke(app, ["scenarios", "--show", "thesis-c"])
-    assert refused.exit_code == 2
-    assert "thesis, thesis-b, utias" in refused.stderr

@@ -85,15 +85,6 @@ def test_forms_that_do_not_fit_are_named():
         simulated(steered, [RobotConfig("r1")], 1)
 
 
-def test_a_car_never_turns_on_the_spot():
-    car = MotionModel("ackermann", wheel_base=2.0)
-    world = simulated(WORLD, [RobotConfig("r1", motion=car)], 1)
-    truth = world.streams[0].truth
-    turns = np.abs(np.angle(np.exp(1j * np.diff(truth[:, 2]))))
-    chords = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    assert np.all(turns <= chords / 3.0 + 1e-2)
-
-
 def streams(form: str, identities: str):
     """Waypoints whose sensors claim the covariance of each measurement, in a form."""
     scenario = load("waypoints")
@@ -136,21 +127,3 @@ def landmarks(**fields) -> np.ndarray:
     found = simulated(world, (ROBOT,), 3).landmarks
     assert found is not None
     return found
-
-
-def test_of_twins_each_has_another_one_beside_it():
-    at = landmarks(landmark_count=12, layout="twins", twin_m=0.7)
-    away = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
-    np.fill_diagonal(away, np.inf)
-    assert len(at) == 12
-    assert np.allclose(np.diag(away[:6, 6:]), 0.7)
-    assert (away.min(axis=1) <= 0.7 + 1e-9).all()
-
-
-def test_rooms_are_all_alike():
-    at = landmarks(landmark_count=27, layout="rooms", rooms=3).reshape(9, 3, 2)
-    corners = np.round((at - at[0]).mean(axis=1), 9)
-    assert (at - corners[:, None] - at[0] < 1e-9).all()
-    assert sorted(map(tuple, corners.tolist())) == [
-        (10.0 * i, 10.0 * j) for i in range(3) for j in range(3)
-    ]

@@ -10,7 +10,6 @@ from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.rules.team_keyframes import TeamKeyframes
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.odometry import measured_speeds
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
@@ -87,16 +86,6 @@ def test_a_filter_with_another_model_is_found_out(name, wrong):
     assert not moments_agree(whitened(MODELS[name], other))
 
 
-def test_wheels_that_differ_make_errors_of_way_and_turn_that_go_together():
-    steps = np.tile([1.0, 0.0], (4000, 1))
-    normals = np.random.default_rng(1).standard_normal((4000, 2))
-    forward, yaw_rate = measured_speeds(
-        MODELS["wheels"], steps, np.ones(4000), np.zeros((4000, 2)), normals
-    )
-    expected = (0.012**2 - 0.004**2) / (0.012**2 + 0.004**2)
-    assert np.corrcoef(forward, yaw_rate)[0, 1] == pytest.approx(expected, abs=0.03)
-
-
 def mixed_team(**of_first: object) -> Scenario:
     """Three robots of three kinds, and a short world with enough landmarks."""
     sensors = (Sensor(), Sensor(range_sigma=0.3), Sensor(range_sigma_per_m=0.02))
@@ -159,17 +148,6 @@ def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
 
 def cost_per_dof(of: m.FusedMap) -> float:
     return of.chi2 / of.dof
-
-
-def test_a_centre_that_takes_raw_measurements_puts_the_clock_right_too():
-    exact, off = (
-        team_keyframes(each.robots[0], streams_of(each))
-        for each in (mixed_team(), mixed_team(clock_offset_s=-0.75))
-    )
-    assert len(exact) == 120
-    assert exact == off
-    ignorant = team_keyframes(mixed_team().robots[0], streams_of(mixed_team(clock_offset_s=-0.75)))
-    assert ignorant != exact
 
 
 def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:

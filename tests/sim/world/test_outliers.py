@@ -8,7 +8,7 @@ from scipy.stats import kstest
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
-from tests.sim.world.test_simulator import content, true_detections
+from tests.sim.world.test_simulator import content
 
 
 def world_with(outlier_share: float, kind: str, name: str = "thesis-b") -> WorldStreams:
@@ -58,30 +58,6 @@ def test_a_spoilt_measurement_is_uniform_over_what_can_be_seen(clean):
     assert kstest((joined(clean, "ranges") - 3.0) / 17.0, "uniform").pvalue < 1e-3
 
 
-def test_a_spoilt_identity_is_any_other_landmarks(clean):
-    was, is_now = joined(clean, "ids"), joined(world_with(1.0, "identity"), "ids")
-    assert not np.any(was == is_now)
-    ahead = np.bincount((is_now.astype(int) - was.astype(int)) % 18, minlength=18)[1:]
-    assert ahead.min() > 0.8 * len(was) / 17
-    assert ahead.max() < 1.2 * len(was) / 17
-
-
 def test_a_world_without_outliers_is_as_it_was_whatever_its_kind(clean):
     for before, after in zip(clean.streams, world_with(0.0, "drop").streams, strict=True):
         assert content(before) == content(after)
-
-
-def test_without_limits_of_sight_outliers_lie_within_the_place():
-    scenario = load("waypoints")
-    world = msgspec.structs.replace(
-        scenario.world, outlier_share=1.0, visible_to_m=None, visible_from_m=None, steps=50
-    )
-    for stream in streams_of(msgspec.structs.replace(scenario, world=world)).streams:
-        assert stream.landmark_detections.ranges.max() <= 100.0 * np.sqrt(2.0)
-
-
-def test_the_measurements_that_stay_are_true():
-    world = world_with(0.3, "drop")
-    for stream in world.streams:
-        true_range, _ = true_detections(stream, world.landmarks)
-        assert np.abs(stream.landmark_detections.ranges - true_range).max() < 6 * 0.2

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chi2, kstest
+from scipy.stats import chi2
 
-from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.paths import Limits, driven, followed, moved, wrapped
@@ -20,11 +19,8 @@ from teamslam.sim.world.streams import (
     START,
     RobotStream,
     WorldStreams,
-    grouped,
 )
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats
 
 angles = st.floats(-np.pi, np.pi)
 
@@ -64,31 +60,6 @@ def test_measurements_are_numbered_by_time_with_what_was_seen_before_the_interva
     assert order == sorted(order)
     assert np.count_nonzero(stream.kinds == ODOMETRY) == 500
     assert np.count_nonzero(stream.kinds == OBSERVATIONS) == 500, "empty messages too"
-
-
-def test_a_source_makes_the_message_of_a_counter():
-    stream = world_of(load("thesis")).streams[0]
-    source = Source(stream)
-    messages = [source.message(i) for i in range(len(stream))]
-    odometry = [each for each in messages if isinstance(each, m.Odometry)]
-    assert [each.stamp_ns for each in odometry] == [10**9 * k for k in range(1, 501)]
-    assert {each.duration_ns for each in odometry} == {10**9}
-    assert odometry[6].forward == stream.intervals.forward[6]
-    seen = [floats(each.bearings, "") for each in messages if isinstance(each, m.Observations)]
-    assert np.array_equal(np.concatenate(seen), stream.landmark_detections.bearings)
-    met = next(each for each in messages if isinstance(each, m.Sightings))
-    assert met.teammates == ("r2",)
-    assert 3.0 - 8.0 < floats(met.ranges, "")[0] < 20.0 + 8.0
-    assert isinstance(messages[0], m.InitialPose)
-
-
-def test_the_teams_order_is_by_stamp_and_keeps_each_robots_order():
-    world = world_of(load("waypoints"))
-    stream, counter = world.order()
-    stamps = [world.streams[s].stamps_ns[c] for s, c in zip(stream, counter, strict=True)]
-    assert stamps == sorted(stamps)
-    for i, each in enumerate(world.streams):
-        assert np.array_equal(counter[stream == i], np.arange(len(each)))
 
 
 def test_the_thesis_world_is_the_one_that_the_figures_were_measured_in():
@@ -209,15 +180,6 @@ def test_a_sensor_is_simulated_with_its_calibration_and_field_of_view():
     assert 28.0 < true_range.max() <= 30.0
 
 
-def test_what_a_sensor_gives_is_a_range_and_a_bearing():
-    sensor = Sensor(range_sigma=20.0, bearing_sigma=3.0, max_range=40.0)
-    world = SimulatedWorld(steps=100, landmark_count=50)
-    seen = simulated(world, [RobotConfig(id="r1", sensor=sensor)], 3).streams[0].landmark_detections
-    assert seen.ranges.min() == 0.05
-    assert -np.pi < seen.bearings.min() < -3.0
-    assert 3.0 < seen.bearings.max() <= np.pi
-
-
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_other_noise():
     first, again, other = (world_of(load("waypoints"), seed) for seed in (5, 5, 6))
     assert [content(s) for s in first.streams] == [content(s) for s in again.streams]
@@ -236,12 +198,6 @@ def test_a_further_robot_changes_nothing_of_the_others(name):
         assert np.array_equal(
             after.teammate_detections.ranges[known], before.teammate_detections.ranges
         )
-
-
-def test_two_robots_with_the_same_model_have_different_noise():
-    first, second = world_of(load("thesis")).streams
-    noise = [s.intervals.forward - true_steps(s.truth, MotionModel())[0] for s in (first, second)]
-    assert abs(np.corrcoef(noise)[0, 1]) < 0.2
 
 
 def test_a_start_pose_is_exact_or_not_told_at_all():
@@ -276,18 +232,6 @@ def test_a_slip_moves_the_robot_and_is_in_no_odometry():
         assert (b[0] - x) * np.cos(heading) + (b[1] - y) * np.sin(heading) == pytest.approx(0.0)
     assert inside_two_sided(np.array(aside) / 0.2)
     assert inside_two_sided(np.array(turned) / 0.02)
-
-
-def test_logged_values_are_such_that_the_scales_put_them_right():
-    scaled = MotionModel(kind="turn-then-drive", forward_scale=1.25, yaw_scale=0.8)
-    plain = MotionModel(kind="turn-then-drive")
-    world = SimulatedWorld(steps=50)
-    a, b = (
-        simulated(world, [RobotConfig(id="r1", motion=motion)], 1).streams[0].intervals
-        for motion in (scaled, plain)
-    )
-    assert np.allclose(a.forward * 1.25, b.forward)
-    assert np.allclose(a.yaw_rate * 0.8, b.yaw_rate)
 
 
 @settings(deadline=None, max_examples=50)
@@ -329,24 +273,6 @@ def test_a_driven_robot_reaches_its_way_points_within_its_limits_and_then_stands
     assert np.all(drive.steps[-10:] == 0.0)
 
 
-def test_random_way_points_lead_through_the_place_and_not_far_out_of_it():
-    robots = [RobotConfig(id=f"r{i}") for i in range(1, 6)]
-    for stream in simulated(SimulatedWorld(steps=2000, size_m=40.0), robots, 2).streams:
-        assert stream.truth[:, :2].min() > -3.0
-        assert stream.truth[:, :2].max() < 43.0
-        assert np.all(np.ptp(stream.truth[:, :2], axis=0) > 25.0)
-
-
-def test_measurements_of_one_stamp_are_one_message():
-    stamps = np.array([5, 5, 7, 9, 9, 9])
-    ids = np.arange(6, dtype=np.uint32)
-    seen = grouped(stamps, ids, np.arange(6.0), np.zeros(6))
-    assert seen.stamps_ns.tolist() == [5, 7, 9]
-    assert [seen.ids[seen.rows(i)].tolist() for i in range(3)] == [[0, 1], [2], [3, 4, 5]]
-    nothing = grouped(stamps[:0], ids[:0], np.zeros(0), np.zeros(0))
-    assert (len(nothing.stamps_ns), nothing.offsets.tolist()) == (0, [0])
-
-
 def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:
     """Normalised (range, bearing) errors of a standing robot, a row per step, by landmark."""
     world = SimulatedWorld(steps=4000, step_s=0.5, landmark_count=12, paths=(((0, 0), (1e-9, 0)),))
@@ -383,12 +309,6 @@ def test_errors_that_persist_have_the_declared_variance_share_and_time():
     assert abs(apart) < 0.06, "each landmark has an error of its own"
 
 
-def test_errors_are_white_where_nothing_else_is_declared():
-    assert correlation(errors_by_landmark(Sensor()), 1) == pytest.approx(0.0, abs=0.03)
-    no_time = Sensor(range_white=0.2, range_correlation_s=0.0)
-    assert correlation(errors_by_landmark(no_time), 1) == pytest.approx(0.0, abs=0.03)
-
-
 @pytest.mark.parametrize("name", ["downs-10", "downs-100"])
 def test_downs_world_is_a_disc_seen_through_an_arc(name):
     scenario = load(name)
@@ -402,28 +322,6 @@ def test_downs_world_is_a_disc_seen_through_an_arc(name):
     assert np.abs(true_bearing).max() <= np.pi / 8
     assert stream.landmark_detections.stamps_ns[0] == 0, "an observation before any motion"
     assert np.array_equal(stream.truth[0], np.zeros(3))
-
-
-def test_the_radius_of_a_discs_places_is_uniform_not_their_density():
-    world = SimulatedWorld(steps=1, radius_m=30.0, landmark_count=4000)
-    landmarks = simulated(world, [RobotConfig("r1")], 2).landmarks
-    radius = np.hypot(*landmarks.T) / 30.0
-    assert kstest(radius, "uniform").pvalue > 1e-3
-    assert kstest(radius**2, "uniform").pvalue < 1e-9
-    assert kstest(np.arctan2(*landmarks.T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
-
-
-def test_in_downs_world_a_step_turns_or_drives_and_the_hundredth_way_point_ends_it():
-    scenario = load("downs-10")
-    (stream,) = world_of(scenario).streams
-    chord = np.hypot(*np.diff(stream.truth[:, :2], axis=0).T)
-    turned = np.angle(np.exp(1j * np.diff(stream.truth[:, 2])))
-    assert not np.any((chord > 1e-9) & (np.abs(turned) > 1e-9))
-    assert chord.max() <= 1.0 + 1e-12
-    turning = np.flatnonzero(np.abs(turned) > 1e-9)
-    assert 90 <= len(turning) <= 110, "about one turn for each way-point"
-    assert len(stream.intervals.end_ns) < scenario.world.steps
-    assert chord[-1] > 0.0
 
 
 def true_detections_from_start(
