@@ -55,14 +55,6 @@ class Live:
         return self.centre.final
 
 
-def test_the_team_has_ended_when_every_driver_has():
-    team = Live("r1", "r2").robot("r1")
-    assert team.final is None
-    assert team.centre.awaited == ["r2"]
-    team.robot("r2")
-    assert (team.final.final, team.final.provisional, team.final.lost) == (True, False, ())
-
-
 def test_a_driver_that_comes_back_is_waited_for_again():
     team = Live("r1", "r2").robot("r1").tell(begun("r1", 2)).robot("r2")
     assert team.final is None
@@ -155,18 +147,3 @@ def test_a_robot_that_is_told_to_end_waits_for_its_driver_and_ends_without_one()
     (done,) = of(out, ch.ROBOT_DONE)
     assert done.measurements == len(measured)
     assert of(out, ch.ROBOT_HEAD) == [head("r1", len(measured))]  # when its driver has gone
-
-
-def test_a_robot_goes_on_with_a_driver_that_had_ended_and_comes_back():
-    node, measured = robot_with(len(STREAMS["r1"]))
-    (first,) = of(node.handle(head("r1", len(measured)), 0), ch.ROBOT_DONE)
-    out = node.handle(begun("r1", 2), 0) + node.handle(head("r1", 1, incarnation=2), 0)
-    dones = of(out, ch.ROBOT_DONE)
-    assert [done.incarnation for done in dones] == [2, 1]
-    assert dones[1].submaps == first.submaps
-
-
-def test_an_end_before_what_was_consumed_and_a_head_of_another_are_refused():
-    node, _ = robot_with(9)
-    assert "has consumed 9" in node.refusal(head("r1", 3))
-    assert node.refusal(head("r2", 30)) == "how far r2 is"

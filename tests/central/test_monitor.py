@@ -79,27 +79,12 @@ def test_covariances_that_are_too_large_are_reported_of_the_final_map_only():
         assert "covariance_scale" in found.figures
 
 
-@pytest.mark.parametrize("factor", [1.0 / 25.0, 25.0])
-def test_no_loss_bounds_the_covariance_scale(factor):
-    found = watched(0, with_covariance_times(factor, lambda _: True), ROBUST)
-    assert found.figures["covariance_scale"] == pytest.approx(1.0 / factor, rel=0.4)
-    (team,) = found.misscaled
-    assert (team.robot, team.value) == ("", found.figures["covariance_scale"])
-
-
 def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
     shifted = with_landmarks_moved(10.0, lambda c: c.sequence % 5 == 0)
     clean, spoilt = watched(3, settings=ROBUST), watched(3, shifted, ROBUST)
     of = "covariance_scale"
     assert spoilt.figures[of] == pytest.approx(clean.figures[of], rel=0.35)
     assert not spoilt.misscaled
-
-
-def test_a_profile_says_which_scale_is_normal():
-    small = with_covariance_times(2.0, lambda _: True)
-    found = watched(0, small, normal=0.5)
-    assert found.figures["covariance_scale"] == pytest.approx(1.0, rel=0.25)
-    assert not found.misscaled
 
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])
@@ -111,7 +96,3 @@ def test_the_covariance_scale_of_drawn_terms_is_theirs(dof, scale):
     logs = np.log([each.value for each in found])
     assert np.mean(logs) == pytest.approx(np.log(scale), abs=0.04)
     assert 0.7 < np.std(logs) / found[0].log_sigma < 1.3
-
-
-def test_terms_without_freedom_say_nothing_of_the_scale():
-    assert covariance_scale(np.array([0.1, 7.0]), np.array([0.2, 0.9])) is None

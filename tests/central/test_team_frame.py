@@ -205,14 +205,6 @@ def test_a_robot_whose_submap_comes_before_the_anchored_ones_withdraws_its_team_
         assert (driver.team_pose is not None) == there
 
 
-def test_a_robot_that_joins_a_frame_of_a_larger_name_gives_it_no_other_name():
-    team = Team({"alpha": (False, False), "bravo": (True, False)})
-    run_to_the_end(team, "bravo", "alpha")
-    assert team.map.joined
-    assert team.map.frame == "bravo/1", "alpha's start does not fix it"
-    assert team.poses["alpha"].in_team_frame
-
-
 def test_poses_are_taken_back_where_only_the_final_map_has_another_frame():
     team = Team({"alpha": (False, False), "bravo": (False, False)})
     run_to_the_end(team, "alpha", "bravo")
@@ -279,12 +271,3 @@ def test_a_restarted_process_withdraws_what_the_one_before_it_has_claimed(restar
     for submap in [o.message for o in team.log if o.channel is ch.SUBMAP and o.name == "bravo"]:
         team.to_centre(submap)
     assert not team.poses["bravo"].in_team_frame
-
-
-def test_a_prior_that_withdraws_contains_no_estimate():
-    prior = build.prior(
-        robot="alpha", sequence=-1, ids=b"", mean=b"", frame="alpha/1", in_team_frame=False
-    )
-    prior.check()
-    with pytest.raises(ValueError, match="contains an estimate"):
-        msgspec.structs.replace(prior, mean=bytes(24)).check()

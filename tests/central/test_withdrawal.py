@@ -332,11 +332,6 @@ def test_a_robot_that_is_wrong_is_withdrawn_with_outliers_too(kind):
     assert final_map(run(with_outliers(kind, 3), "odometry")).withdrawn == ("r3",)
 
 
-def test_a_robot_whose_withdrawal_only_an_operator_may_order_stays():
-    samples = tuple(run(scenario(withdraw_above=None), "odometry"))
-    assert final_map(list(samples)).withdrawn == ()
-
-
 def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(tmp_path):
     log = written(tmp_path / "log.mcap", list(team_run("odometry")))
     result = verify(log)
@@ -375,33 +370,6 @@ def test_where_two_robots_contradict_themselves_the_team_is_not_folded_without_e
 
     assert hold_trial(without(()), 4.0, without).robot is None
     assert {len(robots) for robots in asked[1:]} == {2}
-
-
-def test_who_is_wrong_is_whose_absence_makes_the_rest_agree():
-    without = {
-        frozenset({"a"}): agreement(b=9.0, c=8.0),
-        frozenset({"b"}): agreement(a=1.0, c=1.2),
-    }
-    assert verdict(without, a=9.5, b=9.0, c=3.0) == "b"
-
-
-def test_nobody_is_wrong_where_the_rest_never_agree():
-    without = {frozenset({r}): agreement(**{o: 3.0 for o in "abc" if o != r}) for r in "abc"}
-    assert verdict(without, a=9.5, b=9.0, c=6.0) is None
-
-
-def test_of_two_that_disagree_the_one_that_contradicts_itself_is_wrong():
-    without = {frozenset({"a"}): agreement(b=1.0), frozenset({"b"}): agreement(a=1.0)}
-    assert verdict(without, a=9.0, b=9.0) is None
-    without[frozenset({"b"})] = agreement(a=6.0)
-    assert verdict(without, a=9.0, b=9.0) == "a"
-
-
-def test_a_few_bad_submaps_do_not_make_a_robot_suspect():
-    costs = list(agreement(a=1.0).submaps)
-    costs[:4] = [each._replace(chi2=500.0) for each in costs[:4]]
-    assert disagreement(Agreement(0.0, 1.0, {}, tuple(costs)))["a"] < 2.0
-    assert np.isclose(disagreement(agreement(a=3.0))["a"], 3.0 * 0.98)
 
 
 def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():

@@ -70,16 +70,6 @@ def test_all_agree_whatever_one_has_published_before():
     assert found.agreed.payload == encoded(TRUE)
 
 
-def test_a_forgery_is_nobodys_map_until_all_have_it():
-    """Not one robot's word, nor that of all but one."""
-    early = judged(final("r1", FORGED), concluded("r1", FORGED))
-    assert early.agreed is None
-    for robot in ("r1", "r2"):
-        for each in (final(robot, FORGED), concluded(robot, FORGED)):
-            early.take(each)
-    assert early.agreed is None
-
-
 @pytest.mark.parametrize(
     ("behind", "told"),
     [
@@ -115,11 +105,6 @@ def test_a_map_that_calls_the_others_lost_excuses_nobody():
     assert judged(final("r1", alone), concluded("r1", alone)).agreed is None
 
 
-def test_an_older_conclusion_replaces_no_later_one():
-    found = judged(*HONEST, concluded("r1", TRUE, 3), concluded("r1", FORGED, 2))
-    assert found.disagreement == ()
-
-
 def test_a_robots_own_map_is_nothing_in_a_team_with_a_centre():
     attack = [final("r1", FORGED), concluded("r1", FORGED)]
     evaluation = evaluate([scenario(peers=False), *attack])
@@ -129,14 +114,6 @@ def test_a_robots_own_map_is_nothing_in_a_team_with_a_centre():
     evaluation = evaluate([scenario(peers=False), *attack, centre, *attack])
     assert evaluation.map is not None
     assert to_json(evaluation)["final_map_sha256"] == hashlib.sha256(encoded(TRUE)).hexdigest()
-
-
-@pytest.mark.parametrize("told", [True, False], ids=["by its robots", "by the scenario"])
-def test_no_message_of_a_robot_about_the_map_is_shown_in_a_team_with_a_centre(told):
-    centre = PeersAsCentre(() if told else None)
-    running = msgspec.structs.replace(FORGED, final=False)
-    samples = [sample(ch.TEAM_MAP, "r1", running), final("r1", FORGED), concluded("r1", FORGED)]
-    assert [centre.of(each) for each in (scenario(peers=False), *samples)] == [None] * 4
 
 
 def test_a_viewer_is_given_the_final_map_once_and_when_all_have_it():

@@ -1,16 +1,13 @@
 """Robots' clocks in results and while a team runs."""
 
-from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.clocks import (
     BEYOND_DOUBT,
-    Late,
     Timed,
     lateness,
     separate_times_warning,
@@ -86,17 +83,6 @@ def test_a_wrong_mount_is_not_taken_for_a_late_clock(late):
     robot = RobotConfig("r1", sensor=Sensor(mount=(0.3, 0.1, 0.1), range_offset=0.1))
     found = lateness(timed_of(late, "r1"), robot)
     assert abs(found.offset_s) < 3.0 * found.sigma_s
-
-
-def test_a_late_clock_of_the_map_that_the_measurements_exclude_is_no_cause(late):
-    """Windows bent by a wrong scale of the odometry look like late ones."""
-    result = evaluate(late)
-    found = m.Diagnosis(cause="clock_offset", robot="r1", value=(0.12,), sigma=(0.01,))
-    other = msgspec.structs.replace(found, robot="r2")
-    of_map = replace(result.map, diagnosis=(found, other))
-    assert replace(result, map=of_map).diagnosis == (other,)
-    uncertain = {**result.lateness, "r1": Late(0.0, 0.1)}
-    assert replace(result, map=of_map, lateness=uncertain).diagnosis == (found, other)
 
 
 def test_clocks_that_are_right_are_not_mentioned(tmp_path):
@@ -190,7 +176,3 @@ def test_who_lags_or_replays_is_not_told_to_set_its_clock(clocks, words):
     assert advice.startswith("source/r3 stamps ")
     assert words in advice
     assert ("set its machine's clock" in advice) == ("set its machine's clock" in words)
-
-
-def test_robots_of_one_clock_are_advised_nothing():
-    assert presence(IN_TIME, IN_TIME, (0.4, 0.4)).advice() == []

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.central.desk.compare import compare_picture, compare_rows
+from teamslam.central.desk.compare import compare_rows
 from teamslam.central.desk.evaluation.errors import (
     Path,
     interpolate_truth,
@@ -20,17 +20,15 @@ from teamslam.central.desk.evaluation.errors import (
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.pictures.run import in_the_maps_frame
-from teamslam.central.desk.report.tables import robot_sheet, team_rows, title_of
+from teamslam.central.desk.report.tables import robot_sheet, team_rows
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.config import FolderWorld
-from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.consistency import chi2_interval
 from teamslam.team.translate import joint_bytes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import configured
 from tests import build
 from tests.sim.logs import (
     final_map,
@@ -106,19 +104,6 @@ def test_a_map_that_is_only_moved_has_no_error_after_alignment(x, y, theta, seed
     assert errors.rmse_m == pytest.approx(np.sqrt(np.mean(np.sum(shift**2, axis=1))), abs=1e-9)
 
 
-def test_alignment_does_not_scale():
-    truth = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-    errors = map_errors(1.5 * truth, np.eye(8), truth)
-    assert errors.aligned_rmse_m == pytest.approx(0.5 * np.sqrt(2.0))
-
-
-def test_one_landmark_has_an_error_but_no_alignment():
-    errors = map_errors(np.array([[3.0, 4.0]]), np.diag([9.0, 16.0]), np.zeros((1, 2)))
-    assert errors.rmse_m == 5.0
-    assert errors.aligned_rmse_m is None
-    assert errors.nees_per_dof == pytest.approx(1.0)
-
-
 def test_map_nees_takes_the_joint_covariance_not_its_blocks():
     P = spd(4)
     error = np.array([0.5, -0.25, 0.75, 1.0])
@@ -169,17 +154,6 @@ def test_the_shape_of_few_landmarks_is_what_their_distances_say(count):
         assert shape.coverage == 0.0
     else:
         assert 0.0 < shape.nees_per_landmark < 2.0 * 0.09 / 0.01
-
-
-def test_pose_errors_are_those_of_the_consistency_module():
-    P = np.stack([spd(3), 0.25 * spd(3)])
-    truth = path([0.0, 1.0], [[0.0, 0.0, 3.1], [1.0, 1.0, -1.0]])
-    estimate = path([0.0, 1.0], [[0.1, -0.2, -3.1], [1.5, 1.0, -1.25]])
-    errors = pose_errors(estimate, P, truth)
-    expected = [state_error(a, b) for a, b in zip(estimate.poses, truth.poses, strict=True)]
-    np.testing.assert_allclose(errors.errors, expected, atol=1e-12)
-    np.testing.assert_allclose(errors.nees, [nees(e, p) for e, p in zip(expected, P, strict=True)])
-    assert errors.position_rmse_m == pytest.approx(np.sqrt((0.05 + 0.25) / 2.0))
 
 
 def test_coverage_is_the_share_of_poses_within_their_own_95_percent():
@@ -257,14 +231,6 @@ def test_a_measurement_that_is_in_the_log_twice_is_counted_once():
     assert once.consumption.published == twice.consumption.published == 41
 
 
-def test_steps_are_odometry_intervals_and_the_uplink_is_what_the_rule_consumes():
-    sent = samples([submap(0, 0, 20), submap(1, 21, 40)])
-    robot = evaluate(world_log(scenario()) + sent).robots["r1"]
-    assert robot.uplink_bytes == sum(len(s.payload) for s in sent)
-    assert robot.uplink_bytes_per_step == robot.uplink_bytes / 20
-    assert robot.consumption.submaps == 2
-
-
 @pytest.mark.parametrize(
     ("first", "counted", "once"),
     [(21, 41, True), (20, 41, False), (21, 42, False)],
@@ -288,22 +254,6 @@ def test_a_log_without_truth_has_no_errors_but_the_rest():
     assert robot["steps"] == 20
     for name in ("position_rmse_m", "heading_rmse_rad", "pose_nees_per_dof"):
         assert robot[name] is None
-
-
-def test_where_no_true_landmark_is_known_all_paths_are_moved_together(tmp_path):
-    log = joined_log(scenario(robots=2), 0.3)
-    run = evaluate([each for each in log if not each.key.endswith(ch.TRUTH_LANDMARKS.template)])
-    for robot in run.robots.values():
-        assert robot.alignment == "paths"
-        assert robot.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
-    assert compare_picture({"run": run}, tmp_path / "paths.png"), "it has its paths' errors"
-
-
-def test_a_log_that_was_cut_before_the_final_map_is_evaluated():
-    figures = to_json(evaluate(world_log(scenario())[:30]))
-    assert figures["final_map_digest"] is None
-    assert figures["landmark_rmse_m"] is None
-    assert figures["robots"]["r1"]["measurements_consumed"] is None
 
 
 def test_the_trajectory_aligns_itself_where_the_map_can_not():
@@ -351,25 +301,6 @@ def test_damaged_messages_are_counted_and_left_out():
     assert run.map is None
     assert run.unsound == 2
     assert run.channels["nobody/knows"].bytes == 1
-
-
-def test_landmarks_without_truth_are_left_out_of_the_errors():
-    ids, positions = [1, 2, 77], np.array([[5.0, 6.0], [15.0, 5.0], [0.0, 0.0]])
-    said = final_map(ids, positions, 0.5 * spd(6))
-    run = evaluate(world_log(scenario()) + samples([said]))
-    assert run.map.known.tolist() == [True, True, False]
-    assert run.map.errors.count == 2
-    assert run.map.errors.rmse_m == 0.0
-
-
-def test_blocks_without_correlations_are_judged_as_such():
-    P = spd(4)
-    blocks = P.copy()
-    blocks[:2, 2:] = blocks[2:, :2] = 0.0
-    error = np.array([[0.5, 0.25], [-0.5, 1.0]])
-    means = np.array([[5.0, 6.0], [15.0, 5.0]]) + error
-    run = evaluate(world_log(scenario()) + samples([final_map([1, 2], means, P, joint=False)]))
-    assert run.map.errors.nees_per_dof == pytest.approx(nees(error.ravel(), blocks) / 4.0)
 
 
 def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds():
@@ -487,21 +418,6 @@ def test_a_map_far_from_all_true_landmarks_has_no_errors_and_says_within_which_g
     )
 
 
-def test_no_true_landmark_has_two_of_the_map():
-    true = streams(scenario()).landmarks
-    run = evaluate(unnamed_log(np.vstack((true + 0.1, true[:1] + 0.02))))
-    assert (run.map.matching.matched, run.map.matching.of) == (8, 9)
-    assert run.map.known.tolist() == [False] + [True] * 8
-
-
-def test_in_an_arbitrary_frame_the_paths_move_the_map_before_it_is_matched():
-    true = streams(scenario()).landmarks
-    run = evaluate(unnamed_log(transform_points(ROTATED, true), initial_poses=False))
-    assert run.arbitrary_frame
-    assert run.map.matching.matched == 8
-    assert run.map.errors.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
-
-
 def test_in_an_arbitrary_frame_the_true_paths_are_drawn_along_the_estimated_ones():
     true = streams(scenario()).landmarks
     log = unnamed_log(transform_points(ROTATED, true), initial_poses=False)
@@ -515,13 +431,6 @@ def test_in_an_arbitrary_frame_the_true_paths_are_drawn_along_the_estimated_ones
         assert poses[known, :2] == pytest.approx(path.poses[known, :2], abs=1e-6)
         before, _ = interpolate_truth(run.robots[name].truth, path.stamps_ns)
         assert np.abs(before[known, :2] - path.poses[known, :2]).max() > 0.5
-
-
-def test_landmarks_with_identities_are_matched_by_nothing_else():
-    run = evaluate(joined_log(scenario(), 0.1))
-    assert run.map.matching is None
-    assert to_json(run)["landmark_matching"] is None
-    assert "landmark errors" not in dict(team_rows(run))
 
 
 def test_the_table_tells_used_from_rejected_and_open_measurements():
@@ -549,28 +458,3 @@ def test_the_table_tells_used_from_rejected_and_open_measurements():
     assert robot_sheet(replace(run, robots=robots)).note.endswith(": r2 1,300, r1 2")
     without = evaluate(world_log(scenario()))
     assert robot_sheet(without).rows[0][2] == f"– of {published}"
-
-
-def test_a_run_on_a_data_set_is_titled_with_its_name():
-    of = scenario()
-    world = FolderWorld(path="/somewhere/my_set")
-    told = configured("world", 0, 0, msgspec.structs.replace(of, world=world))
-    (configuration,) = samples([Outgoing(ch.WORLD_CONFIG, "", told)])
-    key = ch.WORLD_CONFIG.key()
-    named = [configuration if each.key == key else each for each in joined_log(of, 0.1)]
-    run = evaluate(named)
-    assert title_of(run) == "my_set"
-    assert to_json(run)["data_set"] == "my_set"
-    assert title_of(evaluate(joined_log(of, 0.1))) == "small, seed 1"
-
-
-def test_truth_is_not_extrapolated():
-    truth = path([1.0, 2.0], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    _, known = interpolate_truth(truth, stamps(0.999, 1.0, 2.0, 2.001))
-    assert known.tolist() == [False, True, True, False]
-
-
-def test_without_truth_nothing_is_known():
-    nowhere = Path(np.empty(0, np.int64), np.empty((0, 3)))
-    assert not interpolate_truth(nowhere, stamps(0.0, 1.0))[1].any()
-    assert pose_errors(path([0.0], [[0.0, 0.0, 0.0]]), np.eye(3)[np.newaxis], nowhere) is None

@@ -2,13 +2,9 @@
 
 import msgspec
 
-from teamslam.central.desk.evaluation.events import MOST, EventDetector, without_decimals
-from teamslam.central.desk.evaluation.history import history
-from teamslam.team.wire import channels as ch
+from teamslam.central.desk.evaluation.events import EventDetector, without_decimals
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing
 from tests import build
-from tests.sim.logs import samples
 from tests.support import fused_map
 
 
@@ -26,14 +22,6 @@ def test_a_robot_joins_is_lost_and_comes_back():
         ("joined", "r1 joined"),
         ("lost", "r1 was lost"),
         ("restarted", "r1 came back"),
-    ]
-
-
-def test_a_robot_that_is_done_leaves():
-    done = build.done(measurements=1200, steps=5, submaps=4)
-    assert told(alive(True), done, done, alive(False))[1:] == [
-        ("done", "r1 has taken all its 1,200 measurements, 4 submaps"),
-        ("left", "r1 left"),
     ]
 
 
@@ -128,20 +116,6 @@ def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_
     assert without_decimals("submap 20, cost 9.1") == "submap 20, cost #"
 
 
-def test_another_incarnation_and_another_life_of_a_process_are_events():
-    first, again = (
-        m.InitialPose(stamp_ns=9, robot="r1", incarnation=n, number=0, pose=b"", covariance=b"")
-        for n in (1, 2)
-    )
-    configured = build.configuration(node="robot/r1", incarnation=0)
-    assert told(first, first, again, again) == [
-        ("restarted", "the stream of r1 begins anew, incarnation 2")
-    ]
-    assert told(configured, alive(True), alive(False), configured)[2:] == [
-        ("restarted", "r1 announces itself again")
-    ]
-
-
 def test_the_end_of_the_world_and_its_notes_are_told_once():
     end = m.End(stamp_ns=9, streams=(), notes=("a row was repaired",))
     assert told(end, end, fused([], final=True), alive(True, "recorder")) == [
@@ -150,8 +124,3 @@ def test_the_end_of_the_world_and_its_notes_are_told_once():
         ("done", "final map of 0 landmarks"),
         ("joined", "recorder joined"),
     ]
-
-
-def test_the_number_of_events_of_a_run_is_bounded():
-    many = [Outgoing(ch.ALIVE, "robot/r1", alive(t % 2 == 0)) for t in range(MOST + 50)]
-    assert len(history(samples(many)).events) == MOST

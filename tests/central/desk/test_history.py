@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.history import history
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team import translate
@@ -28,12 +27,6 @@ def log():
 @pytest.fixture(scope="module")
 def run(log):
     return history(log)
-
-
-def test_every_byte_is_counted_under_its_key(log):
-    channels = evaluate(log).channels
-    assert sum(each.bytes for each in channels.values()) == sum(len(s.payload) for s in log)
-    assert set(channels) == {s.key for s in log}
 
 
 def test_nis_is_what_the_robots_said_of_their_windows(run, log):
@@ -112,24 +105,6 @@ def test_latency_runs_from_a_measurements_publication_to_the_first_map_that_used
     np.testing.assert_allclose(found.first_s, [0.350, 0.700])
 
 
-def test_a_part_of_a_log_has_the_latencies_of_what_is_in_it():
-    log = [measurement(k, 10 * k) for k in range(12, 20)]
-    log += [at(Outgoing(ch.SUBMAP, "r1", submap(k, "r1")), 400) for k in range(2)]
-    assert "r1" not in history([*log, at(fused(9, 1), 450)]).latencies
-    absurd = samples(
-        [
-            Outgoing(
-                ch.ODOMETRY,
-                "r1",
-                build.odometry(
-                    stamp_ns=5, incarnation=0, number=2**60, duration_ns=MS, forward=0.5
-                ),
-            )
-        ]
-    )
-    assert history([*log, *absurd]).end_ns == 19 * MS
-
-
 def test_without_truth_there_is_the_cost_and_no_nees():
     of = scenario()
     hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
@@ -137,8 +112,3 @@ def test_without_truth_there_is_the_cost_and_no_nees():
     assert len(blind.map_nees.values) == 0
     assert blind.map_cost.values.tolist() == [1.5]
     assert final_map([1], np.zeros((1, 2)), np.eye(2)).message.dof == 20
-
-
-def test_an_empty_log_has_an_empty_history():
-    empty = history([])
-    assert (empty.start_ns, empty.end_ns, empty.events, empty.latencies) == (0, 0, (), {})

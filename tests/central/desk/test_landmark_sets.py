@@ -1,10 +1,6 @@
-import msgspec
-import numpy as np
-
 from teamslam.central.desk.evaluation.association import AssociationResult, Pairs
-from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.events import EventDetector
-from teamslam.central.desk.report.tables import decision_sheet, in_words, score_sheet
+from teamslam.central.desk.report.tables import score_sheet
 from teamslam.central.desk.view.landmark_sets import sets_of
 from teamslam.team.wire import messages as m
 from tests.support import examples
@@ -46,16 +42,6 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone():
     assert not [each for each in detector.take(again, 0) if each.kind in ("closure", "undone")]
 
 
-def test_the_report_lists_what_happened_newest_first_then_what_waits_and_why():
-    (made,) = FUSED.decisions
-    waits = msgspec.structs.replace(made, kind="waits", why="evidence 3 < 12", absent=9)
-    undone = msgspec.structs.replace(made, kind="undone", why="share 0.41 < 0.5")
-    rows = decision_sheet([made, undone, waits]).rows
-    assert [row[0].partition(":")[0] for row in rows] == ["undone", "merge", "waits"]
-    assert [row[-1] for row in rows] == ["share 0.41 < 0.5", "", "evidence 3 < 12"]
-    assert rows[2][1:6] == ("0.0", "12", "40", "9", "5")
-
-
 def test_the_report_scores_pairs_inside_windows_and_over_all():
     def pairs(missed: int) -> Pairs:
         return Pairs(right=30, wrong=10, missed=missed, wrong_detections=1, detections=50)
@@ -79,12 +65,3 @@ def test_the_report_scores_pairs_inside_windows_and_over_all():
         ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
     ]
     assert "4 rightly, 0 wrongly; 3 attempts wait" in score_sheet(found).note
-
-
-def test_a_nees_outside_of_its_band_says_what_that_means():
-    errors = map_errors(np.full((18, 2), 1.26), np.eye(36), np.zeros((18, 2)))
-    assert 1.5 < errors.nees_per_dof < 1.6
-    words = in_words(errors, joint=True)
-    assert words.startswith("1.588, above 95 % of 0.59…1.51 (joint). WARNING: the errors are")
-    small = map_errors(np.full((18, 2), 0.1), np.eye(36), np.zeros((18, 2)))
-    assert "below" in in_words(small, joint=True)

@@ -84,22 +84,10 @@ def test_an_order_that_is_not_followed_says_why(monkeypatch, answer, why):
         ordered(monkeypatch, **answer)
 
 
-def test_a_robot_that_nobody_knows_can_not_be_withdrawn(monkeypatch):
-    with pytest.raises(WithdrawError, match=r"no robot r9; its robots: r3"):
-        ordered(monkeypatch, robot="r9")
-
-
 def test_without_a_centre_there_is_nobody_to_order(monkeypatch):
     monkeypatch.setattr(orders, "CENTRE_S", 0.2)
     with pytest.raises(WithdrawError, match="no centre and no peer answers"):
         withdraw(MemoryBus(MemoryNetwork()), "r3", "a flat wheel", 1.0)
-
-
-@pytest.mark.parametrize(("robot", "team"), [("R 3", "thesis"), ("r3", "a/b")])
-def test_names_that_are_none_are_wrong_use(robot, team):
-    refused = CliRunner().invoke(app, ["withdraw", robot, "--team", team])
-    assert refused.exit_code == 2
-    assert "is no" in refused.stderr
 
 
 def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(monkeypatch):
@@ -177,12 +165,6 @@ def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgeme
 def pair(same: bool) -> m.Judgement:
     first, second = local_landmark("r3/1/2/3"), local_landmark("r3/1/4/5")
     return m.Judgement(first=first, second=second, same=same)
-
-
-def test_a_verdict_on_a_robot_that_the_team_does_not_have_is_wrong_use(monkeypatch):
-    refused = said(monkeypatch, "same", "r3/1/2/3", "r9/1/77/1", rests_on=())
-    assert refused.exit_code == 2
-    assert "the team has no robot r9; its robots: r3" in refused.stderr
 
 
 def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(monkeypatch):

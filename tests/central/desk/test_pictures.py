@@ -36,7 +36,6 @@ from teamslam.central.desk.pictures.style import (
     Picture,
     Style,
     drawn_in,
-    parsed_width,
     save,
 )
 from teamslam.central.desk.report.page import write_pictures
@@ -45,7 +44,7 @@ from teamslam.central.desk.report.tables import summary_tables, team_rows
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded
-from tests.sim.logs import joined_log, online, samples, scenario, streams, world_log
+from tests.sim.logs import joined_log, scenario
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -94,18 +93,6 @@ def test_the_same_run_draws_the_same_bytes(run, tmp_path):
         map_picture(run, tmp_path / name)
         pictures.append((tmp_path / name).read_bytes())
     assert pictures[0] == pictures[1]
-
-
-def test_a_run_without_truth_has_a_map_but_no_error_picture(tmp_path):
-    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
-    blind = evaluate([s for s in joined_log(scenario(), 0.1) if s.key not in hidden])
-    assert map_picture(blind, tmp_path / "map.png")
-    assert not error_picture(blind, tmp_path / "errors.png")
-    assert not (tmp_path / "errors.png").exists()
-
-
-def test_an_empty_run_draws_nothing(tmp_path):
-    assert not map_picture(evaluate([]), tmp_path / "map.png")
 
 
 def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_path, monkeypatch):
@@ -160,17 +147,6 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     np.testing.assert_allclose(found[: len(expected)], expected)
 
 
-def test_errors_of_online_poses_are_marked_where_nothing_was_smoothed():
-    of = scenario()
-    truth = streams(of).streams[0].truth
-    said = online(ch.OWN_POSE, truth[1:] + np.array([3.0, 4.0, 0.0]), of)
-    console = Console(width=80, record=True, force_terminal=False)
-    console.print(summary_tables(evaluate(world_log(of) + samples(said)))[1])
-    text = console.export_text()
-    assert "5.000*" in text
-    assert "* of online ones" in " ".join(text.split())
-
-
 @pytest.mark.parametrize(
     ("fusion", "said"),
     [
@@ -221,24 +197,6 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):
     assert not error_picture(run, tmp_path / "errors.png")
     assert map_picture(run, tmp_path / "map.png")
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
-
-
-@pytest.mark.parametrize(
-    ("text", "inches"), [("3.5in", 3.5), ("89mm", 89 / 25.4), ("8.9 cm", 8.9 / 2.54)]
-)
-def test_a_width_is_read_in_several_units(text, inches):
-    assert parsed_width(text) == pytest.approx(inches)
-
-
-@pytest.mark.parametrize("text", ["3.5", "wide", "0.1in", "9000mm", "-3in"])
-def test_a_width_that_is_none_is_refused(text):
-    with pytest.raises(ValueError, match=r"give a width from 1in to 40in, as 3\.5in or 89mm"):
-        parsed_width(text)
-
-
-def test_png_for_a_paper_does_not_take_the_names_of_the_page():
-    names = [Style(look, Form.PNG).file_name(Picture.MAP) for look in Look]
-    assert names == ["map.png", "map-paper.png"]
 
 
 @pytest.mark.parametrize(("width_in", "inches"), [(None, 3.5), (2.5, 2.5)])

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.history import history
-from teamslam.central.desk.ledger import Entry, Ledger
 from teamslam.central.desk.report import page as report_page
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run, run_figures
@@ -82,15 +81,6 @@ def test_it_is_one_page_that_needs_nothing_else(log, tmp_path):
     assert figures["bytes_per_s"][ch.SUBMAP.key("r1")] > 0.0
 
 
-def test_clocks_that_disagree_still_give_a_page(log, tmp_path):
-    behind = [
-        msgspec.structs.replace(s, wall_ns=1) if s.key.startswith("central") else s for s in log
-    ]
-    found = history(behind)
-    assert max(of.last_s.max() for of in found.latencies.values()) < 0.0
-    assert 'id="latency"' in page_of(run_of(behind), tmp_path)  # a warning would be an error here
-
-
 def test_what_a_log_says_can_not_become_markup(log, tmp_path):
     run = run_of(log, commit="<b>", long="<i>" * 100)
     bad = "<script>alert(1)</script> [red]x[/nothing]"
@@ -141,15 +131,6 @@ def test_the_command_proves_the_ledger_and_says_so(log, tmp_path):
     figures = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
     assert figures["ledger"]["offenders"] == []
     assert figures["provenance"] == {"seed": "1"}
-
-
-@pytest.mark.usefixtures("_without_pictures")
-def test_a_measurement_used_twice_is_named_on_the_page(log, tmp_path):
-    run = run_of(log)
-    name = "measurement 7 of r1, incarnation 1 is in two submaps: 0 and 1"
-    offending = Ledger({("r1", 1): 3 * (Entry("in a submap", 0),)}, {}, (name,))
-    page = page_of(replace(run, ledger=offending), tmp_path)
-    assert 'class="bad">Ledger: 1 offenders: measurement 7 of r1' in page
 
 
 @pytest.mark.usefixtures("_without_pictures")

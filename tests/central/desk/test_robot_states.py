@@ -1,12 +1,10 @@
 """Robots that are withdrawn, not joined or lost, in results and reruns."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
@@ -15,7 +13,6 @@ from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
 from teamslam.central.desk.verification.differences import first_difference
-from teamslam.sim.cli.rerun import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
@@ -28,7 +25,6 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.central.test_withdrawal import run, scenario
-from tests.sim.reruns import written
 from tests.support import packed, spd
 
 
@@ -60,20 +56,6 @@ def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_
     assert of == {"robot": "r3", "cause": "contradicts_the_rest", "text": state.why}
     write_report(Run(result, history(samples), {}), tmp_path, figures)
     assert "r3: by central: its submaps contradict" in (tmp_path / "report.html").read_text()
-
-
-def test_a_rerun_gives_the_same_warnings_and_ends_with_1(samples, result, tmp_path):
-    log = written(tmp_path / "log.mcap", samples)
-    figures = tmp_path / "rerun.json"
-    path = str(log.path)
-    found = CliRunner().invoke(app, ["rerun", path, "--json", str(figures)], env={"COLUMNS": "300"})
-    assert found.exit_code == 1, found.output
-    for warning in result.warnings:
-        assert f"warning: {warning}" in found.output
-    assert "NIS per dof: " in found.output
-    assert json.loads(figures.read_text())["recomputed"]["robot_states"]["r3"]["why"]
-    left_out = CliRunner().invoke(app, ["rerun", path, "--without", "r3"], env={"COLUMNS": "300"})
-    assert left_out.exit_code == 0, "the others have seen it, which is left out, too"
 
 
 def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothing_is_named(

@@ -74,14 +74,6 @@ def test_between_the_ends_the_covariance_is_that_of_the_errors(log):
     assert 0.3 < float(np.concatenate(within).mean()) < 2.0
 
 
-def test_without_the_measurements_the_ends_are_what_there_is(log):
-    said = [sample for sample in log if "/odometry" not in sample.key]
-    ends = {name: robot.smoothed_path for name, robot in evaluate(log).robots.items()}
-    for robot, path in smoothed_paths(recorded_of(said)).items():
-        assert not path.at_keyframes
-        np.testing.assert_array_equal(path.poses, ends[robot].poses)
-
-
 def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
     home = take_home(recorded_of(log))
     fused = evaluate(log).map

@@ -13,8 +13,6 @@ from mcap_protobuf.decoder import DecoderFactory
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from teamslam.central.desk.view.drawn import (
-    PATH_POINTS,
-    Track,
     centre_particles,
     place_points,
 )
@@ -135,18 +133,6 @@ def test_a_view_comes_once_a_second_and_has_every_robot_where_it_was(read, sampl
                 assert any(np.allclose([place.x, place.y], p) for p in said[robot, at])
 
 
-def test_the_transform_is_the_robots_pose(read):
-    (at, transforms), (_, pose) = read["view/transforms"][-1], read["view/pose/r1"][-1]
-    of_r1 = next(t for t in transforms.transforms if t.child_frame_id == "robot/r1")
-    assert of_r1.parent_frame_id == "map"
-    assert (of_r1.translation.x, of_r1.translation.y) == (
-        pose.pose.position.x,
-        pose.pose.position.y,
-    )
-    assert str(of_r1.rotation) == str(pose.pose.orientation)  # two equal types of two schemas
-    assert of_r1.timestamp.ToNanoseconds() == at
-
-
 def test_figures_hold_errors_within_their_bounds_and_the_monitors_cost(read):
     _, robot = read["view/robot/r1"][-1]
     assert abs(robot["error_x_m"]) < robot["three_sigma_x_m"] + 1.0
@@ -161,36 +147,12 @@ def test_views_of_the_same_log_are_the_same_bytes(samples):
     assert list(with_views(samples)) == list(with_views(samples))
 
 
-def test_views_that_are_in_a_log_are_not_doubled(samples):
-    once = list(with_views(samples))
-    assert list(with_views(once)) == once
-
-
-def test_without_the_truth_there_are_views_without_errors(samples):
-    blind = [s for s in samples if not s.key.startswith("truth")]
-    team = [json.loads(s.payload) for s in with_views(blind) if s.key == "view/team"]
-    robot = [json.loads(s.payload) for s in with_views(blind) if s.key == "view/robot/r1"]
-    assert team[-1]["landmarks"] > 10
-    assert "map_rmse_m" not in team[-1]
-    assert "error_x_m" not in robot[-1]
-    assert robot[-1]["three_sigma_x_m"] > 0.0
-
-
 @pytest.mark.parametrize("node", [RobotNode])
 def test_no_robot_hears_a_view(node):
     assert ch.VIEW not in node.listens
 
 
 # What is drawn.
-
-
-def test_a_long_path_keeps_its_ends_and_few_points():
-    track = Track()
-    for i in range(10 * PATH_POINTS):
-        track.take(i * 100_000_000, float(i), 0.0)
-    assert len(track.points) <= PATH_POINTS
-    assert track.points[0] == (0.0, 0.0)
-    assert track.points[-1][0] > 9.9 * PATH_POINTS
 
 
 # Errors.
@@ -228,18 +190,6 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
     np.testing.assert_allclose(found.nees, [1.0])
 
 
-def test_truth_that_is_far_ahead_is_kept_for_the_estimates():
-    errors = RunningErrors()
-    for begin in range(0, 300, 10):
-        errors.take_truth(truth([float(begin + i) for i in range(11)]))
-    errors.take_pose(pose(3.0, 3.25))
-    found = errors.known()
-    np.testing.assert_allclose(found.errors[0, 0], 0.25)
-    errors.forget(250 * S)
-    assert errors.truth_at(3 * S) is None
-    np.testing.assert_allclose(errors.truth_at(round(260.5 * S)), [260.5, 0.0, 0.0])
-
-
 def test_the_nees_of_a_joint_map_is_that_of_the_report():
     P = np.diag([0.25, 1.0, 0.25, 1.0]) + 0.2
     means = np.array([[1.0, 0.0], [5.5, 5.0]])
@@ -256,17 +206,6 @@ def test_the_nees_of_a_joint_map_is_that_of_the_report():
     of_one = TrueLandmarks(np.array([7], np.uint32), true[1:]).fit(fused)
     e = means[1] - true[1]
     assert of_one.nees_per_dof == pytest.approx(e @ np.linalg.solve(P[2:, 2:], e) / 2.0)
-
-
-def test_the_nees_of_a_map_of_blocks_is_the_mean_over_its_landmarks():
-    fused = fused_map(
-        ids=from_ids([4, 7]),
-        means=from_floats([1.0, 0.0, 5.0, 5.0]),
-        covariance=from_floats([0.25, 0.0, 1.0] * 2),
-    )
-    fit = TrueLandmarks(np.array([4], np.uint32), np.zeros((1, 2))).fit(fused)
-    assert (fit.landmarks, fit.rmse_m, fit.nees_per_dof) == (1, 1.0, 2.0)
-    assert TrueLandmarks().fit(fused) is None
 
 
 # Time.
@@ -302,15 +241,6 @@ def test_a_stamp_from_far_ahead_does_not_make_views_without_end():
     node = ViewerNode()
     out = shown(node, (ch.OWN_POSE, pose(0, 0)), (ch.OWN_POSE, pose(1e9, 0)))
     assert len(robots_at(out)) <= MOST_PERIODS + 2
-
-
-def test_the_teams_pose_goes_before_the_robots_own():
-    node = ViewerNode()
-    node.handle(ch.OWN_POSE, pose(0, 0))
-    node.handle(ch.TEAM_POSE, pose(1, 7.0))
-    out = node.handle(ch.OWN_POSE, pose(2, 9.0)) + node.handle(ch.TEAM_POSE, pose(2, 8.0))
-    figures = [json.loads(s.payload) for s in out if s.key == "view/robot/r1"]
-    assert figures[-1]["x_m"] == 8.0
 
 
 def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():
