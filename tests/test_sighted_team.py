@@ -6,12 +6,9 @@ import msgspec
 import pytest
 
 from teamslam.central.config import CentralConfig
-from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.ledger import ledger
 from teamslam.central.desk.verification.recorded import recorded
 from teamslam.central.desk.verification.verification import verify
-from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.robot.ledger import IN_SIGHTING
 from teamslam.team.robot.node import RobotNode
@@ -132,21 +129,3 @@ def test_sightings_whose_node_never_comes_are_rejected_at_the_end():
     assert sum(told.values()) == done.measurements
     used = {n for x in of(out, ch.SIGHTING_FACTOR) for n in x.measurements}
     assert told.get(IN_SIGHTING, 0) == len(used)
-
-
-def test_with_the_grid_off_nothing_is_said_of_teammates():
-    plain = scenario(node_s=0.0)
-    found = Team(STREAMS, plain.robots, random.Random(1), CENTRE)
-    found.run()
-    for robot in plain.robots:
-        assert found.sent[ch.SIGHTING_FACTOR.key(robot.id)] == []
-        assert {x.nodes for x in found.sent[ch.SUBMAP.key(robot.id)]} == {b""}
-
-
-def test_the_demo_uses_every_measurement_that_its_world_sends():
-    demo = load("waypoints")
-    run = evaluate(run_team(demo, streams_of(demo)))
-    used = [robot.consumption for robot in run.robots.values()]
-    assert [each.rejected for each in used] == [{}, {}, {}]
-    assert [each.used for each in used] == [each.published for each in used]
-    assert all(each.ledger[IN_SIGHTING] > 40 for each in used)

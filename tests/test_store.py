@@ -74,12 +74,6 @@ def test_what_does_not_fit_is_refused_with_its_reason_and_changes_nothing(there,
     assert found.add_submap(CHAIN[there[0]]) is None, "what is in stays in"
 
 
-def test_another_incarnation_is_another_stream():
-    second = [msgspec.structs.replace(each, incarnation=1) for each in CHAIN[:2]]
-    found = put(*CHAIN, *second)
-    assert (len(found.chain(("alpha", 0))), len(found.chain(("alpha", 1)))) == (6, 2)
-
-
 # --- sightings: what completes a submap ---
 
 
@@ -122,12 +116,6 @@ def test_a_submap_counts_when_its_sightings_are_here_in_any_order(order, cut):
     assert len(found.chain(("alpha", 0))) == 3
     assert found.sightings(WITH_SIGHTINGS[1]) == SEEN
     assert found.missing() == ()
-
-
-def test_an_incomplete_submap_is_what_its_stream_waits_for():
-    found = put(CHAIN[0], changed(1, sightings=1))
-    assert found.missing() == (m.VersionEntry(robot="alpha", incarnation=0, sequence=1),)
-    assert found.chain(("alpha", 0)) == CHAIN[:1]
 
 
 @pytest.mark.parametrize(

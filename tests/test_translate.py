@@ -113,12 +113,6 @@ def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
     assert start.stream == ("r1", 1)
 
 
-def test_an_unknown_start_is_none():
-    unknown = build.initial_pose()
-    assert translate.start_of(unknown) is None
-    assert translate.pose_of(unknown) == (None, None)
-
-
 def estimate(covariance, *, joint):
     return build.map_estimate(
         joint=joint, ids=from_ids([3, 9]), means=from_floats(np.arange(4.0)), covariance=covariance
@@ -138,13 +132,6 @@ def test_a_map_carries_its_joint_covariance_or_the_blocks_of_it():
     ids, means = translate.landmarks_of(whole)
     assert ids.tolist() == [3, 9]
     np.testing.assert_array_equal(means, [[0.0, 1.0], [2.0, 3.0]])
-
-
-def test_a_map_without_landmarks_has_an_empty_covariance():
-    empty = np.zeros((0, 0))
-    assert translate.blocks_of(empty).shape == (0, 2, 2)
-    assert translate.joint_bytes(empty) == b""
-    assert translate.block_bytes(translate.blocks_of(empty)) == b""
 
 
 def test_a_pose_passes_the_door_although_rounding_made_it_skew():
@@ -188,16 +175,3 @@ def test_every_field_of_a_configuration_changes_its_digest():
     ]
     digests = {configured("x", 0, 0, each).digest for each in (base, *others)}
     assert len(digests) == 1 + len(others)
-
-
-def test_a_scan_is_in_the_machines_byte_order_and_writable_by_nobody_elses_hand():
-    message = build.observations(
-        number=1,
-        ids=from_ids([4, 2]),
-        ranges=from_floats([1.5, 2.5]),
-        bearings=from_floats([0.5, -0.5]),
-    )
-    ids, ranges, bearings, _ = translate.scan_of(message)
-    assert (ids.tolist(), ranges.tolist(), bearings.tolist()) == ([4, 2], [1.5, 2.5], [0.5, -0.5])
-    ranges[0] = 9.0
-    assert translate.scan_of(message)[1][0] == 1.5

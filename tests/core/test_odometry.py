@@ -1,12 +1,11 @@
 """Odometry and scans in the core: motions since several places, and inputs that are refused."""
 
-import msgspec
 import numpy as np
 import pytest
 
 from teamslam.team import core
-from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.estimation.models import Increment, calibration_of, increment_of, model_of
+from teamslam.team.config import MotionModel, MotionNoise
+from teamslam.team.estimation.models import Increment, increment_of, model_of
 from teamslam.team.estimation.mount import of_sensor
 from teamslam.team.estimation.odometry import OdometryInterval, moved
 from teamslam.team.estimation.se2 import adjoint, between, inverse
@@ -20,8 +19,6 @@ MOTION = MotionModel(
 MOUNT = (0.4, -0.2, 1.1)
 PARTS = [(0.5, 0.7, 0.3), (0.5, -0.4, 0.1), (0.2, 0.25, -0.6), (1.0, 0.9, 0.0)]
 ADDED = (0.2, 0.1, 0.05)
-IDS = np.array([3, 5], np.uint32)
-SEEN = IDS, np.array([1.0, 2.0]), np.array([0.1, -0.1]), np.empty((2, 0))
 
 
 def driven(mount=None, added=None) -> core.Odometry:
@@ -101,29 +98,3 @@ def test_the_motion_since_a_scan_without_identities_begins_there():
     _, _, rest = odometry.end_keyframe()
     assert rest is not None
     assert_equal(rest, composed([increment_of(MOTION, *PARTS[1])]))
-
-
-def test_arrays_of_other_shapes_and_types_are_refused():
-    poses = np.zeros((1, 3))
-    core.reduce_scans([SEEN], poses)
-    with pytest.raises(ValueError, match="poses must be"):
-        core.reduce_scans([SEEN], np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="one length"):
-        core.reduce_scans([(IDS, SEEN[1][:1], *SEEN[2:])], poses)
-    with pytest.raises(ValueError, match="own must be"):
-        core.reduce_scans([(*SEEN[:3], np.empty((2, 3)))], poses)
-    with pytest.raises(TypeError):  # they would wrap
-        core.reduce_scans([(IDS.astype(np.int64), *SEEN[1:])], poses)
-    with pytest.raises(ValueError, match="must be finite"):
-        core.reduce_scans([SEEN], poses + np.nan)
-    with pytest.raises(ValueError, match=r"\(L, 2\)"):
-        core.predict(poses[0], np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="one length"):
-        calibration_of(Sensor()).correct(np.zeros(2), np.zeros(3))
-    with pytest.raises(ValueError, match="range_scale"):
-        calibration_of(msgspec.structs.replace(Sensor(), range_scale=0.0))
-
-
-def test_the_median_of_no_scans_is_nothing():
-    ids, ranges, bearings, own = core.reduce_scans([], np.empty((0, 3)))
-    assert (len(ids), len(ranges), len(bearings), own.shape) == (0, 0, 0, (0, 0))

@@ -5,10 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.team.core import Cholesky, NotPositiveDefiniteError, Pattern, minimum_degree
-from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, add_start, fold_submaps
-from tests.estimation.submap_world import team
+from teamslam.team.core import Cholesky, NotPositiveDefiniteError, Pattern
 
 BIG_ROWS, BLOCK = 256, 48
 """A panel of so many rows is factorised by blocks of so many columns (`sparse.cpp`)."""
@@ -163,23 +160,6 @@ def test_a_clique_is_big_from_the_threshold_on_and_right_on_either_side(beyond):
         np.testing.assert_array_equal(block, 0.5 * (columns + columns.T))
 
 
-def test_many_columns_equal_a_few_at_a_time():
-    pattern = pattern_of([3] * 60, [(i + 1, i) for i in range(59)])
-    rng = np.random.default_rng(1)
-    cholesky = Cholesky(pattern, values_of(pattern, dense_on(pattern, rng)))
-    together = cholesky.inverse_columns(np.arange(180))
-    for some in ([0], [63, 64], [179], list(range(33))):
-        np.testing.assert_array_equal(cholesky.inverse_columns(np.array(some)), together[:, some])
-
-
-def test_a_pattern_serves_other_numbers():
-    pattern = pattern_of([3, 2, 3, 2], [(1, 0), (2, 0), (3, 2)])
-    for seed in range(3):
-        dense = dense_on(pattern, np.random.default_rng(seed))
-        solution = Cholesky(pattern, values_of(pattern, dense)).solve(np.ones(10))
-        np.testing.assert_allclose(dense @ solution, np.ones(10), atol=1e-9)
-
-
 def test_the_same_numbers_give_the_same_bytes():
     sizes, pairs = [3, 2, 3, 2], [(1, 0), (2, 0), (3, 2), (3, 0)]
     values = values_of(
@@ -218,18 +198,6 @@ def test_an_indefinite_matrix_names_the_variable_of_its_pivot(bad, value):
     assert caught.value.variable == bad
 
 
-@pytest.mark.parametrize("bad", [0, 15, 16, 50, 84, 85])
-@pytest.mark.parametrize("value", [-1.0, np.nan])
-def test_an_indefinite_big_matrix_names_the_variable_of_its_pivot(bad, value):
-    pattern = clique(BIG_ROWS)
-    dense = np.eye(BIG_ROWS) + 1e-3
-    unknown = pattern.offset[bad + 1] - 1
-    dense[unknown, unknown] = value
-    with pytest.raises(NotPositiveDefiniteError) as caught:
-        Cholesky(pattern, values_of(pattern, dense))
-    assert caught.value.variable == bad
-
-
 def test_a_singular_matrix_is_refused_though_rounding_leaves_a_positive_pivot():
     pattern = pattern_of([1, 1, 1], [(1, 0), (2, 1)])
     weights = np.array([0.1, 0.7])
@@ -255,13 +223,6 @@ def test_no_factor_has_a_number_that_is_not_finite(value):
         except NotPositiveDefiniteError:
             continue
         assert np.isfinite(cholesky.selected_inverse()).all()
-
-
-def test_a_system_without_unknowns_has_a_solution():
-    cholesky = Cholesky(Pattern(*[np.zeros(k, np.int64) for k in (0, 1, 0)]), np.zeros(0))
-    assert cholesky.solve(np.zeros(0)).shape == (0,)
-    assert cholesky.inverse_block(np.zeros(0, np.int64)).shape == (0, 0)
-    assert cholesky.selected_inverse().shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -313,48 +274,3 @@ def test_arguments_of_another_size_are_refused():
     ):
         with pytest.raises(ValueError, match=r"must|no such"):
             call()
-
-
-def elimination(pattern):
-    return minimum_degree(pattern.sizes, pattern.column_start, pattern.rows)
-
-
-def test_a_chain_is_eliminated_without_fill():
-    order, _, start, _ = elimination(pattern_of([3] * 40, [(i + 1, i) for i in range(39)]))
-    assert np.diff(start).max() == 1
-    assert sorted(order) == list(range(40))
-
-
-def test_what_everything_sees_is_eliminated_last():
-    spokes = [(40, i) for i in range(40)]
-    chain = [(i + 1, i) for i in range(39)]
-    order, _, start, _ = elimination(pattern_of([3] * 40 + [2], chain + spokes))
-    assert 40 in order[-2:]
-    assert np.diff(start).max() == 2
-
-
-def test_a_child_comes_before_its_parent_and_subtrees_are_contiguous():
-    rng = np.random.default_rng(2)
-    pairs = [(i, j) for i in range(30) for j in range(i) if rng.random() < 0.08]
-    _, parent, _, _ = elimination(pattern_of([2] * 30, pairs))
-    size = np.ones(30, dtype=int)
-    for step, above in enumerate(parent):
-        assert above == -1 or above > step
-        if above >= 0:
-            size[above] += size[step]
-    for step in range(30):
-        subtree = {step}
-        for below in range(step - 1, -1, -1):
-            if parent[below] in subtree:
-                subtree.add(below)
-        assert subtree == set(range(step - size[step] + 1, step + 1))
-
-
-def test_a_hundred_landmarks_have_no_big_panel():
-    world = team(0, robots=10, submaps=30, landmarks=100, size=60.0, reach=20.0)
-    fold = EMPTY_FOLD
-    for start in world.starts:
-        fold = add_start(fold, start)
-    fold = fold_submaps(fold, world.submaps, JoinSettings(iterations_per_tick=1))
-    assert len(fold.main.graph.landmarks) == 100
-    assert not fold.main.graph.pattern.has_big_panel

@@ -102,21 +102,6 @@ def test_landmarks_solved_at_earlier_keyframes_are_those_that_are_solved_at_the_
     assert bytes_of(asked) == bytes_of(unasked)
 
 
-def test_a_motion_without_a_covariance_is_refused_by_every_method_that_takes_one():
-    window, indefinite = opened(), np.diag([1.0, -1.0, 1.0])
-    kept = bytes_of(window)
-    seen = IDS, RANGES, BEARINGS, UNCLAIMED
-    for refused in (
-        lambda: window.advance(MOTION, indefinite, *seen, None, NORMALS),
-        lambda: window.step(MOTION, indefinite, *seen, NORMALS),
-        lambda: window.move(MOTION, indefinite, NORMALS),
-        lambda: window.innovation(MOTION, indefinite, *seen),
-    ):
-        with pytest.raises(core.MotionError, match="not positive semi-definite"):
-            refused()
-    assert bytes_of(window) == kept
-
-
 @pytest.mark.parametrize("place", [0, 2, 3, 4])
 def test_a_sensor_without_noise_or_white_noise_is_refused(place):
     noise = (*NOISE[:place], 0.0, *NOISE[place + 1 :])
@@ -138,33 +123,6 @@ def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes():
             use()
 
 
-def test_the_arrays_of_a_window_are_copies():
-    window = opened()
-    kept = bytes_of(window)
-    arrays = window.particles()
-    arrays[0][:] = 0.0
-    assert bytes_of(window) == kept
-
-
-def test_arrays_may_lie_otherwise_and_be_read_only():
-    window, other = opened(), opened()
-    wide = np.zeros((2, 2))
-    wide[:, 0] = RANGES
-    frozen = NORMALS.copy()
-    frozen.flags.writeable = False
-    window.advance(*changed(3, wide[:, 0])[:-1], frozen)
-    other.advance(*KEYFRAME)
-    assert bytes_of(window) == bytes_of(other)
-
-
-def test_the_innovation_of_a_keyframe_is_that_which_advance_returns():
-    window = opened()
-    squared, error, S = window.innovation(*KEYFRAME[:6])
-    step = window.advance(*KEYFRAME)
-    assert (step.squared, step.dof) == (squared, len(error)) == (squared, len(S))
-    assert core.normalised_square(error, S) == squared
-
-
 def test_a_window_of_particles_goes_on_as_the_one_they_come_from():
     window = opened()
     again = core.Window.of_particles(*window.particles(), NOISE)
@@ -172,16 +130,6 @@ def test_a_window_of_particles_goes_on_as_the_one_they_come_from():
     assert window.advance(*KEYFRAME).log_evidence == log
     for one, other in zip(window.particles(), again.particles(), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_replacing_paths_by_themselves_changes_nothing():
-    window = opened(3, CONSTANT)
-    kept = bytes_of(window)
-    _, log_weights, _, means, covariances = window.particles()
-    window.replace(window.paths(), log_weights, means, covariances)
-    assert bytes_of(window) == kept
-    with pytest.raises(ValueError, match="paths must be"):
-        window.replace(window.paths()[:1], log_weights, means, covariances)
 
 
 def test_particles_that_do_not_fit_each_other_are_refused():
@@ -213,13 +161,6 @@ def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path():
     for wrong in (keyframes + 1, keyframes - 1):
         with pytest.raises(ValueError, match="not in the paths"):
             core.landmarks_along_paths(*solved, wrong, seen, measurements, own, NOISE)
-
-
-@pytest.mark.parametrize("count", [1, 7, 8, 127, 128, 129, 1000, 4099])
-def test_the_sum_of_squares_in_the_sample_factor_has_the_order_of_numpy(count):
-    weights = RNG.dirichlet(np.ones(count))
-    squares = float(np.add.reduce(weights * weights))
-    assert core.sample_factor(weights) == 1.0 / (1.0 - 5.0 * min(squares, 0.1))
 
 
 @settings(deadline=None, max_examples=60)

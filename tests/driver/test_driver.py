@@ -1,6 +1,5 @@
 """The driver: refused calls, the stored stream, and its messages."""
 
-import inspect
 import re
 import threading
 import warnings
@@ -13,7 +12,6 @@ from typer.testing import CliRunner
 
 from teamslam import Driver, DriverError, DriverWarning, MeasurementError
 from teamslam.sim.cli.main import app
-from teamslam.sim.scenarios.scenario import load
 from teamslam.team.saved_map import write_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -67,15 +65,6 @@ def test_speeds_and_what_is_seen_become_the_messages_of_the_wire(alone):
     assert floats(seen.bearings, "bearings") == pytest.approx([0.5, 4.0 - 2 * np.pi])
     assert (driven.duration_ns, driven.forward, driven.yaw_rate) == (100_000_000, 0.5, 0.1)
     assert [each.number for each in (start, seen, driven)] == [0, 1, 2]
-
-
-def test_points_carry_their_own_covariances(alone):
-    robot = alone()
-    robot.observe_points(1.0, [3], [[0.0, 2.0]], [[[0.1, 0.02], [0.02, 0.2]]])
-    _, seen = messages(robot)
-    assert isinstance(seen, m.Points)
-    assert floats(seen.positions, "positions").tolist() == [0.0, 2.0]
-    assert floats(seen.covariances, "covariances").tolist() == [0.1, 0.02, 0.2]
 
 
 def test_a_saved_map_is_published_for_the_teams_set(alone, tmp_path):
@@ -146,11 +135,6 @@ def test_what_can_not_be_is_refused_at_once_by_name_and_nothing_of_it_is_kept(al
 def test_a_start_that_can_not_be_is_refused(alone, options, words):
     with pytest.raises(MeasurementError, match=words):
         alone(**options)
-
-
-def test_a_name_that_no_robot_has_is_refused():
-    with pytest.raises(DriverError, match=r"'R 1' is no robot's name: a small letter, then"):
-        Driver("R 1", team="lab")
 
 
 def test_what_is_hardly_meant_is_warned_of_once(alone):
@@ -430,18 +414,6 @@ def test_the_pages_ten_lines_bring_a_robot_onto_its_team(tmp_path, monkeypatch):
     kinds = [type(robot.got[1, n]).__name__ for n in range(len(robot.got))]
     assert kinds == ["InitialPose", "Observations", "Odometry"]
     assert robot.heads[-1].state == "ended"
-
-
-def test_the_pages_scenario_is_a_live_team_and_its_calls_are_the_drivers(tmp_path):
-    (scenario,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
-    (tmp_path / "lab.toml").write_text(scenario)
-    live = load(tmp_path / "lab.toml")
-    assert live.is_live
-    assert [robot.id for robot in live.robots] == ["r1", "r2"]
-    for call, arguments in re.findall(r"^\| `(\w+)\((.*?)\)` \|", PAGE, re.MULTILINE):
-        takes = list(inspect.signature(getattr(Driver, call)).parameters)[1:]
-        said = re.sub(r"\(ahead, left, turn\)", "increment", arguments).split(", ")
-        assert takes == [argument.partition("=")[0] for argument in said]
 
 
 def test_a_fix_becomes_a_message_with_its_position_and_its_covariance_if_stated(alone):

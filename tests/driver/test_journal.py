@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from teamslam.team.driver import journal as j
-from teamslam.team.driver.journal import Journal, JournalError, Sorter, opened
+from teamslam.team.driver.journal import Journal, JournalError, opened
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -46,13 +46,6 @@ def test_what_is_seen_at_a_time_is_numbered_before_the_odometry_to_it(tmp_path):
     found = numbered(filled(tmp_path / "r1.stream"))
     assert found[:4] == [(0, "InitialPose"), (1, "Observations"), (1, "Odometry"), (2, "Odometry")]
     assert found.index((4, "Observations")) == found.index((4, "Odometry")) - 1
-
-
-def test_the_newest_wait_until_their_place_is_known_and_a_mark_ends_that(tmp_path):
-    journal = filled(tmp_path / "r1.stream")
-    assert numbered(journal)[-1] == (4, "Odometry")
-    journal.mark("ended")
-    assert numbered(journal)[-1] == (7, "Odometry")
 
 
 @pytest.mark.parametrize("lost", [0, 1, 7])
@@ -108,15 +101,6 @@ def test_a_file_that_a_crash_left_empty_or_half_written_is_begun_anew(tmp_path, 
         again.close()
 
 
-def test_a_file_begun_anew_beside_one_set_aside_counts_on(tmp_path):
-    path = tmp_path / "r1.stream"
-    filled(path).close()
-    path.rename(tmp_path / "r1.stream.1")
-    path.touch()
-    journal, _ = opened(path, "r1", LATENCY_NS)
-    assert journal.next_incarnation == 2
-
-
 @pytest.mark.parametrize("step_s", [7200.0, 50 * 365 * 86_400.0])
 def test_a_clock_that_was_set_makes_no_undelivered_stream_an_old_one(tmp_path, monkeypatch, step_s):
     path = tmp_path / "r1.stream"
@@ -158,16 +142,6 @@ def test_a_file_has_one_driver_and_one_robot(tmp_path):
     other.write_text("t,v\n")
     with pytest.raises(JournalError, match="no driver's"):
         opened(other, "r1", LATENCY_NS)
-
-
-def test_a_sorter_gives_back_nothing_that_something_may_still_come_before():
-    sorter = Sorter(latency_ns=10)
-    assert sorter.put((100, j.ODOMETRY), 1) == []
-    assert sorter.put((105, j.ODOMETRY), 2) == []
-    assert sorter.put((99, j.OBSERVATIONS), 3) == []
-    assert sorter.put((111, j.ODOMETRY), 4) == [3, 1]
-    assert sorter.released == (100, j.ODOMETRY)
-    assert sorter.flush() == [2, 4]
 
 
 def test_nobody_has_consumed_more_than_the_driver_has_numbered(tmp_path):

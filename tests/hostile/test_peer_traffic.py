@@ -7,11 +7,9 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.peers.fold import PeerFold
 from teamslam.central.peers.main import PeerCentre
 from teamslam.team.door import MOST_LIVES
-from teamslam.team.keys.roster import Issued
 from teamslam.team.peers.exchange import MOST_ASKED
 from teamslam.team.peers.members import LARGEST_SIGNATURE
 from teamslam.team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
-from teamslam.team.peers.proofs import LARGEST_OF_ROBOT, Proofs
 from teamslam.team.peers.replica import MOST_INTERVALS, MOST_STREAMS
 from teamslam.team.peers.set_file import SetFile
 from teamslam.team.wire import channels as ch
@@ -123,40 +121,6 @@ def test_a_large_signature_is_refused_and_does_not_cut_the_file(tmp_path):
     again = SetFile(tmp_path / "r1.set")
     again.close()
     assert [each.key for each in again.members] == [poses[0].key, poses[2].key]
-
-
-class _Signs:
-    certificate = b"c"
-
-    def sign(self, named: bytes) -> bytes:
-        return named
-
-    def issued(self, node: str, certificate: bytes) -> Issued | str:
-        return Issued(1, 2**62)
-
-    def revoked(self, node: str) -> int:
-        return 0
-
-    def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        return True
-
-
-def test_what_a_robot_gives_as_its_signature_is_no_longer_than_one():
-    proofs = Proofs("r1", _Signs())
-    pose = start("r3")
-    for size, kept in ((LARGEST_OF_ROBOT + 1, b""), (72, bytes(72))):
-        signature = m.Signature(stamp_ns=0, robot="r3", member=pose.hash, signature=bytes(size))
-        proofs.take_signature(signature, "r3")
-        assert proofs.of(member(ch.START, pose.message)) == kept
-
-
-def test_a_question_that_names_a_robot_again_and_again_is_answered_once():
-    node = node_of()
-    last = build.done(robot="r2", measurements=1, submaps=1)
-    node.take(member(ch.ROBOT_DONE, last), "robot/r2")
-    request = build.members_request(node=LIAR, statements=("r2",) * 10_000)
-    (reply,) = node.answer(encoded(request))
-    assert len(decoded(reply, m.Members).keys) == 1
 
 
 def test_a_robot_that_contradicts_itself_again_and_again_does_not_begin_the_fold_as_often():

@@ -155,13 +155,6 @@ def test_what_is_refused_leaves_the_map_of_the_others_as_it_is():
     )
 
 
-def test_behind_a_refused_submap_the_chain_has_ended_and_it_is_said():
-    final = concluded([*good("r1", 1), submap("r1", 1, mean=FAR), submap("r1", 2), *good("r2")])
-    (words,) = [reason for reason in final.reasons if "refused" in reason]
-    assert words.startswith("submap 1 of r1 (incarnation 1) refused")
-    assert words.endswith("the 1 behind it are not in the map either")
-
-
 def test_a_standing_robot_that_is_seen_by_another_one_stays_apart_and_it_is_said_why():
     """As on a real data set: a place, seen again and again, gives no heading."""
     messages = []

@@ -113,14 +113,6 @@ def test_who_is_renewed_keeps_its_name_and_who_was_revoked_gets_another(tmp_path
         make_keys(tmp_path, TEAM, [], renew=["robot-r7"])
 
 
-def test_another_host_of_the_router_renews_its_certificate(tmp_path):
-    make_keys(tmp_path, TEAM, nodes_of([]))
-    assert make_keys(tmp_path, TEAM, [], hosts=["lab.example", "10.0.0.7"]).made == ("router",)
-    assert make_keys(tmp_path, TEAM, [], hosts=["lab.example"]).made == ()
-    with pytest.raises(KeysError, match="is no name or address"):
-        make_keys(tmp_path, TEAM, [], hosts=["bücher.example"])
-
-
 def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors():
     """A row whose key nobody owns could not be published with keys."""
     nodes = nodes_of(["r1", "r2"])

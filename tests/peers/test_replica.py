@@ -1,7 +1,5 @@
 """Replicas of the set: members, questions, storms, the end."""
 
-import random
-
 import msgspec
 import pytest
 
@@ -10,7 +8,7 @@ from teamslam.central.peers.fold import PeerFold
 from teamslam.central.peers.robot import PeerRobot
 from teamslam.team.config import RobotConfig
 from teamslam.team.door import MOST_COUNT
-from teamslam.team.peers.exchange import MOST_ASKED, make_answer, make_request
+from teamslam.team.peers.exchange import MOST_ASKED, make_request
 from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
 from teamslam.team.peers.node import GIVEN_BYTES, PeerNode
 from teamslam.team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
@@ -19,7 +17,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
-from tests.peers.teams import Storm, done, member, parcel, said, start
+from tests.peers.teams import Storm, done, member, parcel, start
 from tests.support import example
 
 ROBOTS = ("r1", "r2")
@@ -30,11 +28,6 @@ def replica_of(*members: Member, share: int = 2**20) -> Replica:
     for each in members:
         replica.add(each)
     return replica
-
-
-def everything() -> list[Member]:
-    lives = [*said("r1", 5, "r2"), *said("r2", 4, "r1")]
-    return [each for occasion in lives for each in occasion]
 
 
 def digest_of(replica: Replica) -> bytes:
@@ -111,17 +104,6 @@ def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_
     replica.add(member(ch.CONCLUDED, concluded))
 
 
-def test_the_order_of_arrival_and_duplicates_change_nothing():
-    members = everything()
-    first = replica_of(*members)
-    for seed in range(20):
-        shuffled = members + members[::3]
-        random.Random(seed).shuffle(shuffled)
-        other = replica_of(*shuffled)
-        assert digest_of(other) == digest_of(first)
-        assert list(other.members()) == list(first.members())
-
-
 def test_of_two_members_of_one_name_the_same_stays_whichever_came_first():
     (one,) = parcel("r1", 0)
     assert isinstance(one.message, m.Submap)
@@ -150,21 +132,6 @@ def test_a_summary_names_gaps_and_what_is_asked_for_is_what_lacks():
     assert [(w.start, w.first, w.last) for w in asked.requested] == [(False, 2, 3), (False, 6, 6)]
     back = make_request(there, here.summary("robot/r1", 0, 0))
     assert [(w.start, w.first, w.last) for w in back.requested] == [(True, 8, 8)]
-
-
-def test_two_peers_that_ask_each_other_end_with_one_set():
-    occasions = [*said("r1", 5, "r2"), *said("r2", 4, "r1")]
-    one, other = (
-        replica_of(*(each for occasion in occasions[k::2] for each in occasion)) for k in (0, 1)
-    )
-    for _ in range(3):
-        for asker, answerer in ((one, other), (other, one)):
-            request = make_request(asker, answerer.summary("robot/r2", 0, 0))
-            for batch in [] if request is None else make_answer(answerer, request, "robot/r2"):
-                for key, payload in zip(batch.keys, batch.payloads, strict=True):
-                    asker.add(member_of(key, payload))
-    assert digest_of(one) == digest_of(other)
-    assert set(one.members()) == set(everything())
 
 
 def test_a_submap_without_its_inter_robot_measurements_is_not_told_as_here():
@@ -249,18 +216,6 @@ def test_the_end_of_one_robot_is_not_the_end_of_the_team(peer):
     assert not peer.peer.replica.concluded, "the set grows by what peers send"
 
 
-def test_an_end_in_another_robots_name_and_garbage_are_nobodys(peer):
-    forged = Sample(ch.CONCLUDED.key("r3"), ended("r1").payload, 0, 0, 0)
-    peer.take_end([ended("r1"), forged, Sample(forged.key, b"garbage", 0, 0, 0)])
-    assert not peer.is_left_alone
-
-
-def test_nobody_is_left_alone_while_another_is_there(peer):
-    peer.take_end([ended("r1"), ended("r3")])
-    peer.handle(build.liveliness(node="robot/r3"), 0)
-    assert not peer.is_left_alone
-
-
 @pytest.mark.parametrize("order", ORDERS)
 def test_whom_an_operator_has_given_up_or_withdrawn_is_not_waited_for(peer, order):
     peer.take_end([ended("r1")])
@@ -283,14 +238,6 @@ def test_after_any_schedule_all_peers_have_the_whole_set(part):
             whole = [share.count for share in node.replica.streams.values()]
             assert whole == [4, 4, 4], f"schedule {seed}: a fold is given {whole} submaps"
         assert not any(node.refused for node in storm.nodes.values()), seed
-
-
-def test_after_a_schedule_all_folds_are_handed_the_same_in_the_same_order():
-    storm = Storm(7)
-    storm.run()
-    first, *others = [list(storm.fed(name)) for name in storm.names]
-    assert len(first) == 3 * (1 + 4 + 1 + 1)
-    assert all(other == first for other in others)
 
 
 def test_without_questions_a_schedule_ends_with_different_sets():

@@ -98,21 +98,6 @@ def test_behind_flipped_bits_a_set_has_every_intact_record_and_names_the_loss(tm
         assert store.lost or store.torn
 
 
-def test_behind_zeroed_blocks_a_set_has_every_intact_record_and_names_the_loss(tmp_path):
-    rng = random.Random(2)
-    for _ in range(80):
-        size = rng.choice([16, 64, 512, 4096])
-        at = rng.randrange(len(WHOLE) - 16)
-        last = min(at + size, len(WHOLE)) - 1
-        damaged = bytearray(WHOLE)
-        damaged[at : last + 1] = bytes(last + 1 - at)
-        changed = [k for k in range(at, last + 1) if WHOLE[k]]
-        lost = set().union(*(touched(k, k) for k in changed))
-        store = check_recovered(tmp_path / "set", bytes(damaged), lost)
-        assert bool(store.lost or store.torn) == bool(changed)
-    assert check_recovered(tmp_path / "zeros", bytes(4096), set(range(99))).lost
-
-
 def test_what_is_known_to_be_lost_is_named_by_its_number(tmp_path, caplog):
     submaps = [k for k, each in enumerate(MEMBERS) if isinstance(each.message, m.Submap)]
     damaged = bytearray(WHOLE)

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from teamslam.sim.cli import log as cli_log
 from teamslam.sim.cli.main import app
-from teamslam.team.recording import tables
 from teamslam.team.recording.tables import ParquetTable, export_tables, numbers_of, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
@@ -48,21 +47,6 @@ def test_every_field_of_every_message_reads_back(tmp_path):
                 assert type(back) is type(value)
 
 
-def test_a_long_table_is_written_in_groups(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "GROUP_ROWS", 10)
-    samples = [sampled(c.ODOMETRY, "alpha", odometry(k), k) for k in range(35)]
-    log = recorded(tmp_path / "log.mcap", samples)
-    assert export_tables(log, tmp_path / "out", [c.ODOMETRY], ParquetTable).rows == {
-        tmp_path / "out" / "odometry.parquet": 35
-    }
-    file = pq.ParquetFile(tmp_path / "out" / "odometry.parquet")
-    assert file.num_row_groups == 4
-    assert file.read().column("number").to_pylist() == list(range(35))
-    monkeypatch.setattr(tables, "GROUP_BYTES", 1)
-    export_tables(log, tmp_path / "fine", form=ParquetTable)
-    assert pq.ParquetFile(tmp_path / "fine" / "odometry.parquet").num_row_groups == 35
-
-
 def test_without_pyarrow_the_command_says_what_to_install(tmp_path, monkeypatch):
     log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     command = ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "parquet"]
@@ -74,12 +58,3 @@ def test_without_pyarrow_the_command_says_what_to_install(tmp_path, monkeypatch)
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     assert "odometry.parquet: 1 row\n" in done.output
-
-
-def test_paths_are_exported_and_a_log_without_any_says_so(tmp_path):
-    log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
-    refused = CliRunner().invoke(
-        app, ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "tum"]
-    )
-    assert refused.exit_code != 0
-    assert "no robot's path in it" in refused.output or "no robot's path" in str(refused.exception)

@@ -95,22 +95,6 @@ def samples_of(count: int) -> list[Sample]:
     ]
 
 
-def test_what_an_earlier_part_has_is_not_written_again(path):
-    killed_part(path, samples_of(5))
-    recorder, inventory = next_part(path, "t", {"scenario": "s"})
-    network = MemoryNetwork()
-    bus, world = MemoryBus(network), MemoryBus(network)
-    with recorder:
-        loop = RecordLoop(bus, recorder, (), inventory)
-        for i in range(3, 8):
-            world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
-        loop.take(bus.receive())
-    assert logged(recorder.path, c.ODOMETRY) == 3
-    assert join(path) == [path]
-    assert logged(path, c.ODOMETRY) == 8
-    assert parts_of(path) == [path]
-
-
 @pytest.mark.parametrize("wrong", ["another scenario", "finished", "no log", "old"])
 def test_a_log_that_is_not_of_this_run_is_not_continued(wrong, path, monkeypatch):
     if wrong == "no log":
@@ -211,15 +195,6 @@ def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice
     assert join(path) == [path]
     assert numbers(path) == list(range(10))
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_log_that_was_joined_and_goes_on_gives_no_number_to_two_parts(path):
-    in_two_parts(path)
-    join(path)
-    final_part(path, 3, samples_of(12)[10:])
-    assert numbers(path) == list(range(12))
-    assert join(path) == [path]
-    assert numbers(path) == list(range(12))
 
 
 def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path):

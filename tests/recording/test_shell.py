@@ -4,7 +4,6 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from itertools import count as count_from
 from pathlib import Path
 
 import msgspec
@@ -16,7 +15,7 @@ from teamslam.team.recording import recorder as recorder_module
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.shell import PROGRESS_EVERY, RecordLoop, record, replay, schedule
+from teamslam.team.recording.shell import RecordLoop, record, replay, schedule
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
@@ -43,25 +42,6 @@ def endpoint():
 def messages_of(samples: list[Sample], channel: c.Channel) -> list[m.Message]:
     found = [opened(sample) for sample in samples]
     return [message for of, _, message in found if of is channel]
-
-
-def test_progress_is_told_every_256_measurements_and_when_it_is_quiet(path):
-    network = MemoryNetwork()
-    world, bus = MemoryBus(network), MemoryBus(network)
-    world.subscribe(c.RECORDER_PROGRESS)
-    told = []
-    with Recorder(path, "t", {}) as recorder:
-        loop = RecordLoop(bus, recorder, ())
-        measurement = count_from(0)
-        for count in (PROGRESS_EVERY - 1, 1, 10, 0, 0):
-            for _ in range(count):
-                world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(next(measurement))))
-            loop.take(bus.receive())
-            got = messages_of(world.receive(), c.RECORDER_PROGRESS)
-            told.append(
-                [message.measurements for message in got if isinstance(message, m.Progress)]
-            )
-    assert told == [[], [PROGRESS_EVERY], [], [PROGRESS_EVERY + 10], []]
 
 
 CONCLUDED = example(m.Concluded)
@@ -134,20 +114,6 @@ def test_a_new_incarnation_counts_from_zero(path):
         build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=0, measurements=2),
         build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=3, measurements=1),
     ]
-
-
-def test_a_submap_is_told_at_once_so_that_its_robot_does_not_leave_before(path):
-    network = MemoryNetwork()
-    robot, bus = MemoryBus(network), MemoryBus(network)
-    robot.subscribe(c.RECORDER_PROGRESS)
-    with Recorder(path, "t", {}) as recorder:
-        loop = RecordLoop(bus, recorder, ())
-        for sequence in (0, 1):
-            robot.publish(Outgoing(c.SUBMAP, "alpha", submap(sequence, "alpha")))
-            loop.take(bus.receive())
-            (told,) = messages_of(robot.receive(), c.RECORDER_PROGRESS)
-            assert isinstance(told, m.Progress)
-            assert (told.measurements, told.submaps) == (0, sequence + 1)
 
 
 def test_unsound_payloads_are_recorded_as_they_came(path):
@@ -346,21 +312,6 @@ def flows(source: ZenohBus, path: Path) -> None:
 PROBE = build.sightings(robot="probe", incarnation=0)
 
 
-def test_a_recording_ends_when_asked(path):
-    stop = threading.Event()
-    network = MemoryNetwork()
-    bus, world = MemoryBus(network), MemoryBus(network)
-
-    def stopping(status: m.Status) -> None:
-        world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(1)))
-        stop.set()
-
-    record(bus, Recorder(path, "t", {}), on_status=stopping, stop=stop)
-    log = open_log(path)
-    assert log.complete
-    assert messages_of(list(log.samples()), c.ODOMETRY) == [odometry(1)]
-
-
 def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them():
     stop = threading.Event()
     published: list[float] = []
@@ -379,20 +330,6 @@ def test_a_finite_speed_spaces_the_samples_and_a_stop_ends_them():
 
 def at(*stamps: int) -> list[Sample]:
     return [Sample("k", b"", stamp, 0, i) for i, stamp in enumerate(stamps)]
-
-
-def test_spacing_is_team_time_over_speed():
-    delays = [delay for delay, _ in schedule(at(5 * 10**9, 6 * 10**9, 8 * 10**9), speed=2.0)]
-    assert delays == [0.0, 0.5, 1.0]
-
-
-def test_a_sample_older_than_what_went_before_goes_at_once_and_costs_nothing():
-    delays = [delay for delay, _ in schedule(at(0, 2 * 10**9, 10**9, 3 * 10**9), speed=1.0)]
-    assert delays == [0.0, 2.0, 0.0, 1.0]
-
-
-def test_an_infinite_speed_never_waits():
-    assert {delay for delay, _ in schedule(at(0, 10**12, 10**15), math.inf)} == {0.0}
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])

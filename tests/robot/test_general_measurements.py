@@ -8,17 +8,12 @@ import pytest
 
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.recorded.chains import Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.batch_reference.reference import batch_map
 from teamslam.team import translate
-from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.rejection import Rejection
+from teamslam.team.config import MotionModel, MotionNoise
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
-from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
 from tests.sim.reruns import written
 
 MOUNT = (0.8, -0.3, 0.2)
@@ -80,48 +75,3 @@ def test_a_team_of_mounted_sensors_that_claim_is_mapped(estimator, fusion):
 def test_what_they_said_is_computed_again_to_the_last_bit(tmp_path):
     of = scenario()
     assert verify(written(tmp_path / "log.mcap", run(of))).first is None
-
-
-def test_the_batch_reference_takes_claims():
-    seen = np.array([7], np.uint32), np.ones(1), np.zeros(1)
-    claimed = Scan(*seen, np.array([[0.1, 0.02, 0.3, 0.0]]))
-    np.testing.assert_array_equal(claimed.noise(0, Sensor(), 1.0), [[0.1, 0.02], [0.02, 0.3]])
-    plain = Scan(*seen)
-    np.testing.assert_allclose(plain.noise(0, Sensor(), 1.0), np.diag([0.01, 4e-4]))
-
-
-def told(of: Scenario, samples: list[Sample]) -> list[Sample]:
-    """The same run with another scenario in its log."""
-    payload = encoded(configured("world", 0, 0, of))
-    return [
-        msgspec.structs.replace(sample, payload=payload)
-        if isinstance(opened(sample)[2], m.Configuration)
-        else sample
-        for sample in samples
-    ]
-
-
-@pytest.mark.parametrize("noise", ["white", "profile"])
-def test_the_batch_reference_links_the_poses_of_mounted_sensors(noise):
-    of = scenario()
-    found = batch_map(run(of), noise)
-    chains = chains_of(run(of), of)
-    measured = sum(len(scan.ids) for chain in chains for scan in chain.scans)
-    assert found.cost / (2 * measured - 2 * len(found.ids)) == pytest.approx(1.0, abs=0.15)
-    assert max(found.position_rmse_m.values()) < 0.4, "the base's poses"
-    assert max(found.final_pose_nees_per_dof.values()) < 5.0
-    elsewhere = tuple(
-        msgspec.structs.replace(
-            each, sensor=msgspec.structs.replace(each.sensor, mount=(0.8, 0.3, 0.0))
-        )
-        for each in of.robots
-    )
-    mutant = batch_map(told(msgspec.structs.replace(of, robots=elsewhere), run(of)), noise)
-    assert mutant.cost > 1.5 * found.cost
-
-
-def test_an_estimator_that_takes_no_claims_says_so():
-    samples = run(scenario("ekf-slam", "alone", steps=20))
-    done = [x for x in (opened(s)[2] for s in samples) if isinstance(x, m.Done)]
-    counted = {each.disposition: each.measurements for each in done[0].ledger}
-    assert counted[Rejection.CLAIMS.disposition] == 20

@@ -48,28 +48,6 @@ def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
     assert inbox.waiting == 0, "nothing of a past incarnation is kept"
 
 
-def test_who_stops_taking_finds_the_next_measurement_later():
-    inbox = Inbox()
-    for number in range(3):
-        inbox.put(measurement(number))
-    assert inbox.take_next().number == 0
-    assert names(inbox) == [(0, 1), (0, 2)]
-
-
-def test_the_gap_is_what_is_missing_before_the_earliest_that_waits():
-    inbox = Inbox()
-    assert inbox.gap is None
-    for number in (0, 4, 7):
-        inbox.put(measurement(number))
-    assert names(inbox) == [(0, 0)]
-    assert inbox.gap == (0, 1, 3)
-    for number in (1, 2, 3):
-        inbox.put(measurement(number))
-    assert inbox.gap is None
-    assert names(inbox) == [(0, 1), (0, 2), (0, 3), (0, 4)]
-    assert inbox.gap == (0, 5, 6)
-
-
 def test_a_later_incarnation_whose_beginning_is_missing_is_a_gap():
     inbox = Inbox()
     inbox.put(measurement(3, incarnation=1))
@@ -96,20 +74,6 @@ def test_what_an_earlier_life_consumed_is_not_taken_again():
     inbox.resume(2, 4)
     inbox.put(measurement(3, incarnation=2))
     assert names(inbox) == [(2, 4), (2, 5)]
-
-
-def test_received_counts_what_is_here_without_a_gap_consumed_or_not():
-    inbox = Inbox()
-    for number in (0, 1, 2, 4):
-        inbox.put(measurement(number))
-    assert inbox.received == 3
-    assert inbox.take_next().number == 0
-    assert inbox.received == 3
-    inbox.put(measurement(3))
-    assert inbox.received == 5
-    inbox.put(measurement(0, incarnation=1))
-    names(inbox)
-    assert inbox.received == 1
 
 
 def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():

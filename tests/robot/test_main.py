@@ -141,25 +141,6 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
     assert decoded(said.payload, m.Done).measurements == 1
 
 
-def test_a_source_that_has_published_nothing_yet_is_asked_again():
-    """A stranger who was there before the world made the robot begin at the stranger's word."""
-    network = MemoryNetwork()
-    source = Source(network)
-    source.answers = False
-    source.bus.declare_alive("world")
-    shell = lived(network, MemoryBus(network), lambda: source.begins(4))
-    assert shell.node.incarnation == 0
-    assert source.asked
-
-
-def test_where_no_source_answers_the_message_itself_is_believed():
-    network = MemoryNetwork()
-    source = Source(network)
-    network.answers.clear()  # a replayed log
-    shell = lived(network, MemoryBus(network), lambda: source.begins(3))
-    assert (shell.node.incarnation, shell.node.next_measurement) == (3, 1)
-
-
 class Published(Source):
     """A source that has its initial pose and one odometry interval to give."""
 

@@ -20,7 +20,6 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import codec
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
-from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.digest import digest_of
 from tests.support import fused_map, packed, spd
@@ -117,25 +116,6 @@ def test_the_prior_does_change_the_team_pose():
         poses.append(payloads(out, ch.TEAM_POSE))
     assert len(poses[0]) == len(poses[1]) > 0
     assert poses[0] != poses[1]
-
-
-def test_an_older_prior_does_not_replace_the_one_that_is_held():
-    """Closed and provisional broadcasts alternate: the closed one has fewer of everyone's."""
-    poses = []
-    newer = msgspec.structs.replace(
-        prior(2, at=3.0), members=(m.VersionEntry(robot="r1", incarnation=1, sequence=2),)
-    )
-    older = msgspec.structs.replace(
-        prior(1), members=(m.VersionEntry(robot="r1", incarnation=1, sequence=1),)
-    )
-    for after in ((), (older,), (newer,), (older, newer, older)):
-        node = RobotNode(config())
-        out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
-        for message in (newer, *after):
-            out += node.handle(message, 0)
-        out += [o for r in MEASUREMENTS[10:] for o in node.handle(r, 0)]
-        poses.append(payloads(out, ch.TEAM_POSE))
-    assert poses[0] == poses[1] == poses[2] == poses[3]
 
 
 def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
@@ -270,19 +250,6 @@ def test_everything_it_sends_passes_the_door():
     assert {o.channel for o in out} >= {ch.SUBMAP, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE}
 
 
-def test_progress_never_passes_a_window_that_may_still_end(monkeypatch):
-    """At a progress's stamp every submap that ends there or before has been sent."""
-    monkeypatch.setattr(robot_node, "PROGRESS_MEASUREMENTS", 1)
-    node, passed = RobotNode(config()), -1
-    for measurement in published(stream("r1", 12)):
-        for o in node.handle(measurement, 0):
-            if o.channel is ch.ROBOT_PROGRESS:
-                passed = max(passed, o.message.stamp_ns)
-            if o.channel is ch.SUBMAP:
-                assert o.message.stamp_ns > passed
-    assert passed == 12_000_000_000
-
-
 def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeypatch):
     monkeypatch.setattr(robot_node, "CREDIT_SUBMAPS", 1)
     node = RobotNode(config())
@@ -308,36 +275,6 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
     assert payloads(out) == lonely()
     assert len(of(out, ch.ROBOT_DONE)) == 1
-
-
-def test_missing_measurements_are_asked_for():
-    node = RobotNode(config())
-    assert node.request() is None
-    node.handle(MEASUREMENTS[3], 0)
-    assert node.request() == m.MeasurementsRequest(
-        stamp_ns=0, robot="r1", incarnation=1, first=0, last=2
-    ), "the very first ones too"
-    for measurement in MEASUREMENTS[:3]:
-        node.handle(measurement, 0)
-    assert node.request() is None
-    node.handle(MEASUREMENTS[8], 0)
-    wanted = node.request()
-    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 4, 7)
-    for measurement in MEASUREMENTS[4:8]:
-        node.handle(measurement, 0)
-    node.handle(END, 0)
-    wanted = node.request()
-    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 9, len(MEASUREMENTS) - 1)
-    for measurement in MEASUREMENTS[9:]:
-        node.handle(measurement, 0)
-    assert node.request() is None
-
-
-def test_a_stream_that_was_missed_entirely_is_asked_for_at_its_end():
-    node = RobotNode(config())
-    node.handle(END, 0)
-    wanted = node.request()
-    assert (wanted.incarnation, wanted.first, wanted.last) == (1, 0, len(MEASUREMENTS) - 1)
 
 
 def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
@@ -384,33 +321,6 @@ def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
 
-def test_waiting_for_an_exchange_a_robot_reports_what_it_has_received(monkeypatch):
-    """Else the world waits for it, and it for a teammate that waits for the world."""
-    monkeypatch.setattr(robot_node, "PROGRESS_MEASUREMENTS", 4)
-    node = feedback()
-    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)]
-    assert node.next_measurement < len(MEASUREMENTS) - 10
-    reported = max(p.measurements for p in of(out, ch.ROBOT_PROGRESS))
-    assert len(MEASUREMENTS) - 4 < reported <= len(MEASUREMENTS)
-
-
-def test_under_feedback_the_last_map_is_sent_whether_or_not_an_exchange_is_due():
-    for estimator, fusion in (("hybrid", "kalman"), ("hybrid-thesis", "kalman-per-axis")):
-        node = node_for(config(estimator=estimator, fusion=fusion, exchange_s=1e6))
-        node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
-        maps = of(driven(node, MEASUREMENTS), ch.OWN_MAP)
-        assert len(maps) == 2
-        assert maps[-1].stamp_ns > maps[0].stamp_ns
-
-
-def test_under_feedback_a_lost_centre_is_not_waited_for():
-    node = feedback()
-    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
-    assert not of(out, ch.ROBOT_DONE)
-    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
-    assert len(of(out, ch.ROBOT_DONE)) == 1
-
-
 def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkeypatch):
     checked = []
 
@@ -434,49 +344,6 @@ def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkey
     assert [ids(x.ids, "ids")[1:].tolist() for x in sent] == [
         ids(x.ids, "ids").tolist() for x in rest
     ]
-
-
-def test_running_maps_and_particles_go_out_for_the_windows_with_a_multiple_of_pose_s():
-    """Windows end at 3, 6, 9 and 12 s; the maps are those of a robot that sends them all."""
-    every = driven(RobotNode(config()), MEASUREMENTS)
-    some = driven(RobotNode(config(pose_s=4.0)), MEASUREMENTS)
-    never = driven(RobotNode(config(pose_s=1e6)), MEASUREMENTS)
-    for channel in (ch.OWN_MAP, ch.PARTICLES):
-        sent = of(every, channel)
-        assert [x.stamp_ns // 10**9 for x in sent] == [3, 6, 9, 12]
-        assert of(some, channel) == [x for x in sent if x.stamp_ns // 10**9 != 3]
-        assert not of(never, channel)
-
-    def means(out):
-        return [x.mean for x in of(out, ch.SUBMAP)]
-
-    assert means(every) == means(some) == means(never)
-
-
-def test_the_final_map_ends_it():
-    node = RobotNode(config())
-    driven(node, MEASUREMENTS)
-    assert not node.finished
-    node.handle(fused(final=True), 0)
-    assert node.finished
-
-
-def test_its_status_says_what_it_is_doing():
-    node = RobotNode(config())
-    assert node.status().state == "waiting"
-    for measurement in MEASUREMENTS[:9]:
-        node.handle(measurement, 0)
-    status = node.status()
-    assert status.state == "mapping"
-    assert status.figures["measurements"] == 9.0
-    assert status.figures["steps"] == sum(isinstance(r, m.Odometry) for r in MEASUREMENTS[:9])
-    driven(node, MEASUREMENTS[9:])
-    assert node.status().state == "done"
-
-
-def test_out_of_its_messages_none_is_on_another_robots_key():
-    out: list[Outgoing] = driven(RobotNode(config()), MEASUREMENTS)
-    assert {o.name for o in out} == {"r1"}
 
 
 def test_its_nis_is_that_of_its_windows_and_of_the_open_one():

@@ -7,7 +7,7 @@ import pytest
 
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, dumps, loads
+from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -110,11 +110,3 @@ def test_a_recorded_rendezvous_is_computed_again_to_the_last_bit(tmp_path):
     assert sum(x.submaps for x in told) == sum(x.key.endswith("/submap") for x in samples)
     found = verify(written(tmp_path / "log.mcap", samples))
     assert found.first is None
-
-
-def test_a_scenario_says_how_robots_exchange_and_only_submaps_can_wait():
-    scenario = at_rendezvous(SCENARIO)
-    assert loads(dumps(scenario)).exchange == "rendezvous"
-    fields = msgspec.to_builtins(scenario) | {"fusion": "kalman"}
-    with pytest.raises(ScenarioError, match="needs a continuous exchange"):
-        loads(msgspec.json.encode(fields).decode())

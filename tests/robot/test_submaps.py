@@ -84,15 +84,3 @@ def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on():
     assert [type(each).__name__ for each in every] == 2 * ["InitialPose", *3 * ["Submap"]]
     assert len(submaps) == submaps.sent == 3
     assert submaps.answer(request(incarnation=3)) == []
-
-
-def test_a_member_that_is_restored_twice_is_held_once():
-    submaps = Submaps("r1", "rendezvous")
-    submaps.begin(start(1))
-    for message in 2 * (start(1), sent(0, 1)):
-        submaps.restore(message)
-    assert [decoded(each) for each in submaps.answer(request())] == [
-        start(1),
-        sent(0, 1),
-    ]
-    assert submaps.since_ns is None, "an earlier process has sent it"

@@ -32,13 +32,6 @@ def prior(sequence: int) -> m.Prior:
     )
 
 
-def test_the_map_that_is_kept_is_the_one_that_is_made_anew():
-    kept, told = TeamMap(), prior(1)
-    for known in range(2, 7):
-        again = TeamMap().join(told, LOCALS[:known])
-        assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == again.whole.mean.tobytes()
-
-
 def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch):
     """The oldest submaps are condensed, by their order alone, whenever it is asked for."""
     submaps = [each.local for each in team(1, robots=1, submaps=5 * CONDENSED).submaps]

@@ -1,15 +1,11 @@
 """Landmarks without names: detections, classes."""
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.verification.verification import verify
-from teamslam.sim.datasets.detections_table import detections_of
-from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -119,44 +115,7 @@ def test_a_log_with_hidden_identities_is_computed_again_to_the_same_bytes(run, t
     assert checked["association"].equal == checked["association"].messages > 3
 
 
-def test_the_same_world_with_known_identities_has_the_same_measurements():
-    without = streams_of(hidden()).streams[0].landmark_detections
-    scenario = hidden()
-    known = msgspec.structs.replace(scenario.world, identities="known")
-    named = streams_of(msgspec.structs.replace(scenario, world=known)).streams[0]
-    assert without.hidden.all()
-    for name in ("stamps_ns", "ids", "ranges", "bearings"):
-        assert np.array_equal(getattr(without, name), getattr(named.landmark_detections, name))
-
-
 TREES = np.array([[3.0, 1.0], [5.0, -2.0], [8.0, 2.0], [11.0, -1.0]])
-
-
-def table(folder: Path, *classes: object) -> Path:
-    folder.mkdir()
-    rows = [f"{k},{2 + k},0.1,{name}" for k, name in enumerate(classes)]
-    text = "\n".join(["t_s,range_m,bearing_rad,class", *rows])
-    (folder / "detections.csv").write_text(text)
-    return folder
-
-
-def test_a_tables_class_is_a_column_of_the_confusion_matrix(tmp_path):
-    seen = detections_of(table(tmp_path / "r1", 2, 0), "r1")
-    assert seen.classes is not None
-    assert np.allclose(np.exp(seen.classes), [[0.025, 0.025, 0.95], [0.95, 0.025, 0.025]])
-    with pytest.raises(DatasetError, match=r"line 3.*class"):
-        detections_of(table(tmp_path / "r2", 1, "2.5"), "r2")
-
-
-def test_a_class_may_have_a_name_and_all_robots_have_the_classes_that_are_named(tmp_path):
-    names = ("tree", "pole", "sign")
-    seen = detections_of(table(tmp_path / "r1", "pole", "tree", 1), "r1", names)
-    assert seen.classes is not None
-    assert np.exp(seen.classes).round(3).tolist() == [
-        [0.025, 0.95, 0.025], [0.95, 0.025, 0.025], [0.025, 0.95, 0.025],
-    ]  # fmt: skip
-    with pytest.raises(DatasetError, match=r"line 2.*'bush' is no name in central.classes, which "):
-        detections_of(table(tmp_path / "r2", "bush"), "r2", names)
 
 
 def test_a_driver_gives_probabilities_and_a_wrong_shape_is_named():

@@ -106,14 +106,6 @@ def test_a_landmark_s_block_is_that_of_the_packed_covariance(joint):
     np.testing.assert_array_equal(landmark_blocks_of(example(m.FusedMap, **changed)), blocks)
 
 
-def test_an_ellipse_has_the_directions_of_its_covariance():
-    turn, axes = 0.7, np.array([3.0, 0.5])
-    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    major, minor, direction = ellipse(R @ np.diag(axes**2) @ R.T)
-    assert (major, minor) == pytest.approx((12.0, 2.0))
-    assert math.tan(direction) == pytest.approx(math.tan(turn))
-
-
 @pytest.mark.parametrize(
     ("topic", "frame", "namespace", "tf"),
     [

@@ -16,10 +16,9 @@ from teamslam.team.driver.journal import Journal
 from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
-from teamslam.team.ros2.keys import of_rmw, of_token
 from teamslam.team.ros2.topics import RobotTopics, TopicsError, load_topics
 from teamslam.team.ros2.translator import Measured
-from teamslam.team.ros2_driver import BEHIND_S, MOST_REASONS, SILENT_S, Ros2Driver
+from teamslam.team.ros2_driver import BEHIND_S, SILENT_S, Ros2Driver
 from teamslam.team.wire.digest import configured
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
@@ -223,19 +222,6 @@ def test_a_sensor_whose_place_comes_late_is_there_from_then_on():
     assert found == [0.2]
 
 
-def test_keys_name_topic_and_type():
-    assert of_rmw(by_rmw("/r1/odom", ODOMETRY), 0) == ("/r1/odom", ODOMETRY)
-    humble = "7/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported"
-    assert of_rmw(humble, 7) == ("/odom", ODOMETRY)
-    assert of_rmw(humble, 0) is None
-    assert of_rmw("r1/odom", 0) is None
-    assert of_token("@/beef/@ros2_lv/MS/odom/nav_msgs§msg§Odometry/:::") is None
-    assert of_token("@/beef/@ros2_lv/MP/r1§odom/nav_msgs§msg§Odometry/:::") == (
-        "/r1/odom",
-        ODOMETRY,
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -276,14 +262,6 @@ def test_a_sound_message_that_can_not_be_translated_is_set_aside_and_the_driver_
         driver.take(ForeignSample(key, odometry(k)))
     assert driver.dropped == {"/r1/odom: set aside": 1}
     assert len(robot.calls) == 2
-
-
-def test_the_reasons_that_are_told_apart_are_bounded():
-    driver = Ros2Driver(Robot(), TOPICS)
-    for k in range(2 * MOST_REASONS):
-        driver.take(ForeignSample(f"0/r1/odom/what::msg::dds_::Ever{k}_/RIHS01_0", b""))
-    assert len(driver.dropped) == MOST_REASONS + 1
-    assert driver.dropped["for other reasons"] == MOST_REASONS
 
 
 def numbered(number: int, gid: bytes = b"a" * 16) -> bytes:

@@ -1,7 +1,6 @@
 """Order and gaps of what arrives, and intervals of numbers."""
 
 import itertools
-from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -147,32 +146,6 @@ def test_intervals_are_the_set_in_ascending_disjoint_pieces_that_do_not_touch(of
     intervals, model = both(of)
     assert expanded(list(intervals)) == sorted(model)
     assert len(intervals) == len(list(intervals)) == sum(n - 1 not in model for n in model)
-
-
-@given(pairs, numbers)
-def test_membership_and_the_nearest_absent_numbers_are_those_of_the_set(of, number):
-    intervals, model = both(of)
-    assert (number in intervals) == (number in model)
-    assert intervals.next_absent(number) == next(n for n in range(number, 99) if n not in model)
-    assert intervals.last_absent(number) == next(
-        n for n in range(number, -99, -1) if n not in model
-    )
-
-
-@given(pairs, numbers, numbers)
-def test_gaps_are_the_complement_within_their_bounds(of, first, last):
-    intervals, model = both(of)
-    gaps = intervals.gaps(first, last)
-    assert expanded(gaps) == [n for n in range(first, last + 1) if n not in model]
-    assert all(a[1] + 1 < b[0] for a, b in pairwise(gaps))
-
-
-def test_four_billion_numbers_are_one_interval():
-    intervals = IntervalSet()
-    intervals.add(0, 2**32 - 1)
-    intervals.add(2**40, 2**63)
-    assert list(intervals) == [(0, 2**32 - 1), (2**40, 2**63)]
-    assert intervals.gaps(0, 2**41) == [(2**32, 2**40 - 1)]
 
 
 @given(pairs, st.integers(1, 9))

@@ -6,7 +6,6 @@ from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import WireError, encoded
-from teamslam.team.wire.views import PARTICLES, view_of
 from tests.support import odometry, submap
 
 
@@ -34,10 +33,6 @@ def test_no_two_channels_share_a_name_or_a_key():
     assert len({channel.template for channel in c.CHANNELS}) == len(c.CHANNELS)
 
 
-def test_a_message_is_opened_with_its_channel_and_robot():
-    assert opened(sample("robot/alpha/submap", submap(3))) == (c.SUBMAP, "alpha", submap(3))
-
-
 def test_a_key_that_no_channel_has_is_refused():
     with pytest.raises(WireError, match="no channel has the key 'robot/alpha/gossip'"):
         opened(sample("robot/alpha/gossip", submap(0)))
@@ -51,12 +46,3 @@ def test_a_robots_message_on_another_robots_key_is_refused():
 def test_a_message_on_another_channels_key_is_refused():
     with pytest.raises(WireError, match="wrong tag: 'odometry/1' where 'submap/1' belongs"):
         opened(sample("robot/alpha/submap", odometry(0)))
-
-
-def test_a_view_is_of_its_row_and_is_opened_by_nobody():
-    assert c.VIEW.owner("view/particles/alpha") == "particles/alpha"
-    assert view_of("view/particles/alpha") is PARTICLES
-    assert view_of("view/nothing") is None
-    assert view_of("robot/alpha/particles") is None
-    with pytest.raises(WireError, match="no channel has the key 'view/map'"):
-        opened(Sample("view/map", b"", 0, 0, 0))

@@ -29,7 +29,6 @@ from teamslam.team.wire.codec import (
     check_structure,
     decoded,
     encoded,
-    read_tag,
     tag_in,
 )
 from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
@@ -109,10 +108,6 @@ def test_a_key_of_several_kinds_takes_them_and_names_them_for_another():
         decoded(encoded(odometry(0)), *kinds)
     with pytest.raises(WireError, match="wrong version: 'detections/9' where detections/1 is"):
         decoded(msgpack.packb(["detections/9"]), *kinds)
-
-
-def test_no_tag_is_read_where_there_is_none():
-    assert [tag_in(data) for data in (b"", b"\x98", b"\x98\x01\x02")] == ["", "", ""]
 
 
 def with_fields(message: m.Message, **values: object) -> bytes:
@@ -355,26 +350,10 @@ def count(value: Any) -> int:
     return 1 + sum(map(count, value)) if isinstance(value, list) else 1
 
 
-def depth(value: Any) -> int:
-    if isinstance(value, dict):
-        value = list(value.values())
-    inner = value if isinstance(value, list) else None
-    return 0 if inner is None else 1 + max(map(depth, inner), default=0)
-
-
 def reason_of_structure(payload: bytes) -> str:
     with pytest.raises(StructureError) as refused:
         check_structure(payload)
     return refused.value.reason
-
-
-@given(values, st.booleans())
-def test_every_value_is_counted_and_its_end_found(value, single):
-    payload = msgpack.packb(value, use_single_float=single)
-    check_structure(payload)
-    check_structure(payload + b"\xc1")
-    for cut in {0, len(payload) // 2, len(payload) - 1}:
-        assert reason_of_structure(payload[:cut]) == "truncated"
 
 
 @pytest.mark.parametrize("nested", range(DEEPEST - 2, DEEPEST + 3))
@@ -384,27 +363,6 @@ def test_nesting_is_bounded(nested):
         check_structure(payload)
     else:
         assert reason_of_structure(payload) == "too deep"
-
-
-def test_no_message_is_near_the_bounds_and_each_has_its_tag():
-    deepest = 0
-    for message in examples():
-        payload = encoded(message)
-        check_structure(payload)
-        assert read_tag(payload) == type(message).__struct_config__.tag
-        deepest = max(deepest, depth(msgpack.unpackb(payload)))
-    assert 2 * deepest <= DEEPEST
-
-
-@pytest.mark.parametrize(
-    "head", [b"\x91\xa3x/1", b"\xdc\x00\x01\xa3x/1", b"\xdd\x00\x00\x00\x01\xa3x/1",
-             b"\x91\xd9\x03x/1", b"\x91\xda\x00\x03x/1", b"\x91\xdb\x00\x00\x00\x03x/1"]
-)  # fmt: skip
-def test_a_tag_is_read_in_every_form_of_an_array_and_a_text(head):
-    assert read_tag(head) == msgpack.unpackb(head)[0] == "x/1"
-    for cut in range(len(head)):
-        with pytest.raises(StructureError):
-            read_tag(head[:cut])
 
 
 def verdict(check, *arguments):

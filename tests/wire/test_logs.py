@@ -21,13 +21,6 @@ def test_a_hostile_text_is_one_printable_line():
     assert lines("one\ntwo\x1b") == "one\ntwo\\x1b"
 
 
-def test_a_log_line_is_escaped_whoever_formats_it(caplog):
-    logging.getLogger("teamslam").warning("%s: dropped", HOSTILE + "x" * 100_000)
-    assert len(caplog.messages) == 1
-    assert caplog.messages[0].startswith(PRINTABLE)
-    assert len(caplog.messages[0]) <= logs.LONGEST
-
-
 def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(request, caplog):
     now, made = [1000.0], logging.getLogRecordFactory()
 

@@ -7,7 +7,6 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, replied
 from teamslam.team.wire.codec import WireError, encoded
-from teamslam.team.wire.zenoh import stored_samples as stored_module
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 from tests import build
 from tests.support import example
@@ -115,17 +114,6 @@ def test_an_end_is_sent_to_whose_run_is_older():
     stored.take(final, 10.0)
     assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=2.9) == []
     assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=3.1) == [final]
-
-
-def test_of_more_than_a_team_has_the_first_are_kept(monkeypatch):
-    monkeypatch.setattr(stored_module, "MOST_ORDERS", 3)
-    monkeypatch.setattr(stored_module, "MOST_ENDS", 2)
-    stored = StoredMessages()
-    for number in range(4):
-        stored.take(order(number), 0.0)
-        stored.take(sample(ch.TEAM_FINAL, f"r{number}", FINAL), 0.0)
-    assert of(stored, *ch.ORDERS) == [order(number) for number in range(3)]
-    assert [each.key[6:8] for each in of(stored, ch.TEAM_FINAL, run_s=1.0)] == ["r0", "r1"]
 
 
 def test_every_order_of_an_operator_is_stored_with_its_signature():

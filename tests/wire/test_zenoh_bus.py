@@ -10,13 +10,12 @@ import time
 import msgspec
 import pytest
 import zenoh
-from zenoh.handlers import Callback
 
 from teamslam.team import end_query
 from teamslam.team.end_query import EndQuery
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import MAPS_CACHE, BusError, Outgoing, Sample, opened
+from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from teamslam.team.wire.zenoh import bus as zenoh_bus
 from teamslam.team.wire.zenoh import recovery as recovery_module
@@ -30,7 +29,6 @@ from tests.support import (
     ROOT,
     Link,
     example,
-    nobody_listens,
     odometry,
     received,
     submap,
@@ -69,37 +67,8 @@ def progress(i: int) -> Outgoing:
     )
 
 
-MORE = 34
-
-
 def counters(samples: list[Sample], key: str) -> list[int]:
     return [sample.counter for sample in samples if sample.key == key]
-
-
-def test_what_was_published_before_close_reaches_a_reader_that_is_slow(endpoint):
-    """A session drops what its link has not sent about a second after its close."""
-    arrived: list[int] = []
-
-    def read(sample: zenoh.Sample) -> None:
-        time.sleep(0.01)
-        arrived.append(int.from_bytes(sample.payload.to_bytes()[:4], "little"))
-
-    def publish(number: int) -> None:
-        payload = number.to_bytes(4, "little") + bytes(100_000)
-        source.publish_raw(Sample("source/alpha/odometry", payload, 0, 0, 0))
-
-    def reaches() -> bool:
-        publish(0)
-        return bool(arrived)
-
-    with client(endpoint, 5.0, None) as reader, ZenohBus("t", endpoint) as source:
-        reader.declare_subscriber("team/t/source/**", Callback(read, indirect=False))
-        wait_until(reaches)
-        for number in range(1, 200):
-            publish(number)
-        source.close()
-        wait_until(lambda: arrived[-1:] == [199])
-    assert arrived[-199:] == list(range(1, 200))
 
 
 @pytest.mark.parametrize("behind", ["source", "sink"])
@@ -122,28 +91,6 @@ def test_a_cut_link_loses_nothing_but_streams(endpoint, behind):
     assert counters(arrived, "robot/alpha/submap") == list(range(100))
     assert counters(arrived, "robot/alpha/progress") == list(range(100))
     assert counters(arrived, "robot/bravo/submap") == [0]
-
-
-def test_of_more_maps_than_are_kept_a_cut_link_still_gets_the_newest(endpoint):
-    with (
-        Link(endpoint) as link,
-        ZenohBus("t", endpoint) as source,
-        ZenohBus("t", link.endpoint) as sink,
-    ):
-        flowing(source, sink, c.FUSED_MAP)
-        for i in range(10 + MORE + MAPS_CACHE):
-            if i == 10:
-                arrived = received(sink, 10)
-                link.cut()
-            source.publish_raw(Sample("central/map", b"map", i, 0, i))
-        link.mend()
-        wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or arrived[-1].counter == i))
-        source.publish_raw(Sample("central/map", b"map", i + 1, 0, i + 1))
-        arrived += received(sink, 1)
-        wait_until(
-            lambda: bool(sink.receive(0.02) or sink.lacking() == {"central/map": [(10, 9 + MORE)]})
-        )
-    assert counters(arrived, "central/map") == [*range(10), *range(10 + MORE, i + 2)]
 
 
 def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint):
@@ -214,14 +161,6 @@ def test_a_process_that_dies_of_an_exception_ends(endpoint):
     assert told.endswith("RuntimeError: of an exception\n")
 
 
-def test_nobody_at_the_endpoint_is_an_error_that_says_what_to_do():
-    with (
-        nobody_listens() as free,
-        pytest.raises(BusError, match=f"no router answers at {free}.*start `teamslam router`"),
-    ):
-        ZenohBus("t", free, patience_s=0.3)
-
-
 def test_a_client_waits_for_a_router_that_starts_later():
     with router() as free:
         pass
@@ -263,13 +202,6 @@ def test_an_answer_that_never_comes_is_an_error(endpoint):
 def test_a_payload_beyond_the_limit_is_not_sent(endpoint):
     with ZenohBus("t", endpoint) as bus, pytest.raises(BusError, match="split the map"):
         bus.publish_raw(Sample("robot/alpha/submap", bytes(LARGEST_PAYLOAD + 1), 0, 0, 0))
-
-
-def test_the_largest_payload_arrives(endpoint):
-    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
-        flowing(source, sink, c.FUSED_MAP)
-        source.publish_raw(Sample("central/map", bytes(LARGEST_PAYLOAD), 0, 0, 0))
-        assert [len(sample.payload) for sample in received(sink, 1)] == [LARGEST_PAYLOAD]
 
 
 def test_a_publication_without_its_attachment_is_dropped_and_logged(endpoint, caplog):
@@ -365,19 +297,6 @@ def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
             bus.receive(0.05)
         assert bus.lacking() == {}
     assert "asked for" not in caplog.text
-
-
-def test_on_a_key_of_no_channel_nothing_is_missing(endpoint):
-    """As Zenoh composed it of two when links had been cut: it is handed on, and that is all."""
-    with client(endpoint, 5.0, None) as session:
-        publisher = zenoh.SourceInfo(session.declare_publisher("any").id, 390)
-        recovery = Recovery(session, "team/t/", lambda item: None)
-        mixed = Sample("recorder/progress/r46/r13/status", b"", 0, 0, 390)
-        assert recovery.arrived(mixed, publisher) == [mixed]
-        assert recovery.lacking() == {}
-        own = Sample("robot/r13/submap", b"", 0, 0, 390)
-        assert recovery.arrived(own, publisher) == []
-        assert recovery.lacking() == {"robot/r13/submap": [(0, 389)]}
 
 
 def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
@@ -484,13 +403,6 @@ def test_close_wakes_a_receiver_and_ends_the_bus(endpoint):
     for act in (bus.receive, lambda: bus.subscribe(c.SUBMAP), lambda: bus.publish(progress(0))):
         with pytest.raises(BusError, match="closed"):
             act()
-
-
-def test_a_subscription_to_all_after_one_by_name_is_refused(endpoint):
-    with ZenohBus("t", endpoint) as bus:
-        bus.subscribe(c.SUBMAP, "alpha")
-        with pytest.raises(BusError, match="deliver twice"):
-            bus.subscribe(c.SUBMAP)
 
 
 def join_late(endpoint: str, team: str, rng: random.Random) -> dict[str, list[int]]:
