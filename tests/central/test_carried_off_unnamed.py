@@ -110,9 +110,10 @@ def test_the_cut_depends_on_no_order_of_arrival():
         for start in (each for each in of.messages if isinstance(each, m.InitialPose)):
             ticks.add_start(translate.start_of(start))
         submaps = [each for each in of.messages if isinstance(each, m.Submap)]
-        for each in sorted(submaps, key=lambda each: each.stamp_ns, reverse=backwards):
+        ordered = sorted(submaps, key=lambda each: each.stamp_ns, reverse=backwards)
+        for number, each in enumerate(ordered):
             ticks.add_submap(each, bytes(8))
-            if not backwards:
+            if not backwards and number % 10 == 0:
                 ticks.fold_until(each.stamp_ns)
         folds.append(ticks.solve())
         assert ticks.members(folds[-1])["r2", 1] == 21

@@ -59,20 +59,6 @@ async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Proce
     return await team.start("robot", found.scenario, "r1", "--connect", endpoint, name=name)
 
 
-async def test_a_robot_that_dies_and_is_started_again_changes_no_bit_of_the_map(team):
-    found = await assembled(team, "10")  # it must die before its end, on a busy machine too
-    first = await robot(team, found, found.endpoint, "r1")
-    with Observer(found.endpoint, [ch.SUBMAP]) as seen:
-        await seen.sees(2, ch.SUBMAP, "r1")
-        first.signal(signal.SIGKILL)
-        assert await first.ended() == -signal.SIGKILL
-    found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
-    await found.ends_well()
-    assert "resumed after submap" in found.robots["r1"].said()
-    assert found.others[1].said().count("robot/r1 is lost") == 1
-    assert found.final_map() == map_in_memory(found.scenario)
-
-
 async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(team):
     """The link is cut until the world has ended."""
     found = await assembled(team, "10")
