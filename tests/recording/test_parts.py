@@ -150,20 +150,6 @@ def test_a_robots_final_map_ends_the_log_of_a_team_without_a_centre_only(path: P
         check_continues(path, "t", {"scenario": "s"}, ends=(c.FINAL_MAP, c.TEAM_FINAL))
 
 
-@pytest.mark.parametrize("written", [0, 8, 500, 10**9])
-def test_a_joining_that_was_killed_while_it_copied_is_begun_again(path, written):
-    in_two_parts(path)
-    whole = path.with_name(f"{path.name}.joining")
-    whole.write_bytes(part_of(path, 2).read_bytes()[:written])
-    assert not check_continues(path, "t", {"scenario": "s"}), (
-        "the run is over, and the joining is not"
-    )
-    assert numbers(path) == list(range(10))
-    assert join(path) == [path]
-    assert numbers(path) == list(range(10))
-    assert list(path.parent.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("removed", [0, 1])
 def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice(
     path, removed, monkeypatch

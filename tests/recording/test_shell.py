@@ -23,7 +23,7 @@ from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
-from tests.support import Link, example, odometry, received, submap, wait_until
+from tests.support import example, odometry, received, submap, wait_until
 
 FINAL = example(m.FusedMap)
 
@@ -89,31 +89,6 @@ def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(path, monkeypatch):
     assert sum(key.endswith("/status") for key in counts) == 9
     assert figures["dropped_samples"] == 20 + 11
     assert holes(open_log(path)) == []
-
-
-def test_a_new_incarnation_counts_from_zero(path):
-    network = MemoryNetwork()
-    world, bus = MemoryBus(network), MemoryBus(network)
-    world.subscribe(c.RECORDER_PROGRESS)
-    with Recorder(path, "t", {}) as recorder:
-        loop = RecordLoop(bus, recorder, ())
-        for incarnation, measurement in ((0, 0), (0, 1), (3, 0)):
-            message = build.odometry(
-                stamp_ns=7,
-                robot="alpha",
-                incarnation=incarnation,
-                number=measurement,
-                duration_ns=0,
-                forward=0.0,
-                yaw_rate=0.0,
-            )
-            world.publish(Outgoing(c.ODOMETRY, "alpha", message))
-        loop.take(bus.receive())
-        loop.take([])
-    assert messages_of(world.receive(), c.RECORDER_PROGRESS) == [
-        build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=0, measurements=2),
-        build.progress(stamp_ns=7, node="recorder", robot="alpha", incarnation=3, measurements=1),
-    ]
 
 
 def test_unsound_payloads_are_recorded_as_they_came(path):
@@ -228,62 +203,6 @@ POSE = example(m.PoseEstimate)
 
 def logged(path: Path, channel: c.Channel) -> int:
     return len(list(open_log(path).samples([channel])))
-
-
-@pytest.mark.parametrize("away", ["the router", "the recorder's link"])
-def test_what_is_said_while_the_recorder_is_cut_off_is_in_the_log(path, endpoint, away):
-    """Measurements are asked of their source, the rest of its publisher's cache: it is whole."""
-    with (
-        Link(endpoint) as link,
-        ZenohBus("t", link.endpoint if away == "the router" else endpoint) as source,
-        ZenohBus("t", link.endpoint) as bus,
-    ):
-        team = Team(source)
-        source.watch_alive("recorder")
-        source.declare_alive("robot/alpha")
-        thread = threading.Thread(target=record, args=(bus, Recorder(path, "t", {})))
-        thread.start()
-        received(source, 1)
-        team.says(100)
-        wait_until(lambda: logged(path, c.OWN_POSE) == 10)
-        link.cut()
-        team.says(300)
-        link.mend()
-        team.says(20)
-        team.ends(lambda: logged(path, c.ODOMETRY) == 420 and logged(path, c.OWN_POSE) == 42)
-        thread.join(60.0)
-    log = open_log(path)
-    samples = list(log.samples())
-    assert sorted(messages_of(samples, c.ODOMETRY), key=lambda x: x.stamp_ns) == team.published
-    assert sorted(messages_of(samples, c.SUBMAP), key=lambda x: x.stamp_ns) == team.submaps
-    assert sorted(s.counter for s in log.samples([c.OWN_POSE])) == list(range(42))
-    assert holes(log) == []
-    assert len(messages_of(samples, c.TALLY)) == 1
-
-
-def test_what_nobody_has_any_more_is_named(path):
-    network = MemoryNetwork()
-    bus, world = MemoryBus(network), MemoryBus(network)
-    stop = threading.Event()
-
-    def saying(_: m.Status) -> None:
-        for i in (0, 1, 4):
-            world.publish(Outgoing(c.ODOMETRY, "alpha", odometry(i)))
-        world.publish(
-            Outgoing(
-                c.END,
-                "",
-                build.end(incarnation=0, alpha=7),
-            )
-        )
-        stop.set()
-
-    record(bus, Recorder(path, "t", {}), on_status=saying, stop=stop)
-    lost = "source/alpha: 4 measurements of incarnation 0 missing: 2–3, 5–6"
-    assert lost in [str(finding) for finding in holes(open_log(path))]
-    last = messages_of(list(open_log(path).samples()), c.STATUS)[-1]
-    assert isinstance(last, m.Status)
-    assert last.warnings == (f"missing: {lost}",)
 
 
 def test_what_a_restarted_world_publishes_again_is_written_once(path):

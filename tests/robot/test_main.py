@@ -8,7 +8,6 @@ import msgspec
 import pytest
 
 from teamslam.team.recording.own_log import own_log
-from teamslam.team.rejection import Rejection
 from teamslam.team.robot.main import RobotShell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -235,36 +234,3 @@ def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
     shell = lived(network, MemoryBus(network), act)
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
     assert "the initial pose is measurement 0" in shell.shell.boundary.last_refused
-
-
-def test_a_stream_whose_clock_leaps_by_decades_goes_on_to_its_end():
-    """A board without a clock is set by the network: the robot refused all that came after, asked
-    for it, refused the answer, and the team waited for ever.
-    """
-
-    class Leaping(Source):
-        def answer(self, request: bytes) -> list[bytes]:
-            if not self.asked:  # they come once the stream has begun
-                for each in leapt:
-                    self.bus.publish(Outgoing(ch.ODOMETRY, "r1", each))
-                self.bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=(ended,))))
-            super().answer(request)
-            wanted = decoded(request, m.MeasurementsRequest)
-            there = [self.start, *leapt]
-            return [encoded(x) for x in there if wanted.first <= x.number <= wanted.last]
-
-    leapt = [
-        msgspec.structs.replace(odometry(k, "r1"), incarnation=1, stamp_ns=10**18 + k * 10**9)
-        for k in (1, 2)
-    ]
-    network = MemoryNetwork()
-    source, viewer = Leaping(network), MemoryBus(network)
-    viewer.subscribe(ch.ROBOT_DONE)
-    ended = m.StreamEnd(robot="r1", incarnation=1, measurements=3)
-    shell = lived(network, MemoryBus(network), lambda: source.begins(1), waits_s=0.3)
-    assert shell.shell.boundary.refused == 2
-    (said,) = viewer.receive()
-    done = decoded(said.payload, m.Done)
-    ledger = {each.disposition: each.measurements for each in done.ledger}
-    assert (done.measurements, ledger[Rejection.TIME.disposition]) == (3, 2)
-    assert done.stamp_ns < 10**18

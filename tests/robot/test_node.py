@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.team import translate
 from teamslam.team.config import FrontEnd
 from teamslam.team.pairs import PAIRS
 from teamslam.team.rejection import Rejection
@@ -17,9 +16,8 @@ from teamslam.team.robot import node as robot_node
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.robot.node import robot_node as node_for
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import codec
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
+from teamslam.team.wire.arrays import floats, from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.digest import digest_of
 from tests.support import fused_map, packed, spd
@@ -319,31 +317,6 @@ def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
         out += node.handle(fused(ids=(1, 2), at=2.0, exchange=number), 0)
     assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1, 2, 3, 4]
     assert len(of(out, ch.ROBOT_DONE)) == 1
-
-
-def test_a_sound_map_is_checked_once_and_of_a_spoilt_one_the_rest_is_sent(monkeypatch):
-    checked = []
-
-    def noted(message):
-        checked.append(message)
-        return codec.unsound(message)
-
-    for module in (robot_node, translate):
-        monkeypatch.setattr(module, "unsound", noted)
-    sent = of(driven(RobotNode(config()), MEASUREMENTS), ch.OWN_MAP)
-    assert len(sent) > 1
-    assert [x for x in checked if isinstance(x, m.MapEstimate)] == sent
-
-    def spoilt(covariance, *, joint):
-        blocks = translate.blocks_of(covariance)
-        blocks[0, 0, 1] = blocks[0, 1, 0] = 1e9
-        return translate.block_bytes(blocks)
-
-    monkeypatch.setattr(translate, "covariance_bytes", spoilt)
-    rest = of(driven(RobotNode(config()), MEASUREMENTS), ch.OWN_MAP)
-    assert [ids(x.ids, "ids")[1:].tolist() for x in sent] == [
-        ids(x.ids, "ids").tolist() for x in rest
-    ]
 
 
 def test_its_nis_is_that_of_its_windows_and_of_the_open_one():

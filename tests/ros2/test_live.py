@@ -347,33 +347,3 @@ def test_odometry_that_does_not_come_is_named_with_what_to_look_at(monkeypatch):
     assert not heard.warnings()
     (said,) = silent.warnings()
     assert "/r1/odom: no message yet: look at its name, at `domain`" in said
-
-
-def test_of_a_shared_tf_a_driver_takes_what_its_own_robot_saw():
-    kind = "tf2_msgs/msg/TFMessage"
-    level = (0.0, 0.0, 0.0, 1.0)
-    others = {
-        name: RobotTopics(
-            odometry=f"/{name}/odom", detections=("/tf",), base_frame=f"{name}/base_link"
-        )
-        for name in ("ann", "bob")
-    }
-    robot = Robot()
-    driver = Ros2Driver(robot, others["ann"], name="ann", others=others)
-
-    def put(topic: str, *each: tuple[int, str, str, Any, Any]) -> None:
-        driver.take(ForeignSample(by_rmw(topic, kind), ros.cdr(kind, ros.transforms(*each))))
-
-    tag = {n: (S, f"{n}/camera", "tag36h11:7", ros.vector(2.0), level) for n in ("ann", "bob")}
-    put("/tf", tag["ann"], tag["bob"])  # whose they are is not told yet
-    assert robot.calls == []
-    assert "frames ann/camera, bob/camera" in driver.warnings()[0]
-    assert driver.refusal == ""  # transforms may be on their way
-    driver._undecided_at_s = time.monotonic() - SILENT_S - 1.0
-    assert '[robots.ann] frames = ["ann/camera", "bob/camera"]' in driver.refusal
-    for n in ("ann", "bob"):
-        put("/tf_static", (0, f"{n}/base_link", f"{n}/camera", ros.vector(0.1), level))
-    put("/tf", tag["ann"], tag["bob"])
-    assert robot.calls == [("points", Decimal(1), [7], [[2.0, 0.0]])]
-    assert driver.refusal == ""
-    assert driver.warnings() == ()

@@ -6,13 +6,7 @@ import pytest
 
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments import downs_minima
-from teamslam.sim.studies.experiments.downs import TABLE_5_1
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
-from teamslam.sim.studies.experiments.downs_simulated import (
-    SIMULATED_5_1,
-    WORLDS,
-)
-from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.team.estimation.map_joining.alignment import procrustes
 
@@ -53,25 +47,3 @@ def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_f
         kind(pair, turns) for kind in (downs_minima.profile, downs_minima.profile_with_covariances)
     )
     np.testing.assert_allclose(weighted, 2.0 * alike / (0.1**2 + 0.2**2), rtol=1e-9)
-
-
-def test_his_simulator_stands_in_every_table_and_no_set_is_needed_for_it(tmp_path):
-    options = Options((1, 2), quick=True)
-    short = SIMULATED_5_1.tasks(options)
-    assert len(short) == 2 * len(WORLDS)
-    results = Results({task.name: task.run() for task in short})
-    outcome = TABLE_5_1.outcome(options, results)
-    assert outcome.missing
-    (table,) = outcome.tables
-    assert [row[0] for row in table.rows][:2] == ["10, EKF", "10, EKF, aligned"]
-    assert all(row[1] == "2" for row in table.rows)
-    of_100 = outcome.figures["simulator"]["100, EKF"]
-    assert 0.0 < of_100["p10"] <= of_100["median"] <= of_100["p90"] < 0.5
-    assert [p.name for p in outcome.pictures] == [
-        "simulator",
-        "sample-downs-10",
-        "sample-downs-100",
-    ]
-    for picture in outcome.pictures:
-        picture.draw(tmp_path / "picture.png")
-        assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
-from teamslam.sim.studies.experiments import accuracy_few, accuracy_worlds
+from teamslam.sim.studies.experiments import accuracy_worlds
 from teamslam.sim.studies.experiments.experiment import (
     Goal,
     Options,
@@ -77,37 +77,3 @@ def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments, said):
     refused = CliRunner().invoke(app, ["experiment", *arguments])
     assert refused.exit_code == 2
     assert said in refused.output
-
-
-def few_run(
-    first_chi2: float | None, shape_nees: float, said: list[str], wrong: bool = False
-) -> Figures:
-    robots = {"r1": {"first_pose_chi2": 1.0}, "r2": {"first_pose_chi2": first_chi2}}
-    figures: Figures = {"rmse_aligned": 0.5, "shape_nees": shape_nees, "landmarks": 4.0}
-    figures["minimum"] = {"wrong": wrong, "excluded": False}
-    return figures | {"robots": robots, "not_joined": [], "reasons": said}
-
-
-SURVEYED = ["another map fits about as well"]
-
-
-@pytest.mark.parametrize(
-    ("run", "wrong", "silent", "beyond", "untold", "alarms"),
-    [
-        (few_run(2.0, 2.0, []), 0, 0, 0, 0, 0),
-        (few_run(2.0, 2.0, SURVEYED), 0, 0, 0, 0, 1),
-        (few_run(2.0, 2.0, ["r2 (incarnation 1) is placed weakly: …"]), 0, 0, 0, 0, 0),
-        (few_run(20.0, 2.0, []), 0, 0, 1, 1, 0),
-        (few_run(2.0, 12.0, []), 0, 0, 1, 1, 0),
-        (few_run(20.0, 2.0, SURVEYED), 0, 0, 1, 0, 0),
-        (few_run(None, 2.0, []), 0, 0, 0, 0, 0),
-        (few_run(2.0, 2.0, [], wrong=True), 1, 1, 0, 0, 0),
-        (few_run(2.0, 2.0, SURVEYED, wrong=True), 1, 0, 0, 0, 0),
-    ],
-)
-def test_a_wrong_map_of_few_landmarks_is_counted_and_silent_if_nothing_is_said(
-    run, wrong, silent, beyond, untold, alarms
-):
-    figures = accuracy_few.few_figures([run])
-    names = ("wrong", "silent", "beyond", "beyond_silent", "alarms")
-    assert tuple(figures[name] for name in names) == (wrong, silent, beyond, untold, alarms)

@@ -366,31 +366,6 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(endpoint, monkey
     assert heard, "it was back while the other still spoke"
 
 
-def test_what_an_onlooker_does_not_keep_up_with_is_dropped_and_not_asked_for(endpoint, monkeypatch):
-    """Poses alone are dropped."""
-    monkeypatch.setattr(zenoh_bus, "MOST_WAITING", 10)
-    with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint, sheds=[c.OWN_POSE]) as sink:
-        sink.subscribe(c.OWN_POSE)
-        flowing(source, sink, c.SUBMAP)
-        for i in range(100):
-            source.publish_raw(Sample("robot/alpha/own/pose", b"", i, 0, 0))
-            source.publish(Outgoing(c.SUBMAP, "alpha", submap(i)))
-        wait_until(lambda: sink._queue.qsize() >= 100)  # all has come, and nobody has read
-        found: list[Sample] = []
-
-        def submaps_are_here() -> bool:
-            found.extend(sink.receive(0.1))
-            return [sample.key for sample in found].count("robot/alpha/submap") >= 100
-
-        wait_until(submaps_are_here)
-        while more := sink.receive(0.5):
-            found += more
-        assert not sink.lacking()
-    keys = [sample.key for sample in found]
-    assert 0 < keys.count("robot/alpha/own/pose") < 100
-    assert keys.count("robot/alpha/submap") == 100
-
-
 def test_close_wakes_a_receiver_and_ends_the_bus(endpoint):
     bus = ZenohBus("t", endpoint)
     got: list[list[Sample]] = []

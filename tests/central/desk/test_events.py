@@ -1,7 +1,5 @@
 """The events of a run: each is reported once, when it happens."""
 
-import msgspec
-
 from teamslam.central.desk.evaluation.events import EventDetector, without_decimals
 from teamslam.team.wire import messages as m
 from tests import build
@@ -58,33 +56,6 @@ def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map():
         ("map", "r1 is in the team's map"),
         ("warning", why),
         ("map", "r2 is in the team's map"),
-    ]
-
-
-def test_robots_that_wait_for_a_place_are_told_once_whatever_test_fails_and_who_joined_whom():
-    def waiting(who: str, why: str, joined: tuple[str, ...] = ()) -> m.FusedMap:
-        reasons = (f"{who} not joined: with r1 (incarnation 1) {why}",) if who else ()
-        said = msgspec.structs.replace(fused(["r1", "r2", "r3"], reasons), joined=joined)
-        assert isinstance(said, m.FusedMap)
-        return said
-
-    both, one = "r2 (incarnation 1), r3 (incarnation 1)", "r2 (incarnation 1)"
-    words = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: 12 landmarks"
-    left = "r2 (incarnation 1) joined r1 (incarnation 1) at 12.0 s: 9 landmarks"
-    said = (
-        waiting(both, "pairs 7 < 8"),
-        status(0, f"{both} not joined: with r1 (incarnation 1) pairs 6 < 8"),
-        waiting(both, "pairs 5 < 8"),
-        waiting(one, "share .4 < .5", (words,)),
-        waiting("", "", (words, left)),
-    )
-    assert told(*said) == [
-        ("map", "r1 is in the team's map"),
-        ("warning", "r2, r3 not joined: with r1 pairs 7 < 8"),
-        ("map", "r3 is in the team's map"),
-        ("map", words.replace(" (incarnation 1)", "")),
-        ("map", "r2 is in the team's map"),
-        ("map", left.replace(" (incarnation 1)", "")),
     ]
 
 

@@ -1,6 +1,4 @@
-from teamslam.central.desk.evaluation.association import AssociationResult, Pairs
 from teamslam.central.desk.evaluation.events import EventDetector
-from teamslam.central.desk.report.tables import score_sheet
 from teamslam.central.desk.view.landmark_sets import sets_of
 from teamslam.team.wire import messages as m
 from tests.support import examples
@@ -40,28 +38,3 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone():
         each.kind for each in detector.take(again, 0) if each.kind in ("closure", "undone")
     ] == ["undone"]
     assert not [each for each in detector.take(again, 0) if each.kind in ("closure", "undone")]
-
-
-def test_the_report_scores_pairs_inside_windows_and_over_all():
-    def pairs(missed: int) -> Pairs:
-        return Pairs(right=30, wrong=10, missed=missed, wrong_detections=1, detections=50)
-
-    found = AssociationResult(
-        pairs=pairs(30),
-        inside=pairs(0),
-        label_of={},
-        landmarks=9,
-        duplicates=2,
-        duplicates_confirmed=1,
-        duplicates_shown=0,
-        merges_right=4,
-        merges_wrong=0,
-        merges_refused=3,
-        left_out=0,
-        clutter_in_map=0,
-    )
-    assert score_sheet(found).rows == [
-        ("inside windows", "0.75000", "1.0000", "0.8571", "2.000 %"),
-        ("over all", "0.75000", "0.5000", "0.6000", "2.000 %"),
-    ]
-    assert "4 rightly, 0 wrongly; 3 attempts wait" in score_sheet(found).note

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 from PIL import Image
-from rich.console import Console
 
 from teamslam.central.desk.compare import compare_rows
 from teamslam.central.desk.drawing import (
@@ -20,8 +19,6 @@ from teamslam.central.desk.drawing import (
     ellipses,
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.evaluation.figures import to_json
-from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.pictures import film
 from teamslam.central.desk.pictures.run import (
     error_picture,
@@ -33,14 +30,11 @@ from teamslam.central.desk.pictures.style import (
     PAPER_PT,
     Form,
     Look,
-    Picture,
     Style,
     drawn_in,
     save,
 )
-from teamslam.central.desk.report.page import write_pictures
-from teamslam.central.desk.report.run import Run
-from teamslam.central.desk.report.tables import summary_tables, team_rows
+from teamslam.central.desk.report.tables import team_rows
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded
@@ -145,42 +139,6 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     expected = run.map.means[run.map.known] + 100 * error
     found = np.column_stack([crosses.get_xdata(), crosses.get_ydata()])
     np.testing.assert_allclose(found[: len(expected)], expected)
-
-
-@pytest.mark.parametrize(
-    ("fusion", "said"),
-    [
-        ("join", "> 1000: over-confident"),
-        ("kalman", "> 1000: over-confident (measurements counted again)"),
-    ],
-)
-def test_a_nees_beyond_all_measure_is_told_in_words_and_kept_in_figures(run, fusion, said):
-    assert run.map.errors is not None
-    assert run.scenario is not None
-    absurd = replace(
-        run,
-        map=replace(run.map, errors=replace(run.map.errors, nees_per_dof=6e18)),
-        scenario=msgspec.structs.replace(run.scenario, fusion=fusion),
-    )
-    console = Console(width=80, record=True, force_terminal=False)
-    console.print(summary_tables(absurd)[0])
-    (line,) = [x for x in console.export_text().splitlines() if "map NEES per dof" in x]
-    assert line.strip("│ ").partition("│")[2].strip() == said
-    assert to_json(absurd)["map_nees_per_dof"] == 6e18
-
-
-def test_a_picture_for_a_paper_is_a_pdf_without_a_title(tmp_path):
-    of = scenario(robots=2)
-    log = joined_log(of, 0.1)
-    run = Run(evaluate(log), history(log), {})
-    style = Style(Look.PAPER, Form.PDF, Picture.MAP)
-    drawn = write_pictures(run, tmp_path, style)
-    assert [path.name for path in tmp_path.iterdir()] == ["map.pdf"]
-    assert drawn["map"].read_bytes().startswith(b"%PDF")
-    svg = write_pictures(run, tmp_path, Style(Look.PAPER, Form.SVG, Picture.MAP))["map"].read_text()
-    titled = write_pictures(run, tmp_path, Style(Look.SCREEN, Form.SVG, Picture.MAP))["map"]
-    assert "small, seed 1" not in svg
-    assert svg != titled.read_text()
 
 
 def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):

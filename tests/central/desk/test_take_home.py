@@ -3,7 +3,6 @@
 import csv
 import json
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -12,8 +11,6 @@ from teamslam.central.desk.evaluation.errors import pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,
-    landmark_classes,
-    measurement_counts,
     take_home,
     write_geojson,
     write_map,
@@ -22,18 +19,10 @@ from teamslam.central.desk.export.take_home import (
 from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.sim.in_memory.team import run_team
-from teamslam.team.config import UNNAMED
 from teamslam.team.geodesy import Datum, local_from_geodetic
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.codec import encoded
 from tests.sim.logs import scenario, streams
-from tests.support import fused_map, submap
 
-LIKELY = np.array([[[0.3, 0.7], [0.5, 0.5]], [[0.1, 0.9], [0.9, 0.1]]])
-"""P(reports | class) of the two landmarks of two submaps."""
 DATUM = Datum(48.745, 9.105, 400.0)
 
 
@@ -96,40 +85,6 @@ def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
         read = np.array([[float(v) for v in row] for row in list(csv.reader(lines))[1:]])
     np.testing.assert_array_equal(read[:, 1:4], home.paths["r1"].poses)
     np.testing.assert_array_equal(read[:, 5], home.paths["r1"].covariances[:, 0, 1])
-
-
-def test_a_landmark_without_a_name_has_as_many_measurements_as_its_submaps_counted():
-    def table(*numbers: int) -> bytes:
-        return from_ids(np.array(numbers, np.uint32))
-
-    counted = [
-        msgspec.structs.replace(
-            submap(i),
-            ids=table(UNNAMED, UNNAMED + 4),
-            counts=table(3 + i, 7),
-            seen=b"",
-            keyframes=0,
-            classes=from_floats(np.log(LIKELY[i]).ravel()),
-        )
-        for i in range(2)
-    ]
-    of = m.Membership(
-        robot="alpha",
-        incarnation=counted[0].incarnation,
-        sequences=table(0, 1, 1),
-        locals=table(0, 0, 4),
-        identities=table(UNNAMED + 1, UNNAMED + 1, UNNAMED + 2),
-        steps=bytes(3),
-        figures=from_floats(np.zeros(9)),
-    )
-    found = Recorded()
-    for each in counted:
-        found.take(Sample(ch.SUBMAP.key("alpha"), encoded(each), each.stamp_ns, 0, 0))
-    found.take(Sample(ch.FINAL_MAP.key(), encoded(fused_map(memberships=(of,))), 0, 0, 0))
-    assert measurement_counts(found) == {UNNAMED + 1: 3 + 4, UNNAMED + 2: 7}
-    first, other = (landmark_classes(found)[UNNAMED + k] for k in (1, 2))
-    assert first == ("1", pytest.approx(0.63 / (0.63 + 0.03)))
-    assert other == ("0", pytest.approx(0.9))
 
 
 def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_path):

@@ -7,18 +7,11 @@ import pytest
 
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.map_joining import (
-    condensing,
-    gauss_newton,
     marginals,
-    path_elimination,
 )
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import (
-    age_factors,
-    take_step,
-)
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     JoinSettings,
@@ -125,54 +118,6 @@ def test_an_inter_robot_measurement_that_was_left_out_is_not_restored():
     raw = restore_submaps(fold, world.submaps, world.sightings)
     assert raw.condensed_count == 0
     assert len(raw.main.graph.sightings) == len(others)
-
-
-@pytest.mark.parametrize(
-    ("settings", "near"),
-    [(JoinSettings(robust=False), 1e-4), (ROBUST, 1e-3)],
-    ids=["squares", "robust"],
-)
-def test_an_iteration_that_would_hardly_move_a_condensed_fold_is_left_out(
-    monkeypatch, settings, near
-):
-    world = team(2, submaps=20)
-    taken = []
-
-    def counted(point, damping):
-        taken.append(point)
-        return take_step(point, damping)
-
-    monkeypatch.setattr(gauss_newton, "take_step", counted)
-    full, bounded = both(world, settings)
-    once = [point for point in taken if point.graph.condensed is not None]
-    assert len(taken) - len(once) == 2 * 20 + 2 * (LAG + 1)
-    assert 19 - LAG <= len(once) < 1.5 * (19 - LAG)
-    monkeypatch.setattr(gauss_newton, "STILL", -1.0)
-    _, twice = both(world, settings)
-    assert apart(twice, bounded) < near
-    assert apart(full, bounded) < 1e-3
-
-
-def test_poses_that_are_eliminated_run_by_run_leave_what_all_at_once_leave(monkeypatch):
-    """Inter-robot measurements connect the runs of one robot with those of others."""
-    world = meeting(3, robots=3, submaps=9)
-    fold = joined_with(world.submaps, world.starts, world.sightings, ROBUST)
-    fold = replace(fold, islands={fold.main_key: age_factors(fold.main, 100)})
-    monkeypatch.setattr(path_elimination, "RUN", 3)
-    by_runs = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
-    monkeypatch.setattr(
-        condensing,
-        "eliminate_paths",
-        lambda island, union, factors, _: (union, *island.estimate.quadratic(union, *factors)),
-    )
-    at_once = condense_submaps(fold, Limits(0, lag=2, first=1)).main.graph.condensed
-    assert by_runs.submaps == 21
-    assert by_runs.redundancy == at_once.redundancy
-    assert by_runs.nodes.tolist() == at_once.nodes.tolist()
-    assert by_runs.cost == pytest.approx(at_once.cost, rel=1e-9)
-    largest = np.abs(at_once.information).max()
-    assert np.allclose(by_runs.information, at_once.information, rtol=1e-9, atol=1e-11 * largest)
-    assert np.allclose(by_runs.slope, at_once.slope, atol=1e-9 * np.abs(at_once.slope).max())
 
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))

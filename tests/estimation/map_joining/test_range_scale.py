@@ -5,24 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from teamslam.team.association import AssociationProfile
-from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
-from teamslam.team.estimation.map_joining.gauss_newton import solve_island
 from teamslam.team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
     JoinSettings,
-    add_start,
-    fold_submaps,
     solve_fold,
 )
-from teamslam.team.estimation.map_joining.markers import add_markers
-from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from teamslam.team.estimation.se2 import compose, inverse, transformed
-from teamslam.team.estimation.submap import LocalMap, Unnamed
+from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import local_truth
 
@@ -145,60 +136,6 @@ def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():
     np.testing.assert_array_equal(rows[1:].sum(axis=0), np.where(np.arange(13) < 3, 0.0, rows[0]))
     np.testing.assert_array_equal(rows[0], local.sensitivity[0])
     assert (np.count_nonzero(rows[1:], axis=1) == 2).all()
-
-
-def hidden(submaps, starts, options):
-    """The fold without the landmarks' names, with those that are one united by hand; and the
-    number of each.
-    """
-    counts = np.ones(len(LANDMARKS), np.uint32)
-    together = Unnamed(counts, seen=np.ones((len(LANDMARKS), 1), np.bool_))
-    unnamed = [
-        replace(x, local=replace(x.local, ids=UNNAMED + x.local.ids, unnamed=together))
-        for x in submaps
-    ]
-    fold = fold_submaps(add_start(add_start(EMPTY_FOLD, starts[0]), starts[1]), unnamed, options)
-    assert len(fold.main.graph.landmarks) == 5 * len(unnamed)
-    number = {members[0]: own for own, members in fold.landmarks.sets.items()}
-    first = {each.local: own for each, own in sorted(number.items(), reverse=True)}
-    becomes = {own: first[each.local] for each, own in number.items()}
-    graph, state = tie_landmarks(fold.main.graph, fold.main.state, becomes)
-    united = replace(fold.main, graph=graph, state=state)
-    return replace(fold, islands={fold.main_key: united}), first
-
-
-def test_the_error_of_a_marker_is_its_landmarks_without_a_name_too():
-    submaps, starts, _ = carts(6, submaps=3, marker=MARKER)
-    options = JoinSettings(bias_sigma=SIGMA, common_bias_sigma={"marker": MARKER})
-    named = fold_of(submaps, starts, options).main
-    fold, first = hidden(submaps, starts, options)
-    joined, *_ = solve_island(add_markers(fold.main))
-    graph = joined.graph
-    assert sorted(graph.common) == sorted(graph.landmarks) == sorted(first.values())
-    assert len(graph.priors) == len(named.graph.priors)
-    for local, own in first.items():
-        for nodes, of in (
-            (graph.landmarks, named.graph.landmarks),
-            (graph.common, named.graph.common),
-        ):
-            at, known = graph.offset[nodes[own]], named.graph.offset[of[local]]
-            assert joined.state[at] == pytest.approx(named.state[known], abs=1e-6)
-
-
-def test_a_map_says_that_landmarks_without_a_name_lack_the_error_of_their_marker():
-    submaps, starts, _ = carts(6, submaps=4, marker=MARKER)
-    options = JoinSettings(
-        bias_sigma=SIGMA,
-        common_bias_sigma={"marker": MARKER},
-        association=AssociationProfile(recent=1),
-    )
-    fold, _ = hidden(submaps, starts, options)
-    island, *_ = solve_island(fold.main)
-    old = condense_submaps(replace(fold, islands={fold.main_key: island}), Limits(2, lag=2))
-    assert old.condensed_count
-    said = "5 landmarks without a name lack the error of their marker"
-    assert [each for each in solve_fold(old, options).warnings if said in each]
-    assert not [each for each in solve_fold(fold, options).warnings if "marker" in each]
 
 
 def _only_own_biases_are_discounted(graph):

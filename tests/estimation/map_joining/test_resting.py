@@ -1,7 +1,6 @@
 """Landmarks at rest: map, covariance and cost are those of a fold in which none rests."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from teamslam.team.estimation.map_joining.joining import (
     add_start,
     fold_submaps,
 )
-from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from tests.estimation.submap_world import team
 
 ROBUST = JoinSettings()
@@ -69,46 +67,6 @@ def test_a_fold_whose_landmarks_rest_and_wake_is_the_fold_in_which_none_rests(se
         assert marginals.confirmed(one, 2) == marginals.confirmed(other, 2)
     assert len(resting) > 10
     assert woke > 5
-
-
-@pytest.fixture(scope="module")
-def last():
-    """The last fold with landmarks at rest."""
-    *_, fold = folds(world(4), JoinSettings(), 1)
-    return fold
-
-
-def test_what_wakes_without_the_others_being_conditioned_on_it_is_seen():
-    """The mutant: those that stay at rest keep their former Gaussian; the first test rejects it."""
-    found = list(
-        zip(folds(world(4), JoinSettings(), NEVER), folds(world(4), JoinSettings(), 1), strict=True)
-    )
-    for (_, before), (one, after) in pairwise(found):
-        stays = at_rest(before) & at_rest(after)
-        if stays and at_rest(before) - at_rest(after):
-            old, new = (each.main.graph.condensed for each in (before, after))
-            places = np.repeat(np.isin(old.resting.ids, sorted(stays)), 2)
-            kept = np.repeat(np.isin(new.resting.ids, sorted(stays)), 2)
-            wrong = new.resting.upper.copy()
-            wrong[np.ix_(kept, kept)] = old.resting.upper[np.ix_(places, places)]
-            resting = replace(new.resting, covariance=wrong)
-            graph = replace(after.main.graph, condensed=replace(new, resting=resting))
-            mutant = replace(after, islands={after.main_key: replace(after.main, graph=graph)})
-            a, b = marginals.landmark_blocks(one), marginals.landmark_blocks(mutant)
-            if not np.allclose(a.covariances, b.covariances, rtol=1e-5, atol=1e-8):
-                return
-    pytest.fail("no tick tells the mutant from the fold")
-
-
-def test_what_rests_is_there_when_all_is_linearised_again(last):
-    found = world(4)
-    *_, never = folds(found, JoinSettings(), NEVER)
-    again = restore_submaps(last, found.submaps, [])
-    other = restore_submaps(never, found.submaps, [])
-    assert not at_rest(again)
-    a, b = marginals.landmark_map(again), marginals.landmark_map(other)
-    assert a.ids.tolist() == b.ids.tolist()
-    assert np.allclose(a.means, b.means, atol=1e-6)
 
 
 def test_a_landmark_that_another_island_has_does_not_rest_and_ties_it():

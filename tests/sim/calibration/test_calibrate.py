@@ -1,6 +1,5 @@
 """Calibration: what was put into measurements comes out of them, within its own uncertainty."""
 
-import re
 from dataclasses import replace
 from pathlib import Path as File
 from typing import Any
@@ -310,28 +309,6 @@ def slipping():
         for each in told.streams
     )
     return team, replace(told, streams=less)
-
-
-@pytest.mark.parametrize("by_truth", [True, False])
-def test_odometry_that_does_not_fit_is_learnt_and_told_with_and_without_truth(slipping, by_truth):
-    team, world = slipping
-    told: list[str] = []
-    world = world if by_truth else replace(world, landmarks=None)
-    found = calibrate_models([("a log", world)], team, told.append)
-    assert found.by_truth == by_truth
-    assert told
-    motion = by_name(found.motion)
-    assert motion["forward_scale"].value == pytest.approx(1.1, abs=0.015)
-    assert motion["yaw_scale"].value == pytest.approx(1.0, abs=0.02)
-    (alarm,) = (note for note in found.notes if "not calibrated for these data" in note)
-    assert re.match(r"forward_scale is \+(9|10)\.\d %", alarm)
-    if by_truth:
-        sensor = by_name(found.sensor)
-        assert sensor["range_scale"].value == pytest.approx(1.0, abs=0.003)
-        assert sensor["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
-        assert motion["forward.per_m"].value == pytest.approx(0.05, rel=0.25)
-    else:
-        assert found.sensor == ()
 
 
 def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(

@@ -76,36 +76,6 @@ def test_the_thesis_world_is_the_one_that_the_figures_were_measured_in():
     assert np.count_nonzero(first.kinds == SIGHTINGS) == 139
 
 
-@pytest.mark.parametrize("name", ["thesis", "thesis-b", "waypoints"])
-def test_odometry_differs_from_the_true_motion_by_the_noise_that_the_robot_is_told(name):
-    forward, turn = [], []
-    for seed in range(8):
-        scenario = load(name)
-        for robot, stream in zip(scenario.robots, world_of(scenario, seed).streams, strict=True):
-            d, turned = true_steps(stream.truth, robot.motion)
-            if robot.motion.final_turn != MotionNoise() or robot.motion.lateral != MotionNoise():
-                continue  # a slip hides the step in the truth
-            f, w = robot.motion.forward, robot.motion.turn
-            told, told_turn = stream.intervals.forward, stream.intervals.yaw_rate
-            variance = f.per_s**2 + f.per_m**2 * d + f.per_rad**2 * np.abs(turned)
-            forward.append((told - d) / np.sqrt(variance))
-            variance = w.per_s**2 + w.per_m**2 * d + w.per_rad**2 * np.abs(turned)
-            turn.append(np.angle(np.exp(1j * (told_turn - turned))) / np.sqrt(variance))
-    for noise in (np.concatenate(forward), np.concatenate(turn)):
-        assert abs(noise.mean()) < 3.3 / np.sqrt(noise.size)
-        assert inside_two_sided(noise)
-        assert not inside_two_sided(1.1 * noise), "noise that is 10 % too large is found out"
-        assert not inside_two_sided(0.9 * noise)
-
-
-def true_steps(truth: np.ndarray, motion: MotionModel) -> tuple[np.ndarray, np.ndarray]:
-    """(distance, turn) of each step, from poses alone; the chord of an arc is put right."""
-    chord = np.hypot(*np.diff(truth[:, :2], axis=0).T)
-    turned = np.angle(np.exp(1j * np.diff(truth[:, 2])))
-    bend = np.sinc(turned / (2 * np.pi)) if motion.kind == "velocity" else 1.0
-    return chord / bend, turned
-
-
 @pytest.mark.parametrize("name", ["thesis-b", "waypoints"])
 def test_observations_differ_from_the_truth_by_the_noise_that_the_robot_is_told(name):
     ranges, bearings = [], []

@@ -4,13 +4,10 @@ import numpy as np
 import pytest
 
 from teamslam.sim.studies.estimators import joint_fastslam, plain_fastslam
-from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.models import Increment
-from tests.estimation.team_rounds import LANDMARKS, OTHER, SENSOR, STARTS, team_run, wrap
+from tests.estimation.team_rounds import STARTS, team_run
 
 PROPOSALS = ["fastslam1", "fastslam2"]
-STANDING = Increment.identity()
 
 
 def filtered(rounds, state, random):
@@ -68,25 +65,3 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
     np.testing.assert_allclose(joint.log_weights, fastslam.normalise(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):
         np.testing.assert_array_equal(joint.poses[index], state.particles.poses)
-
-
-def test_standing_robots_measurements_of_one_landmark_are_fused_as_gaussians():
-    sees = np.array([0], np.uint32)
-    turns, informations, weighted = [], [], []
-    for (robot, pose), sensor, error in zip(
-        STARTS.items(), (SENSOR, OTHER), (0.02, -0.01), strict=True
-    ):
-        d = LANDMARKS[0] - pose[:2]
-        r, b = np.hypot(*d) + error, np.arctan2(d[1], d[0]) - pose[2]
-        turns.append(RobotStep(robot, STANDING, sensor, sees, np.array([r]), np.array([wrap(b)])))
-        e = np.array([np.cos(b + pose[2]), np.sin(b + pose[2])])
-        G = np.stack((e, r * np.array([-e[1], e[0]])), axis=1)
-        P = G @ np.diag([sensor.range_sigma, sensor.bearing_sigma]) ** 2 @ G.T
-        informations.append(np.linalg.inv(P))
-        weighted.append(informations[-1] @ (pose[:2] + r * e))
-    state = joint_fastslam.initial_state(STARTS, 5, "fastslam2", 0.5)
-    state = joint_fastslam.filter_step(state, turns, np.random.default_rng(0))
-    _, means, P = joint_fastslam.landmark_gaussian(state)
-    expected = np.linalg.inv(sum(informations))
-    np.testing.assert_allclose(P, expected, rtol=0.02, atol=1e-5)
-    np.testing.assert_allclose(means[0], expected @ sum(weighted), atol=2e-3)

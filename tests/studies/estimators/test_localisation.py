@@ -77,35 +77,6 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
     assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 6.0 / np.sqrt(effective)
 
 
-def test_it_is_fastslam_on_landmarks_that_are_exactly_known():
-    truth, random = np.array([0.5, -1.0, 0.4]), np.random.default_rng(1)
-    state = localisation.initial_state(truth, 500, IDS, LANDMARKS)
-    particles = fastslam.Particles(
-        state.cloud.poses,
-        state.cloud.log_weights,
-        IDS,
-        np.tile(LANDMARKS, (500, 1, 1)),
-        np.zeros((500, 3, 3)),
-    )
-    other = np.random.default_rng(1)
-    for k in range(6):
-        truth = compose(truth, MOTION.mean)
-        ranges, bearings = sights(truth)
-        keyframe = (IDS[k % 3 :], ranges[k % 3 :] + 0.2, bearings[k % 3 :] - 0.05)
-        judged = innovations.innovation(particles, MOTION, SENSOR, *keyframe)
-        assert judged.dof == 2 * len(keyframe[0])
-        assert localisation.innovation(state, MOTION, SENSOR, *keyframe).squared == pytest.approx(
-            judged.squared, rel=1e-9
-        )
-        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
-        particles, _ = fastslam.propagated_and_updated(
-            particles, MOTION, SENSOR, *keyframe, "fastslam1", 0.5, other
-        )
-    np.testing.assert_allclose(state.cloud.log_weights, particles.log_weights, atol=1e-9)
-    np.testing.assert_array_equal(state.cloud.poses, particles.poses)
-    assert len(np.unique(particles.log_weights)) > 400
-
-
 @functools.cache
 def short_run(seed, repeat):
     """Compute NEES and NIS of eight steps; each measurement counts `repeat` times."""

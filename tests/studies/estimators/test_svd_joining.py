@@ -10,16 +10,9 @@ from teamslam.sim.studies.estimators import svd_joining
 from teamslam.sim.studies.estimators.svd_joining import PointPairs, TooFewPointsError
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.gaussian import LandmarkGaussian
-from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.submap_world import local_truth, team, wrap
 
-poses = st.builds(
-    lambda *each: np.array(each),
-    st.floats(-9.0, 9.0),
-    st.floats(-9.0, 9.0),
-    st.floats(-3.1, 3.1),
-)
 quick = settings(deadline=None, max_examples=30)
 
 
@@ -150,34 +143,6 @@ def test_turning_by_svd_and_taking_the_middle_is_the_minimum_of_the_whole_cost(s
     P = np.linalg.inv(found.jac.T @ found.jac) * 2.0 * found.cost / redundancy
     np.testing.assert_allclose(merged.landmarks.covariance, P[3:, 3:], rtol=1e-2, atol=1e-5)
     np.testing.assert_allclose(merged.a_from_b.covariance, P[:3, :3], rtol=1e-2, atol=1e-5)
-
-
-@quick
-@given(poses, poses, poses)
-def test_a_mutual_sighting_alone_ties_two_frames(a_from_b, pose_a, pose_b_in_a):
-    if np.hypot(*(pose_a - pose_b_in_a)[:2]) < 0.5:
-        pose_b_in_a = pose_b_in_a + np.array([1.5, 1.5, 0.0])
-    c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
-    position = (pose_b_in_a[:2] - a_from_b[:2]) @ np.array([[c, -s], [s, c]])
-    pose_b = np.array([*position, wrap(pose_b_in_a[2] - a_from_b[2])])
-    d = pose_b_in_a[:2] - pose_a[:2]
-    towards = np.arctan2(d[1], d[0])
-    robots = svd_joining.mutual_sighting(
-        pose_a,
-        float(np.hypot(*d)),
-        float(wrap(towards - pose_a[2])),
-        pose_b,
-        float(np.hypot(*d)),
-        float(wrap(towards + np.pi - pose_b_in_a[2])),
-    )
-    a = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 2.0]]), np.eye(2))
-    b = LandmarkGaussian(np.array([7], np.uint32), np.array([[-3.0, 4.0]]), np.eye(2))
-    merged = svd_joining.exchanged(a, b, robots)
-    np.testing.assert_array_equal(merged.landmarks.ids, [1, 7])
-    np.testing.assert_allclose(merged.landmarks.means[0], [1.0, 2.0])
-    np.testing.assert_allclose(
-        merged.landmarks.means[1], transformed(a_from_b, np.array([-3.0, 4.0])), atol=1e-6
-    )
 
 
 def test_an_exchange_is_consistent_for_spherical_errors_and_not_if_landmarks_count_again():
