@@ -449,10 +449,7 @@ def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
 
 
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
-    """Find the landmarks that may coincide with the patch's; none where all are certain.
-
-    An alignment with any other landmark would be rejected by `grow_pairs`.
-    """
+    """Find the landmarks that may coincide with the patch's; none where all are certain."""
     others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
     at = evaluate_pairs(view.joint, one, two, view.profile)

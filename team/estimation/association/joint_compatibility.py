@@ -3,13 +3,11 @@
 A merged pair conditions the joint Gaussian for the pairs after it, so the sum of the log-likelihood
 ratios (`gating`) is the ratio of all of them together.
 
-`grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly` is for pairs
-with rivals: two neighbouring landmarks, each of which may be either of two mapped ones, are
-distinguished by their far more certain relative position. Landmarks are assigned one by one to a
-mapped landmark given the pairs before, or to a new one. An assignment has the weight exp(Σ LLR) of
-its pairs, and a pair is accepted when the assignments that contain it outweigh all others. Joint
-compatibility branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with
-the most pairs; here it also has to be the only likely one.
+`grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly` is for
+neighbouring landmarks, each of which may be either of two mapped ones: their relative position
+distinguishes them. An assignment has the weight exp(Σ LLR) of its pairs, and a pair is accepted
+when the assignments that contain it outweigh all others; joint compatibility branch and bound
+(Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most pairs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -65,10 +63,10 @@ class Alignment(NamedTuple):
 
 
 def condition_on_pair(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
-    """Condition the joint Gaussian on two landmarks being one; the second inherits the first's
-    relations.
+    """Condition the joint Gaussian on two landmarks being one.
 
-    With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP.
+    With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP. The
+    second inherits the first's relations.
     """
     n = len(joint.mean)
     P = joint.covariance
@@ -122,8 +120,8 @@ def grow_alignment(
     profile: AssociationProfile,
     sure_sd: float,
 ) -> Alignment | None:
-    """Merge pairs one by one as `grow_pairs` does, after the seeds, whatever their rivals; None
-    where a seed fails its gate.
+    """Merge the seeds, whatever their rivals, then as `grow_pairs`; None where a seed fails its
+    gate.
     """
     begun = merge_in_order(joint, seeds, profile)
     if begun is None:
@@ -172,9 +170,8 @@ def grow_pairs(
 ) -> MergedPairs:
     """Merge pairs one by one, the likeliest first.
 
-    candidates: two lists of landmarks, pair by pair; a merged landmark's other pairs are dropped.
-    most_sd: largest standard deviation of a merged pair; sure_sd: the same, once SURE_AFTER pairs
-    are merged.
+    candidates: two lists of landmarks, pair by pair. most_sd: largest standard deviation of a
+    merged pair; sure_sd: the same after SURE_AFTER pairs.
     """
     near = _select_near(joint, *candidates, profile)
     return _grow(MergedPairs((), joint), near, profile, (most_sd, min(most_sd, sure_sd)))
@@ -226,8 +223,8 @@ def _find_rivals(
 ) -> Float[np.ndarray, " k"]:
     """Find the best LLR of each pair's rivals: another partner of its first or second landmark.
 
-    A partner that may be the same object as this one (split in two, close to it, never observed
-    with it) is no rival: fragments of one landmark would block each other.
+    A partner that may be the same object as this one (split in two) is no rival: fragments of one
+    landmark would block each other.
     """
     rival = np.full(len(first), -np.inf)
     for mine, other in ((first, second), (second, first)):
@@ -263,11 +260,10 @@ def assign_jointly(
 ) -> MergedPairs:
     """Merge the pairs on which nearly all of the weight of joint assignments agrees.
 
-    A pair needs log odds of `odds` against all assignments without it. Where the standard deviation
-    of one of these pairs exceeds `tight`, all of them together need a log-likelihood ratio of
-    `llr_loose`, as a single such pair does (`gating.required_llr`): a few uncertain landmarks fit
-    others by chance. Where it exceeds `tight` but for pairs of the assignment that are not
-    accepted, the assignment as a whole needs it. most_sd: largest standard deviation of a pair.
+    A pair needs log odds of `odds` against all assignments without it. If one of these pairs has a
+    standard deviation above `tight`, all of them together need a log-likelihood ratio of
+    `llr_loose`; if it would without pairs that are not accepted, the assignment as a whole needs
+    it. most_sd: largest standard deviation of a pair.
     """
     first, second, sd = gate_pairs(joint, first, second, profile, most_sd)
     if not len(first):

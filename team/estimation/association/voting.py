@@ -244,7 +244,10 @@ def _find_neighbours(
     reach: float,
     fits: Bool[np.ndarray, "n m"] | None,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find the nearest point of b for each point; mark those mutually nearest and within reach."""
+    """Find the nearest point of b within reach of each point, else 0; mark those mutually nearest.
+
+    fits: the pairs of compatible classes; None: all.
+    """
     n, m = len(a), len(b)
     s, c = core.sin_and_cos(motions[:, 2:])
     x = (c * a[:, 0] - s * a[:, 1] + motions[:, :1]).ravel()
