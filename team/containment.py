@@ -8,7 +8,6 @@ import hashlib
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from types import TracebackType
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -29,34 +28,15 @@ _OURS = ("teamslam.",)
 
 @runtime_checkable
 class Handler(Protocol):
-    """A handler of messages."""
+    """A handler of messages, with optional methods.
+
+    refusal(message): the reason to refuse a message, or None. handle_sample(message, sample): in
+    place of `handle`, to forward the encoded bytes. set_aside(message, why): the messages that
+    replace the answer after an exception, such as the sender's credit.
+    """
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Handle one message; return the answers."""
-
-
-@runtime_checkable
-class TakesSamples(Protocol):
-    """A handler that needs the encoded bytes, too, to forward them."""
-
-    def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """Handle one message, as `handle` does."""
-
-
-@runtime_checkable
-class Guarded(Protocol):
-    """A handler that refuses messages that contradict its team."""
-
-    def refusal(self, message: m.Message) -> str | None:
-        """Return the reason to refuse a message; None: accepted."""
-
-
-@runtime_checkable
-class Recovers(Protocol):
-    """A handler that can recover after an exception in `handle`."""
-
-    def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Return the messages that replace the answer, such as the sender's credit."""
 
 
 @dataclass
@@ -106,12 +86,15 @@ class Boundary:
         if self.aside and _name(sample or _sample_of(message)) in self.aside:
             return []
         try:
-            refused = node.refusal(message) if _guarded(type(node)) else None  # type: ignore[attr-defined]
+            refusal = getattr(node, "refusal", None)
+            refused = None if refusal is None else refusal(message)
             if refused is not None:
                 self.refuse(sample or _sample_of(message), refused)
                 return []
-            if _takes_samples(type(node)):
-                return node.handle_sample(message, sample or _sample_of(message))  # type: ignore[attr-defined, no-any-return]
+            handle_sample = getattr(node, "handle_sample", None)
+            if handle_sample is not None:
+                out: list[Outgoing] = handle_sample(message, sample or _sample_of(message))
+                return out
             return node.handle(message, 0 if sample is None else sample.stamp_ns)
         except Exception as error:
             return self._set_aside(node, message, sample or _sample_of(message), error)
@@ -122,9 +105,12 @@ class Boundary:
         tag = m.tag_of(type(message))
         out = [self.note(error, sample, tag)]
         self.aside.add(_name(sample))
-        for _ in range(MOST_ANSWERS if isinstance(node, Recovers) else 0):
+        set_aside = getattr(node, "set_aside", None)
+        if set_aside is None:
+            return out
+        for _ in range(MOST_ANSWERS):
             try:
-                return [*out, *node.set_aside(message, self.last)]  # type: ignore[attr-defined]
+                return [*out, *set_aside(message, self.last)]
             except Exception as again:
                 out.append(self.note(again, sample, tag))
         return out
@@ -170,16 +156,6 @@ class Boundary:
         dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
-
-
-@cache
-def _takes_samples(kind: type) -> bool:
-    return issubclass(kind, TakesSamples)
-
-
-@cache
-def _guarded(kind: type) -> bool:
-    return issubclass(kind, Guarded)
 
 
 def reply_sample(key: str, payload: bytes) -> Sample:

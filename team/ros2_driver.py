@@ -25,7 +25,7 @@ from teamslam.team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from teamslam.team.ros2.frames import Frames, heading, misplaced, misplaced_antenna
+from teamslam.team.ros2.frames import Frames, describe_misplacement, heading
 from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
 from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
@@ -54,6 +54,13 @@ BEHIND_S = 1.0
 """Waiting time [s] of a message from which the driver is slower than its topics."""
 NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
+_MOUNT = (
+    "so all landmarks are shifted: write mount = [{place}] into [defaults.sensor], or the robot's "
+    "sensor"
+)
+_ANTENNA = (
+    "so all fixes are shifted: write antenna = [{place}] into [defaults.gnss], or the robot's gnss"
+)
 
 
 OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
@@ -335,10 +342,10 @@ class Ros2Driver:
             ]
         configured = self._robot.sensor_mount
         if configured is not None and self.mounts:
-            said += misplaced(self.mounts[0], configured)
+            said += describe_misplacement("sensor", self.mounts[0], configured, _MOUNT)
         there, antenna = self._robot.antenna, self._translator.antenna
         if there is not None and antenna is not None:
-            said += misplaced_antenna(antenna, there)
+            said += describe_misplacement("antenna", antenna, there, _ANTENNA)
         if self._translator.dropped[NO_DATUM]:
             said.append(f"{self._translator.dropped[NO_DATUM]:,} dropped: {NO_DATUM}")
         if question := self._translator.question():

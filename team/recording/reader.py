@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import msgpack
 import zstandard
@@ -16,7 +16,6 @@ from mcap.records import Channel as LogChannel
 
 from teamslam.team.recording.opening import LogFile, open_file
 from teamslam.team.recording.part_files import open_part, parts_of
-from teamslam.team.recording.recorder import Count
 from teamslam.team.recording.records import (
     LARGEST_CHUNK,
     MALFORMED,
@@ -30,7 +29,7 @@ from teamslam.team.recording.records import (
     read_index,
 )
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.channels import VIEW, Channel, channel_of
+from teamslam.team.wire.channels import Channel, row_of
 
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 
@@ -38,6 +37,13 @@ IN_FOLDER = "log.mcap"
 _MESSAGE = struct.Struct("<HIQQ")
 _OF_MESSAGE = int(Opcode.MESSAGE)
 """Plain number: comparing enum members takes a tenth of the reading time."""
+
+
+class Count(NamedTuple):
+    """Number and bytes of a key's messages."""
+
+    messages: int
+    bytes: int
 
 
 @dataclass(frozen=True)
@@ -142,8 +148,7 @@ class Log:
         key = topic.removeprefix(f"team/{self.team}/")
         if names is None:
             return key
-        found = channel_of(key)
-        row = found[0] if found is not None else VIEW if VIEW.owner(key) is not None else None
+        row = row_of(key)
         return key if row is not None and row.name in names else None
 
 

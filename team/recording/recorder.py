@@ -7,12 +7,11 @@ The metadata record "teamslam" describes run and program.
 
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import IO, NamedTuple, Self
+from typing import IO, Self
 
 from mcap.writer import Writer
 
@@ -37,13 +36,6 @@ class RecorderError(RuntimeError):
     """The log cannot be written: existing file, missing folder, full disk."""
 
 
-class Count(NamedTuple):
-    """Number and bytes of a key's messages."""
-
-    messages: int
-    bytes: int
-
-
 class Recorder:
     """Write one log on a thread, whose errors are raised by the next call.
 
@@ -54,7 +46,6 @@ class Recorder:
         self.path = Path(path)
         self._prefix = f"team/{team}/"
         self._queue: SimpleQueue[Sample | None] = SimpleQueue()
-        self._counts: dict[str, Count] = defaultdict(lambda: Count(0, 0))
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._failure: Exception | None = None
@@ -87,10 +78,6 @@ class Recorder:
             raise RecorderError(f"{self.path} is closed")
         for sample in samples:
             self._queue.put(sample)
-
-    def counts(self) -> dict[str, Count]:
-        """Return messages and bytes written so far, by relative key."""
-        return dict(self._counts)
 
     def waiting(self) -> int:
         """Number of queued samples."""
@@ -162,8 +149,6 @@ class Recorder:
             publish_time=max(sample.wall_ns, 0),
             sequence=sample.counter % 2**32,
         )
-        messages, size = self._counts[sample.key]
-        self._counts[sample.key] = Count(messages + 1, size + len(sample.payload))
 
     def _tag(self, sample: Sample) -> str:
         found = channel_of(sample.key)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.channels import SENSORS, VIEW, channel_of
+from teamslam.team.wire.channels import SENSORS, row_of
 
 FOREIGN = "(no channel)"
 """Channel of a key without a row in the table."""
@@ -66,8 +66,8 @@ def summarise_log(log: Log) -> Summary:
             continue
         for sample in chunk:
             if sample.key not in found:
-                row = channel_of(sample.key)
-                name = row[0].name if row else VIEW.name if VIEW.owner(sample.key) else FOREIGN
+                row = row_of(sample.key)
+                name = FOREIGN if row is None else row.name
                 found[sample.key] = KeySummary(
                     sample.key, name, 0, 0, sample.stamp_ns, sample.stamp_ns
                 )

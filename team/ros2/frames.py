@@ -1,5 +1,6 @@
 """A sensor's mount on its robot from static transforms, and detections in the plane."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import atan2, pi, remainder
 
@@ -156,27 +157,16 @@ class Frames:
         return Mount(place, BODY if exact else plane, place)
 
 
-def misplaced(here: Place, configured: Place) -> list[str]:
-    """Warn if the frames and the scenario place the sensor differently."""
-    turned = remainder(here[2] - configured[2], 2.0 * pi)
-    apart = here[0] - configured[0], here[1] - configured[1], turned
+def describe_misplacement(
+    sensor: str, here: Sequence[float], configured: Sequence[float], remedy: str
+) -> list[str]:
+    """Warn if the frames and the scenario place a sensor differently: (x, y) or (x, y, yaw)."""
+    apart = [a - b for a, b in zip(here, configured, strict=True)]
+    apart[2:] = [remainder(each, 2.0 * pi) for each in apart[2:]]
     if max(map(abs, apart)) < SAME_PLACE:
         return []
     place, other = (", ".join(f"{value:.4g}" for value in each) for each in (here, configured))
     return [
-        f"the sensor is at ({place}) on the base by its frames, and the scenario has it at "
-        f"({other}), so all landmarks are shifted: write mount = [{place}] into [defaults.sensor], "
-        "or the robot's sensor, and start the team again"
-    ]
-
-
-def misplaced_antenna(here: tuple[float, float], configured: tuple[float, float]) -> list[str]:
-    """Warn if the frames and the scenario place the antenna differently."""
-    if max(abs(a - b) for a, b in zip(here, configured, strict=True)) < SAME_PLACE:
-        return []
-    place, other = (", ".join(f"{value:.4g}" for value in each) for each in (here, configured))
-    return [
-        f"the antenna is at ({place}) on the base by its frames, and the scenario has it at "
-        f"({other}), so all fixes are shifted: write antenna = [{place}] into [defaults.gnss], or "
-        "the robot's gnss, and start the team again"
+        f"the {sensor} is at ({place}) on the base by its frames, and the scenario has it at "
+        f"({other}), {remedy.format(place=place)}, and start the team again"
     ]

@@ -58,7 +58,7 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
         if len(payload) > SMALL:
             check_structure(payload)
         message: M = _decoder(expected).decode(payload)
-    except (StructureError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (WireError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         _refuse(payload, expected, error)
     try:
         message.check()
@@ -70,14 +70,10 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
 
 def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exception) -> NoReturn:
     """Raise the `WireError` of a payload that could not be decoded; a wrong tag comes first."""
-    try:
-        tag = read_tag(payload)
-    except StructureError as why:
-        raise WireError(why.reason, why.detail) from None
-    kind = _kind(tag, expected)
+    kind = _kind(read_tag(payload), expected)
     match error:
-        case StructureError():
-            raise WireError(error.reason, error.detail) from None
+        case WireError():
+            raise error
         case RecursionError():
             raise WireError("too deep", "nested beyond any message's structure") from None
         case msgspec.ValidationError():
@@ -94,24 +90,8 @@ def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exceptio
 
 def unsound(message: Message) -> WireError | None:
     """Return the error with which every receiver refuses this message; None for a valid one."""
-    payload = _ENCODER.encode(message)
-    kind = type(message)
     try:
-        if len(payload) > SMALL:
-            decoded(payload, kind)
-        else:
-            _decoder((kind,)).decode(payload)
-            message.check()
-    except WireError as error:
-        return error
-    except (msgspec.ValidationError, ValueError):
-        return _refusal(payload, kind)
-    return None
-
-
-def _refusal(payload: bytes, kind: type[Message]) -> WireError | None:
-    try:
-        decoded(payload, kind)
+        decoded(encoded(message), type(message))
     except WireError as error:
         return error
     return None
@@ -126,7 +106,7 @@ def tag_in(payload: bytes) -> str:
     """Return the tag of a payload; empty if it has none."""
     try:
         return read_tag(payload)
-    except StructureError:
+    except WireError:
         return ""
 
 
@@ -162,20 +142,11 @@ _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
 """Number of bytes of the length of an array or map, and of values per entry, by code."""
 
 
-class StructureError(ValueError):
-    """A payload whose structure no message has; reason and detail as in `wire.codec`."""
-
-    def __init__(self, reason: str, detail: str) -> None:
-        super().__init__(f"{reason}: {detail}")
-        self.reason = reason
-        self.detail = detail
-
-
 def read_tag(payload: bytes) -> str:
-    """The tag with which a message begins; raises `StructureError` where there is none."""
+    """The tag with which a message begins; raises `WireError` where there is none."""
     count, at = _group_at(payload)
     if count > MOST_VALUES:
-        raise StructureError("too large", f"an array of {count} values, {MOST_VALUES} at most")
+        raise WireError("too large", f"an array of {count} values, {MOST_VALUES} at most")
     if not count:
         raise _no_tag()
     code = _byte(payload, at)
@@ -190,11 +161,11 @@ def read_tag(payload: bytes) -> str:
     try:
         return payload[at : at + min(size, _LONGEST_TAG)].decode()
     except UnicodeDecodeError:
-        raise StructureError("damaged", "a text is not UTF-8") from None
+        raise WireError("damaged", "a text is not UTF-8") from None
 
 
 def check_structure(payload: bytes) -> None:
-    """Raise `StructureError` where a payload has more values, or nests deeper, than any message.
+    """Raise `WireError` where a payload has more values, or nests deeper, than any message.
 
     Bytes behind the message are not looked at.
     """
@@ -208,11 +179,11 @@ def check_structure(payload: bytes) -> None:
         inside, at = _value_at(payload, at)
         values += 1
         if values + inside > MOST_VALUES:
-            raise StructureError("too large", f"more than {MOST_VALUES} values")
+            raise WireError("too large", f"more than {MOST_VALUES} values")
         if inside:
             left.append(inside)
         if len(left) > DEEPEST:
-            raise StructureError("too deep", "nested beyond any message's structure")
+            raise WireError("too deep", "nested beyond any message's structure")
     if at > len(payload):
         raise _truncated()
 
@@ -238,7 +209,7 @@ def _value_at(payload: bytes, at: int) -> tuple[int, int]:
         width, each = _GROUPS[code]
         size, at = _length(payload, at, width)
         return size * each, at
-    raise StructureError("damaged", "a value of no message")
+    raise WireError("damaged", "a value of no message")
 
 
 def _group_at(payload: bytes) -> tuple[int, int]:
@@ -262,11 +233,11 @@ def _byte(payload: bytes, at: int) -> int:
     return payload[at]
 
 
-def _truncated() -> StructureError:
-    return StructureError("truncated", "the payload ends inside the message")
+def _truncated() -> WireError:
+    return WireError("truncated", "the payload ends inside the message")
 
 
-def _no_tag(code: int = 0) -> StructureError:
+def _no_tag(code: int = 0) -> WireError:
     if code == _INVALID:
-        return StructureError("damaged", "not MessagePack")
-    return StructureError("wrong tag", "a message is an array that begins with its tag")
+        return WireError("damaged", "not MessagePack")
+    return WireError("wrong tag", "a message is an array that begins with its tag")

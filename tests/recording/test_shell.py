@@ -84,7 +84,7 @@ def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(path, monkeypatch):
         loop.take(bus.receive())
         wait_until(lambda: recorder.waiting() == 0 and recorder.dropped > 0)
         figures = loop.status().figures
-    counts = {key: count.messages for key, count in recorder.counts().items()}
+    counts = {key: count.messages for key, count in open_log(path).counts().items()}
     assert counts[c.ODOMETRY.key("r1")] == 20
     assert sum(key.endswith("/status") for key in counts) == 9
     assert figures["dropped_samples"] == 20 + 11

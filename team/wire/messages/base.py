@@ -1,6 +1,8 @@
 """The base of all messages: types of fields, and shared checks of arrays."""
 
-from typing import Annotated, Literal
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -40,6 +42,12 @@ def check_landmarks(id_bytes: bytes, means: bytes, covariance: bytes, *, joint: 
         check_packed_covariance(covariance, 2 * n, "covariance")
         return
     check_blocks(covariance, n, "covariance")
+
+
+def check_sorted(values: Sequence[Any], what: str) -> None:
+    """Raise ValueError unless the values strictly ascend."""
+    if any(a >= b for a, b in pairwise(values)):
+        raise ValueError(f"not ascending: {what}")
 
 
 def check_counts(count_bytes: bytes, groups: int, total: int) -> None:

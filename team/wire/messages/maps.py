@@ -1,6 +1,5 @@
 """The team's map, priors, trajectories and saved maps."""
 
-from itertools import pairwise
 from typing import Annotated, Literal
 
 import msgspec
@@ -26,6 +25,7 @@ from teamslam.team.wire.messages.base import (
     StampNs,
     Text,
     check_landmarks,
+    check_sorted,
 )
 from teamslam.team.wire.messages.orders import Judgement
 
@@ -211,9 +211,8 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
             if len(each.steps) != n:
                 raise ValueError(f"wrong length: {len(each.steps)} steps of {n} members")
             check_finite(each.figures, "figures", 3 * n)
-        for name, robots in (("withdrawn", self.withdrawn), ("lost", self.lost)):
-            if any(a >= b for a, b in pairwise(robots)):
-                raise ValueError(f"not ascending: {name}")
+        check_sorted(self.withdrawn, "withdrawn")
+        check_sorted(self.lost, "lost")
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 
@@ -351,10 +350,8 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
         counts = ids(self.counts, "counts")
         if len(counts) != n or not counts.min():
             raise ValueError(f"wrong length: counts are not {n} positive numbers")
-        if any(a >= b for a, b in pairwise(self.biases)):
-            raise ValueError("not ascending: biases")
-        if any(a >= b for a, b in pairwise(self.sets)):
-            raise ValueError("not ascending: sets")
+        check_sorted(self.biases, "biases")
+        check_sorted(self.sets, "sets")
         if not self.sets:
             raise ValueError("out of bounds: a map of no set")
         self._check_own(2 * n)
@@ -367,8 +364,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     def _check_own(self, n: int) -> None:
         """Check the errors of single robots, with their joint covariance with the landmarks."""
         K = len(self.own)
-        if any(a >= b for a, b in pairwise(self.own)):
-            raise ValueError("not ascending: own")
+        check_sorted(self.own, "own")
         check_finite(self.own_means, "own_means", K)
         check_finite(self.own_cross, "own_cross", K * n)
         check_finite(self.own_sensitivity, "own_sensitivity", K * len(self.biases))

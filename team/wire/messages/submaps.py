@@ -1,7 +1,6 @@
 """The inputs of fusion: submaps and inter-robot factors."""
 
 import math
-from itertools import pairwise
 
 from teamslam.team.config import GNSS, MAP, UNNAMED
 from teamslam.team.core import check_ascending, check_finite, check_packed_covariance
@@ -17,6 +16,7 @@ from teamslam.team.wire.messages.base import (
     StampNs,
     check_classes,
     check_counts,
+    check_sorted,
 )
 
 
@@ -73,8 +73,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
             derivatives(self.curvature, n, "curvature")
             if "clock_offset" not in self.biases:
                 raise ValueError("out of bounds: a curvature without the bias clock_offset")
-        if any(a >= b for a, b in pairwise(self.biases)):
-            raise ValueError("not ascending: biases")
+        check_sorted(self.biases, "biases")
         if not (times[1:] > times[:-1]).all():
             raise ValueError("not ascending: nodes")
         if len(times) and not self.start_ns < times[0] <= times[-1] <= self.stamp_ns:
@@ -150,8 +149,9 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
         check_packed_covariance(self.covariance, 2, "covariance")
         if self.range <= 0.0 or abs(self.bearing) > math.pi:
             raise ValueError("out of bounds: the range is not positive or the bearing not an angle")
-        if not self.measurements or any(a >= b for a, b in pairwise(self.measurements)):
-            raise ValueError("not ascending: measurements, or none")
+        if not self.measurements:
+            raise ValueError("not ascending: measurements, of which there are none")
+        check_sorted(self.measurements, "measurements")
         if self.teammate == self.robot:
             raise ValueError("out of bounds: a robot sees itself")
 
