@@ -13,6 +13,7 @@ from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import RobotBias, is_absolute, is_map, named, whole_of
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.map_joining.absence import absences
+from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import joint, points_of
@@ -110,7 +111,17 @@ def save_map(
         own_sensitivity=from_floats(rows[:, :K]),
         likeliest=from_floats(likeliest),
         evidence=translate.joint_bytes(evidence),
+        classes=_classes(fold, unnamed),
     )
+
+
+def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
+    """Encode the evidence of the classes of landmarks without identity, if any has one."""
+    if not any(each.observation.unnamed.classes.size for each in fold.main.graph.observed):
+        return b""
+    view = view_island(fold.main, fold.landmarks)
+    assert view.joint.classes is not None
+    return from_floats(view.joint.classes[[view.place_of[id_] for id_ in unnamed]])
 
 
 def _own_errors(island: Island) -> dict[RobotBias, int]:

@@ -61,6 +61,7 @@ def submap_of(saved: m.SavedMap) -> m.Submap:
         saved.counts,
         config=saved.sets[-1],
     )
+    submap = msgspec.structs.replace(submap, classes=saved.classes)
     rows = floats(saved.sensitivity, "sensitivity").reshape(len(saved.biases), n)
     if not len(rows):
         return submap

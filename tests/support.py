@@ -440,7 +440,7 @@ def examples() -> Iterator[m.Message]:
     yield m.SavedMap(
         stamp_ns=9_000,
         name="site",
-        ids=two,
+        ids=from_ids([4, UNNAMED]),
         means=means,
         covariance=packed(spd(4)),
         biases=("range_scale",),
@@ -461,6 +461,7 @@ def examples() -> Iterator[m.Message]:
         own_sensitivity=from_floats([1.0, -2.0]),
         likeliest=from_floats([0.25, 0.5, -0.25]),
         evidence=packed(spd(3)),
+        classes=from_floats([-0.25, -1.5]),
     )
     yield build.prior(
         stamp_ns=9_000,

@@ -373,6 +373,37 @@ def test_two_maps_with_a_day_in_common_would_count_it_twice():
     assert store.arrived == 1
 
 
+def classed(seed, classes):
+    """A day without identities; classes: the class of a landmark that is reported, by number."""
+    day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
+    world = streams_of(final_only(day_of))
+    streams = []
+    for each in world.streams:
+        seen = each.landmark_detections
+        rows = np.full((len(seen.ids), 3), np.log(0.1))
+        rows[np.arange(len(rows)), classes(seen.ids)] = np.log(0.8)
+        own = dataclasses.replace(seen, classes=rows)
+        streams.append(dataclasses.replace(each, landmark_detections=own))
+    return final_only(day_of), dataclasses.replace(world, streams=tuple(streams))
+
+
+def test_a_map_without_identities_is_saved_with_classes_which_tell_it_from_another():
+    scenario, streams = classed(1, lambda ids: ids % 3)
+    samples, centre, _ = day(1, scenario=scenario, streams=streams)
+    saved = centre.maps.fold.save_map("site")
+    rows = floats(saved.classes, "classes").reshape(-1, 3)
+    means = floats(saved.means, "means").reshape(-1, 2)
+    off = np.hypot(*(means[:, None] - streams.landmarks).transpose(2, 0, 1))
+    sure = off.min(axis=1) < 0.3
+    assert sure.sum() > 10
+    assert (rows.argmax(axis=1) == streams.landmark_ids[off.argmin(axis=1)] % 3)[sure].all()
+    for shift, joins in ((0, True), (1, False)):
+        scenario, streams = classed(1001, lambda ids, by=shift: (ids + by) % 3)
+        samples, _, _ = day(1, [saved], scenario=scenario, streams=streams)
+        reasons = final_map(samples).reasons
+        assert any("the saved map site not joined" in each for each in reasons) != joins
+
+
 def test_the_submap_of_a_map_has_landmarks_and_no_motion():
     submap = decoded(encoded(msgspec.structs.replace(submap_of(first_day()[1]), robot="r1")))
     assert isinstance(submap, m.Submap)

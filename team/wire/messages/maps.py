@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from teamslam.team.config import MAP, SURVEY
+from teamslam.team.config import MAP, SURVEY, UNNAMED
 from teamslam.team.core import (
     check_ascending,
     check_finite,
@@ -24,6 +24,7 @@ from teamslam.team.wire.messages.base import (
     Real,
     StampNs,
     Text,
+    check_classes,
     check_landmarks,
     check_sorted,
 )
@@ -311,7 +312,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     × K floats: given b their means are own_means + bᵀ own_sensitivity. likeliest, evidence: B + K
     floats and the packed upper triangle of an information matrix, positive definite: the likelihood
     N(likeliest, evidence⁻¹) of (biases, own) by the measurements in the map, without any prior of
-    these errors.
+    these errors. classes: as in Submap, of the landmarks without identity.
     """
 
     name: Name
@@ -333,6 +334,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
     own_sensitivity: Floats = b""
     likeliest: Floats = b""
     evidence: Floats = b""
+    classes: Floats = b""
 
     @property
     def author(self) -> str:
@@ -355,6 +357,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
         if not self.sets:
             raise ValueError("out of bounds: a map of no set")
         self._check_own(2 * n)
+        check_classes(self.classes, int((ids(self.ids, "ids") >= UNNAMED).sum()))
         if self.datum:
             check_finite(self.datum, "datum", 3)
             latitude, longitude, _ = floats(self.datum, "datum")
