@@ -27,7 +27,7 @@ from teamslam.team.estimation.map_joining.hypotheses import (
     explain,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.landmark_view import points_of
+from teamslam.team.estimation.map_joining.landmark_view import known, points_of
 from teamslam.team.estimation.map_joining.marginals import (
     Agreement,
     BiasEstimate,
@@ -35,7 +35,6 @@ from teamslam.team.estimation.map_joining.marginals import (
     terms,
     unbounded_costs,
 )
-from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
 SIGMAS = 4.0
@@ -231,21 +230,24 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
     leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
     """
-    graph = fold.main.graph
     seen_by: dict[int, set[str]] = {}
     own: dict[str, list[Contribution]] = {}
     for each in fold.contributions:
         own.setdefault(each.robot, []).append(each)
-    for joined in graph.submaps:
+    for joined in fold.main.graph.submaps:
+        robot = joined.contribution.robot
         for id_ in joined.contribution.local.ids.tolist():
-            seen_by.setdefault(id_, set()).add(joined.contribution.robot)
+            seen_by.setdefault(id_, set()).add(robot)
+    named = [id_ for id_ in known(fold.main) if id_ < UNNAMED and id_ in seen_by]
+    points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
+    places = dict(zip(named, points, strict=True))
     for robot, chain in sorted({**own, **withdrawn}.items()):
-        others = {i for i, robots in seen_by.items() if i < UNNAMED and robots - {robot}}
-        points = dict(zip(sorted(others), points_of(fold.main, sorted(others)), strict=True))
+        alone = {robot}
+        others = {id_: place for id_, place in places.items() if seen_by[id_] != alone}
         gains: list[float] = []
         wrong = 0
         for each in chain:
-            gain = _gain_of_reflection(points, each)
+            gain = _gain_of_reflection(others, each)
             if gain is not None:
                 gains.append(gain)
                 wrong += not gain > 0.0
@@ -263,24 +265,28 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
             )
 
 
-def _gain_of_reflection(
-    places: Mapping[int, Float[np.ndarray, "2"]], submap: Contribution
-) -> float | None:
+def _gain_of_reflection(places: Mapping[int, complex], submap: Contribution) -> float | None:
     """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection.
 
-    places: the others' landmarks [m], by id.
+    places: the others' landmarks x + iy [m], by id.
     """
     ids = submap.local.ids.tolist()
     own = [k for k, id_ in enumerate(ids) if id_ in places]
     if len(own) < LEAST_SHARED:
         return None
-    points, local = np.array([places[ids[k]] for k in own]), submap.local.landmarks[own]
-    x, y = (points - points.mean(axis=0)).T
-    u, v = (local - local.mean(axis=0)).T
-    rotated = core.hypot((x * u + y * v).sum(), (y * u - x * v).sum())
-    reflected = core.hypot((x * u - y * v).sum(), (y * u + x * v).sum())
+    z = _centred([places[ids[k]] for k in own])
+    w = _centred([complex(x, y) for x, y in submap.local.landmarks[own].tolist()])
+    rotated, reflected = (
+        sum(a * b for a, b in zip(z, each, strict=True)) for each in ([b.conjugate() for b in w], w)
+    )
+    gain = core.hypot(reflected.real, reflected.imag) - core.hypot(rotated.real, rotated.imag)
     variance = median(submap.factor.landmarks[own][:, [0, 2]].ravel().tolist())
-    return float(2.0 * (reflected - rotated)) / variance
+    return float(2.0 * gain) / variance
+
+
+def _centred(points: Sequence[complex]) -> list[complex]:
+    middle = sum(points) / len(points)
+    return [point - middle for point in points]
 
 
 def _wrong_minimum(fold: Fold) -> Iterator[m.Diagnosis]:

@@ -290,16 +290,8 @@ class FoldInputs:
             why = self._beyond(each)
             if why is not None:
                 outside[each.key] = why
-        sightings, starts, set_aside = [], [], []
-        for sighting in (each for key in order for each in self._members.sightings(key)):
-            if sighting.teammate in without:
-                continue
-            why = sighting_beyond(sighting, self._bounds)
-            if why is None:
-                sightings.append(sighting)
-            else:
-                of = f"{sighting.teammate} by {named(sighting.stream)}"
-                set_aside.append(f"an inter-robot measurement of {of} refused: {why}")
+        sightings, set_aside = self._sightings(order, without)
+        starts = []
         first = (m.stream for m in submaps if m.sequence == 0 and m.stream in self._starts)
         for start in (self._starts[stream] for stream in first):
             why = start_beyond(start, self._bounds)
@@ -315,13 +307,30 @@ class FoldInputs:
         )
         return Tick(submaps, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
 
+    def _sightings(
+        self, order: Sequence[Key], without: Collection[str]
+    ) -> tuple[list[InterRobotFactor], list[str]]:
+        """Return the inter-robot measurements from some submaps, and in words those refused."""
+        sightings, refused = [], []
+        for sighting in (each for key in order for each in self._members.sightings(key)):
+            if sighting.teammate in without:
+                continue
+            why = sighting_beyond(sighting, self._bounds)
+            if why is None:
+                sightings.append(sighting)
+            else:
+                of = f"{sighting.teammate} by {named(sighting.stream)}"
+                refused.append(f"an inter-robot measurement of {of} refused: {why}")
+        return sightings, refused
+
     def restore_submaps(self, fold: Fold, last: float, without: Collection[str]) -> Fold:
         """Restore the condensed submaps of a fold of the ticks up to the last."""
         if not fold.condensed_count:
             return fold
-        ticks = [self.tick(tick, without) for tick in self._members.behind(-math.inf, last)]
-        submaps = [each for tick in ticks for each in tick.contributions]
-        return restore_submaps(fold, submaps, [each for tick in ticks for each in tick.sightings])
+        ticks = self._members.behind(-math.inf, last)
+        order = [key for tick in ticks for key in self._members.keys(tick, without)]
+        submaps = [self._members.contribution(key) for key in order]
+        return restore_submaps(fold, submaps, self._sightings(order, without)[0])
 
     def digest(
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]

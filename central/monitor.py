@@ -17,9 +17,9 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Bias
-from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
+from teamslam.team.estimation.consistency import Scale
 from teamslam.team.estimation.map_joining.condensed_factor import SubmapCost
-from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate
+from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
 
 SCALE_WARN = math.sqrt(2.0)
 """Bound of the team's covariance scale; its inverse is the lower one."""
@@ -108,16 +108,10 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     """Compute the covariance scale of the team (the empty name) and of each robot."""
-    streams = [each[0] for each in submaps]
-    chi2, dof = (np.array([each[k] for each in submaps], np.float64) for k in (2, 3))
-    places: dict[str, list[int]] = {"": list(range(len(submaps)))}
-    for place, (robot, _) in enumerate(streams):
-        places.setdefault(robot, []).append(place)
-    half = np.asarray(chi2_quantile(0.5, dof))
-    found = {
-        who: covariance_scale(chi2[own], dof[own], half[own])
-        for who, own in ((who, np.array(places[who], np.int64)) for who in sorted(places))
-    }
+    costs: dict[str, list[SubmapCost]] = {"": [*submaps]}
+    for each in submaps:
+        costs.setdefault(each.stream[0], []).append(each)
+    found = {who: scale_of(costs[who]) for who in sorted(costs)}
     return {
         who: Scale(each.value / normal, each.log_sigma)
         for who, each in found.items()

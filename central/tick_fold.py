@@ -116,7 +116,7 @@ class TickFold:
         self.convicts = config.withdraw_above is not None
         self._tries = True
         self._ordered: frozenset[str] = frozenset()
-        self._agreed: tuple[Fold, Agreement] | None = None
+        self._agreed: tuple[Fold, Agreement, Mapping[str, float]] | None = None
         self._accused: Mapping[str, str] = {}
         self._others: dict[frozenset[str], TickFold] = {}
         self.undecided = ""
@@ -277,8 +277,15 @@ class TickFold:
     def agreement(self, fold: Fold) -> Agreement:
         """Return the agreement of a fold, cached for the last one, which broadcasts reuse."""
         if self._agreed is None or self._agreed[0] is not fold:
-            self._agreed = fold, marginals.joint_cost(fold)
+            found = marginals.joint_cost(fold)
+            self._agreed = fold, found, disagreement(found, least=1)
         return self._agreed[1]
+
+    def disagreement(self, fold: Fold) -> Mapping[str, float]:
+        """Return each robot's disagreement in a fold, be it by a single submap; cached likewise."""
+        self.agreement(fold)
+        assert self._agreed is not None
+        return self._agreed[2]
 
     def _due_for_retrial(self, tick: int) -> str | None:
         suspended = self._conviction.suspended
@@ -326,6 +333,8 @@ class TickFold:
     def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
+            return None
+        if max(self.disagreement(fold).values(), default=0.0) <= limit:
             return None
         if not find_suspects(self.agreement(fold), limit):
             return None
@@ -375,18 +384,19 @@ class TickFold:
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
             return {}
-        together = disagreement(self.agreement(fold), least=1)
+        together = self.disagreement(fold)
         if max(together.values(), default=0.0) <= limit:
             if not self.suspended:
                 self._others.clear()
             return {}
         team = {robot for (robot, _), key in fold.home.items() if key == fold.main_key}
-        folds, alone = {}, {}
+        folds: dict[str, Fold] = {}
+        alone: dict[str, float] = {}
         for robot in sorted(team):
             own = self.leave_out(self._inputs.robots - {robot}, self._until_ns)
             apart = own.fold_ahead() if ahead else own.fold
             if apart.contributions:
-                alone.update(disagreement(own.agreement(apart), least=1))
+                alone.update(own.disagreement(apart))
             is_in_frame = apart.frame == fold.frame or apart.frame in fold.starts
             folds[robot] = apart if is_in_frame else EMPTY_FOLD
         contradict = any(

@@ -108,7 +108,7 @@ def disagreement(
     least: fewest submaps from which a robot is judged.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
-    for (robot, _), _, chi2, dof, _ in agreement.submaps:
+    for (robot, _), _, chi2, dof, *_ in agreement.submaps:
         if dof >= 1.0:
             costs.setdefault(robot, []).append((chi2, dof))
     seen: dict[str, list[tuple[float, float]]] = {}

@@ -349,7 +349,7 @@ def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(tm
 
 def agreement(**ratios: float) -> Agreement:
     submaps = tuple(
-        SubmapCost((robot, 0), k, 5.0 * ratio * (0.8 + 0.04 * k), 5.0, 1.0)
+        SubmapCost((robot, 0), k, 5.0 * ratio * (0.8 + 0.04 * k), 5.0, 1.0, 4.35)
         for robot, ratio in ratios.items()
         for k in range(10)
     )

@@ -270,6 +270,13 @@ void bind_graph(nb::module_& m) {
                    "tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.")
       .def_prop_ro("explained_by_sightings", &Estimate::explained_by_sightings, "tr(JᵀR⁻¹J Σ) of each inter-robot measurement.")
       .def_prop_ro("explained_by_priors", &Estimate::explained_by_priors, "tr(P⁻¹ Σ) of each prior.")
+      .def_prop_ro("observations",
+                   [](const Estimate& self) {
+                     graph::Observations found = self.observations();
+                     return std::tuple(std::move(found.points), std::move(found.spread));
+                   },
+                   "Points of the landmarks of each submap by its start pose, and their covariances (xx, xy, yy) from that of\n"
+                   "the start pose and their own.")
       .def("quadratic",
            [](const Estimate& self, Indices nodes, const Marks& submaps, const Marks& sightings, const Marks& priors) {
              const Graph& graph = self.graph();

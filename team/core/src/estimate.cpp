@@ -375,6 +375,35 @@ Numbers Estimate::explained_by_priors() const {
   return found;
 }
 
+Observations Estimate::observations() const {
+  Observations found{dense::Matrix(graph_->landmarks(), 2), dense::Matrix(graph_->landmarks(), 3)};
+  for (std::size_t f = 0, row = 0; f < graph_->submaps.size(); f++) {
+    const Joined& at = graph_->submaps[f];
+    const Submap& submap = *at.submap;
+    const double* start = &state_[at.at[0]];
+    const auto [s, c] = elementary::sin_cos(start[2]);
+    dense::Matrix P(3, 3);  // of a fixed start 0
+    if (const Index node = at.nodes[0]; !graph_->fixed[node])
+      for (std::size_t i = 0; i < 9; i++) P[i / 3][i % 3] = selected_covariance()[graph_->diagonal_of(node) + i];
+    const Numbers local = submap.shifted_mean(state_, at.at);
+    for (std::size_t l = 0; l < submap.landmarks.size(); l++, row++) {
+      const double x = local[3 * submap.poses() + 2 * l], y = local[3 * submap.poses() + 2 * l + 1];
+      const double dx = c * x - s * y, dy = s * x + c * y;
+      auto [xx, xy, yy] = submap.landmarks[l];
+      for (double* each : {&xx, &xy, &yy}) *each *= loss_.covariance_factor;
+      found.points[row][0] = start[0] + dx;
+      found.points[row][1] = start[1] + dy;
+      found.spread[row][0] =
+          c * c * xx - 2.0 * c * s * xy + s * s * yy + P[0][0] - 2.0 * dy * P[0][2] + dy * dy * P[2][2];
+      found.spread[row][1] = c * s * (xx - yy) + (c * c - s * s) * xy + P[0][1] + dx * P[0][2] - dy * P[1][2] -
+                             dx * dy * P[2][2];
+      found.spread[row][2] =
+          s * s * xx + 2.0 * c * s * xy + c * c * yy + P[1][1] + 2.0 * dx * P[1][2] + dx * dx * P[2][2];
+    }
+  }
+  return found;
+}
+
 Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
   const Graph& graph = *graph_;
   std::vector<std::ptrdiff_t> place(graph.nodes(), -1);

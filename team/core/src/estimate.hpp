@@ -32,6 +32,12 @@ struct Summed {
   double cost;
 };
 
+// Of each landmark of each submap: its point in the frame by the submap's start pose, and its covariance
+// (xx, xy, yy) from that of the start pose and its own.
+struct Observations {
+  dense::Matrix points, spread;
+};
+
 // state: empty where no step lowers the cost; then the damping is infinite. change: the largest change
 // of a number by the full step.
 struct Step {
@@ -84,6 +90,9 @@ class Estimate {
   Numbers explained() const;
   Numbers explained_by_sightings() const;
   Numbers explained_by_priors() const;
+
+  // Throws sparse::NotPositiveDefinite.
+  Observations observations() const;
 
   // The marked factors and the condensed one as one quadratic at this state, over these nodes,
   // ascending; the factors' other nodes are constants.

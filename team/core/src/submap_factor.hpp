@@ -71,6 +71,7 @@ struct Submap {
   std::size_t unknowns() const { return 3 + size() + biases(); }
   std::size_t row_of(std::size_t point) const { return point < poses() ? 3 * point : 2 * point + poses(); }
 
+  Numbers shifted_mean(Values state, Indices at) const;  // mean + Σ_b (S_b b + ½ D_b b²)
   Residual residual(Values state, Indices at) const;
   Normal normal(Values state, Indices at) const;
   double chi2(Values state, Indices at) const;
@@ -98,7 +99,6 @@ struct Submap {
 
  private:
   double bias(Values state, Indices at, std::size_t b) const { return state[at[1 + points() + b]]; }
-  Numbers shifted_mean(Values state, Indices at) const;
   // S + D b, with which the mean answers each bias at a state.
   dense::Matrix sensitivity_at(Values state, Indices at) const;
   Residual residual_of(const Numbers& shifted, Values state, Indices at) const;

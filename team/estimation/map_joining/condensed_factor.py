@@ -39,7 +39,8 @@ class SubmapCost(NamedTuple):
 
     chi2: unweighted χ² of the submap, no landmark discounted. dof: dim − w tr(JᵀP⁻¹J Σ), the part
     of the submap's dimension that the solution does not absorb (its redundancy, Baarda 1968).
-    weight: the robust weight w; 1 without a robust loss.
+    weight: the robust weight w; 1 without a robust loss. median: of χ² with `dof` degrees of
+    freedom; NaN for less than one.
     """
 
     stream: Stream
@@ -47,6 +48,7 @@ class SubmapCost(NamedTuple):
     chi2: float
     dof: float
     weight: float
+    median: float
 
 
 class EliminatedPath(NamedTuple):
@@ -89,14 +91,18 @@ class Departed(NamedTuple):
 
 def select_newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
     """Select the costs of the last HISTORY submaps of each stream, in order."""
-    counts = Counter(stream for stream, *_ in submaps)
+    counts = Counter(each.stream for each in submaps)
     older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
-    found = []
-    for each in submaps:
-        if older.get(each[0], 0) > 0:
-            older[each[0]] -= 1
-        else:
+    found: list[SubmapCost] = []
+    for at, each in enumerate(submaps):
+        if not older:
+            return (*found, *submaps[at:])
+        if each.stream not in older:
             found.append(each)
+        elif older[each.stream] > 1:
+            older[each.stream] -= 1
+        else:
+            del older[each.stream]
     return tuple(found)
 
 

@@ -18,6 +18,8 @@ also be larger than that which a single submap resolves.
 import math
 from bisect import insort
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -25,16 +27,14 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.consistency import covariance_scale
 from teamslam.team.estimation.map_joining.gauss_newton import (
     LANDMARK_GATE,
     Island,
     final_cost,
     joint_marginal,
 )
-from teamslam.team.estimation.map_joining.marginals import terms
+from teamslam.team.estimation.map_joining.marginals import scale_of, terms
 from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
-from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.estimation.se2 import compose, inverse, wrapped
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64
@@ -115,63 +115,44 @@ class Hypothesis(NamedTuple):
     island: Island
 
 
-def sights_of(island: Island) -> dict[int, Sights]:
-    """Tabulate the observations of each named landmark by the submaps of the graph."""
-    graph, state = island.graph, island.state
+def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
+    """Tabulate the observations of each named landmark whose χ² about one place is above a
+    bound: no split removes more.
+    """
+    graph = island.graph
+    points, spread = island.estimate.observations
     id_of = np.full(len(graph.fixed), NO_ID)
     for id_, node in graph.landmarks.items():
         if id_ < UNNAMED:
             id_of[node] = id_
-    order = sorted(range(len(graph.submaps)), key=lambda at: graph.submaps[at].contribution.key)
-    order = [at for at in order if len(graph.submaps[at].contribution.local.ids)]
-    if not order:
+    of = np.repeat(np.arange(len(graph.submaps)), np.diff(graph.landmark_start))
+    keys = [each.contribution.key for each in graph.submaps]
+    rank = np.argsort(sorted(range(len(keys)), key=keys.__getitem__))
+    ids = id_of[graph.landmark_nodes]
+    order = np.lexsort((rank[of], ids))[int((ids == NO_ID).sum()) :]
+    if not len(order):
         return {}
-    joined = [graph.submaps[at] for at in order]
-    of = np.repeat(np.arange(len(order)), [len(each.landmarks) for each in joined])
-    local = np.concatenate([_landmarks_of(each, island) for each in joined])
-    starts = np.array([int(each.nodes[0]) for each in joined])
-    at = graph.offset[starts]
-    x, y, heading = state[at], state[at + 1], state[at + 2]
-    s, c = core.sin_and_cos(heading)
-    s, c = s[of], c[of]
-    dx, dy = c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1]
-    own = np.concatenate([each.contribution.factor.landmarks for each in joined])
-    own = own * island.settings.covariance_factor
-    xx = c * c * own[:, 0] - 2.0 * c * s * own[:, 1] + s * s * own[:, 2]
-    yy = s * s * own[:, 0] + 2.0 * c * s * own[:, 1] + c * c * own[:, 2]
-    xy = c * s * (own[:, 0] - own[:, 2]) + (c * c - s * s) * own[:, 1]
-    free = [not graph.fixed[start] for start in starts.tolist()]
-    poses = np.zeros((len(order), 3, 3))
-    for k in np.flatnonzero(free).tolist():
-        start = int(starts[k])
-        poses[k] = graph.pattern.block(island.selected_covariance, start, start)
-    P = poses[of]
-    xx = xx + P[:, 0, 0] - 2.0 * dy * P[:, 0, 2] + dy * dy * P[:, 2, 2]
-    yy = yy + P[:, 1, 1] + 2.0 * dx * P[:, 1, 2] + dx * dx * P[:, 2, 2]
-    xy = xy + P[:, 0, 1] + dx * P[:, 0, 2] - dy * P[:, 1, 2] - dx * dy * P[:, 2, 2]
-    points, spread = np.column_stack([x[of] + dx, y[of] + dy]), np.column_stack([xx, xy, yy])
-    places = np.array(order, np.int64)[of]
-    end_ns = np.array([each.contribution.end_ns for each in joined], np.int64)[of]
-    ids = id_of[np.concatenate([each.landmarks for each in joined])]
-    by_id = np.argsort(ids, kind="stable")
-    groups = np.split(by_id, np.flatnonzero(np.diff(ids[by_id])) + 1)
-    return {
-        int(ids[group[0]]): Sights(places[group], end_ns[group], points[group], spread[group])
-        for group in groups
-        if ids[group[0]] != NO_ID
-    }
+    ids, of, points, spread = ids[order], of[order], points[order], spread[order]
+    first = np.flatnonzero(np.diff(ids, prepend=NO_ID))
+    counts = np.diff(first, append=len(ids))
+    about = np.repeat(_medians(points, first, counts), counts, axis=0)
+    one = np.add.reduceat(_chi2_of(points - about, spread), first)
+    end_ns = np.array([key[0] for key in keys], np.int64)[of]
+    found = {}
+    for k in np.flatnonzero(one > beyond).tolist():
+        own = slice(first[k], first[k] + counts[k])
+        found[int(ids[first[k]])] = Sights(of[own], end_ns[own], points[own], spread[own])
+    return found
 
 
-def _landmarks_of(joined: Joined, island: Island) -> Float[np.ndarray, "n 2"]:
-    """Return a submap's landmarks in its frame, at the state's shared errors."""
-    graph, local = island.graph, joined.contribution.local
-    mean = local.mean[-2 * len(local.ids) :].copy()
-    of_biases = joined.nodes[len(joined.nodes) - len(joined.biases) :]
-    rows = zip(joined.sensitivity, joined.curvature, of_biases.tolist(), strict=True)
-    for row, bent, node in rows:
-        value = island.state[graph.offset[node]]
-        mean += value * (row + 0.5 * value * bent)[-len(mean) :]
-    return mean.reshape(-1, 2)
+def _medians(
+    values: Float[np.ndarray, "n k"], first: Places, counts: Places
+) -> Float[np.ndarray, "g k"]:
+    """Compute the medians of consecutive groups of rows."""
+    group = np.repeat(np.arange(len(first)), counts)
+    ordered = np.column_stack([each[np.lexsort((each, group))] for each in values.T])
+    middle: Values = 0.5 * (ordered[first + (counts - 1) // 2] + ordered[first + counts // 2])
+    return middle
 
 
 class _Two(NamedTuple):
@@ -185,11 +166,15 @@ def _chi2_about(
     sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
 ) -> Costs:
     """Evaluate the χ² of each of some observations about a place, or about each of k places (k × 1
-    × 2), at most FAR.
+    × 2).
     """
-    away = sights.points[own] - point
+    return _chi2_of(sights.points[own] - point, sights.spread[own])
+
+
+def _chi2_of(away: Float[np.ndarray, "*k n 2"], spread: Float[np.ndarray, "n 3"]) -> Costs:
+    """Evaluate the χ² of differences, at most FAR."""
     x, y = away[..., 0], away[..., 1]
-    xx, xy, yy = sights.spread[own].T
+    xx, xy, yy = spread.T
     chi2: Costs = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     bounded: Costs = np.minimum(chi2, FAR)
     return bounded
@@ -262,11 +247,6 @@ def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _
     return _Two(second, one - sum(parts) - price)
 
 
-def _about_one_place(sights: Sights) -> float:
-    """Evaluate the χ² about one place: no split removes more."""
-    return float(_chi2_about(sights, median(sights.points)).sum())
-
-
 def change_of(sights: Sights) -> _Two | None:
     """Find the time at which a landmark's place changes most."""
     n, least = len(sights.places), _least_side(len(sights.places))
@@ -310,20 +290,22 @@ def clusters_of(sights: Sights, scale: float) -> _Two | None:
     return _split_by(sights, second, scale * _price(second)) if _is_shared(sights, second) else None
 
 
-class _Solved(NamedTuple):
-    """The island in which all accepted causes are unknowns, its cost, and its covariance scale."""
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The island in which all accepted causes are unknowns, and its covariance scale."""
 
     island: Island
-    cost: float
     scale: float
 
+    @cached_property
+    def cost(self) -> float:
+        """Its cost at final robust scales."""
+        return final_cost(self.island)
 
-def _solved(island: Island, cost: float) -> _Solved:
-    found = terms(island).submaps
-    scale = covariance_scale(
-        np.array([each.chi2 for each in found]), np.array([each.dof for each in found])
-    )
-    return _Solved(island, cost, 1.0 if scale is None else max(1.0, scale.value))
+
+def _solved(island: Island) -> _Solved:
+    scale = scale_of(terms(island).submaps)
+    return _Solved(island, 1.0 if scale is None else max(1.0, scale.value))
 
 
 def _difference(island: Island, before: int, after: int) -> tuple[Values, Covariance]:
@@ -364,10 +346,11 @@ def _robots_of(island: Island, places: Places) -> frozenset[str]:
 
 def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the most likely hypotheses of a landmark with two places."""
-    sights, enough = sights_of(base.island), base.scale * level
+    enough = base.scale * level
+    sights = sights_of(base.island, enough)
     proposals: list[tuple[float, int, SplitCause, Bool[np.ndarray, " n"]]] = []
     for id_, own in sights.items():
-        if len(own.places) < 2 * LEAST_SIDE or _about_one_place(own) <= enough:
+        if len(own.places) < 2 * LEAST_SIDE:
             continue
         moved, shared = change_of(own), clusters_of(own, base.scale)
         if moved is not None and moved.evidence > enough:
@@ -487,6 +470,8 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     """
     island, graph = base.island, base.island.graph
     chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
+    if int((chi2 > base.scale * FAR).sum()) < LEAST_SPOILT:
+        return
     worst: list[tuple[int, int]] = []
     for at, joined in enumerate(graph.submaps):
         of = chi2[int(graph.landmark_start[at]) : int(graph.landmark_start[at + 1])]
@@ -538,9 +523,9 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
     """Find landmarks with two places, and robots that were carried off; return also the island in
     which these are unknowns.
     """
-    first = robust(island)
-    base = _solved(first, final_cost(first))
-    tests = 2 * len(first.graph.submaps) + int(first.graph.landmark_start[-1])
+    base = _solved(robust(island))
+    graph = base.island.graph
+    tests = 2 * len(graph.submaps) + len(graph.landmark_nodes)
     level = -2.0 * core.log(CHANCE / max(tests, 1))
     accepted: list[Hypothesis] = []
     for _ in range(ROUNDS):
@@ -554,7 +539,7 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
             break
         best = max(found, key=lambda each: each.evidence / each.dof)
         accepted.append(best)
-        base = _solved(best.island, final_cost(best.island))
+        base = _solved(best.island)
     return _told_apart(accepted, base, level), base.island
 
 

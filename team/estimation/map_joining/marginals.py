@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from teamslam.team.config import UNNAMED, Bias
-from teamslam.team.estimation.consistency import covariance_scale
+from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import deviation
 from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
@@ -370,17 +370,24 @@ def _terms(island: Island) -> Terms:
     weight = now.weights
     taken = weight * now.explained
     of = [each.contribution for each in graph.submaps]
-    whole, left = now.whole_chi2.tolist(), (graph.dimensions - taken).tolist()
+    left = graph.dimensions - taken
+    costs = now.whole_chi2, left, weight, np.asarray(chi2_quantile(0.5, left))
     counted = (weight * now.counted_chi2).tolist(), (now.dimensions - taken).tolist()
     return Terms(
         [
             SubmapCost(each.stream, each.sequence, *rest)
-            for each, *rest in zip(of, whole, left, weight.tolist(), strict=True)
+            for each, *rest in zip(of, *(column.tolist() for column in costs), strict=True)
         ],
         [(each.robot, *rest) for each, *rest in zip(of, *counted, strict=True)],
         _priors(island),
         _sightings(island),
     )
+
+
+def scale_of(costs: Sequence[SubmapCost]) -> Scale | None:
+    """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
+    rows = [(each.chi2, each.dof, each.median) for each in costs]
+    return covariance_scale(*np.array(rows, np.float64).reshape(-1, 3).T)
 
 
 def unbounded_costs(island: Island) -> list[SubmapCost]:
@@ -391,9 +398,7 @@ def unbounded_costs(island: Island) -> list[SubmapCost]:
     scale that it shows; the costs are stated for its own covariances.
     """
     found, settings = terms(island).submaps, island.settings
-    scale = covariance_scale(
-        np.array([each.chi2 for each in found]), np.array([each.dof for each in found])
-    )
+    scale = scale_of(found)
     if not settings.robust or scale is None or scale.value < FAR_TOO_SMALL:
         return found
     try:

@@ -31,12 +31,12 @@ TOLERANCE = 1e-4
 
 
 def robust(island: Island) -> Island:
-    """Solve an island with a robust loss, from its state."""
+    """Solve an island with a robust loss, from its state, if it has none."""
     settings = island.settings
     if settings.robust:
-        return age_factors(island, FULL_AGE)
+        return island
     solved, *_ = solve_island(replace(island, settings=replace(settings, robust=True)))
-    return age_factors(solved, FULL_AGE)
+    return solved
 
 
 def split(
@@ -76,8 +76,8 @@ def resolved(island: Island) -> tuple[Island, float] | None:
     """Solve from the state, at final robust scales; return the solution and its cost; None without
     one.
     """
+    island, damping = age_factors(island, FULL_AGE), 0.0
     try:
-        damping = 0.0
         for _ in range(ITERATIONS):
             island, damping, change = take_step(island, damping)
             if change < TOLERANCE or damping == STUCK:

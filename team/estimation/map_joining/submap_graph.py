@@ -253,6 +253,11 @@ class Graph:
         return _starts([len(each.contribution.local.ids) for each in self.submaps])
 
     @cached_property
+    def landmark_nodes(self) -> Indices:
+        """The nodes of the landmarks of all submaps."""
+        return np.concatenate([np.zeros(0, np.int64), *(each.landmarks for each in self.submaps)])
+
+    @cached_property
     def dimensions(self) -> Indices:
         """Dimension of each submap."""
         return np.array([len(each.contribution.local.mean) for each in self.submaps], np.int64)
