@@ -486,6 +486,13 @@ class Estimate:
     def explained_by_priors(self) -> NDArray[numpy.float64]:
         """tr(P⁻¹ Σ) of each prior."""
 
+    @property
+    def observations(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Points of the landmarks of each submap by its start pose, and their covariances (xx, xy, yy) from that of
+        the start pose and their own.
+        """
+
     def quadratic(self, nodes: NDArray[numpy.int64], submaps: NDArray[numpy.bool_], sightings: NDArray[numpy.bool_], priors: NDArray[numpy.bool_]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
         """
         Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,

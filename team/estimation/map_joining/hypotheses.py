@@ -146,7 +146,9 @@ def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
 
 
 def _medians(
-    values: Float[np.ndarray, "n k"], first: Places, counts: Places
+    values: Float[np.ndarray, "n k"],
+    first: Int64[np.ndarray, " g"],
+    counts: Int64[np.ndarray, " g"],
 ) -> Float[np.ndarray, "g k"]:
     """Compute the medians of consecutive groups of rows."""
     group = np.repeat(np.arange(len(first)), counts)
