@@ -263,10 +263,11 @@ def assign_jointly(
     A pair needs log odds of `odds` against all assignments without it. If one of these pairs has a
     standard deviation above `tight`, all of them together need a log-likelihood ratio of
     `llr_loose`; if it would without pairs that are not accepted, the assignment as a whole needs
-    it. most_sd: largest standard deviation of a pair.
+    it. most_sd: largest standard deviation of a pair given those before it: far landmarks that
+    share a heading error are certain given near ones.
     """
-    first, second, sd = gate_pairs(joint, first, second, profile, most_sd)
-    if not len(first):
+    first, second, sd = gate_pairs(joint, first, second, profile)
+    if not (sd <= most_sd).any():
         return MergedPairs((), joint)
     order = _order_landmarks(first, sd)
     assigned = np.isin(first, order)

@@ -315,6 +315,27 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
         assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(merged)]
 
 
+@pytest.mark.parametrize(("heading_sigma", "merged"), [(0.06, 3), (0.2, 0)])
+def test_far_landmarks_are_merged_that_near_ones_make_certain(heading_sigma, merged):
+    """Three landmarks seen again at 4, 6 and 8 m under an error of the heading. Alone, the nearest
+    one is too little evidence; the others are uncertain by more than `most_sd` until it is merged.
+    """
+    known, most_sd = np.array([(4.0, 0.0), (0.0, 6.0), (-8.0, 0.0)]), 0.35
+    profile = AssociationProfile(slack=0.03, density=0.05, same=0.5)
+    turned = np.zeros((12, 1))  # by one standard deviation of the heading
+    turned[6:, 0] = (heading_sigma * known[:, ::-1] * [-1.0, 1.0]).ravel()
+    points = np.concatenate([known, known + turned[6:].reshape(-1, 2)])
+    seen = np.arange(6) >= 3
+    apart = (seen[:, None] == seen) & ~np.eye(6, dtype=np.bool_)
+    joint = Joint(points, 0.08**2 * np.eye(12) + turned @ turned.T, apart)
+    one, two = (each.ravel() for each in np.meshgrid(np.arange(3, 6), np.arange(3)))
+    at = evaluate_pairs(joint, np.arange(3, 6), np.arange(3), profile)
+    assert at.llr[0] < profile.llr_loose
+    assert at.sd[1:].min() > most_sd
+    found = assign_jointly(joint, one, two, profile, most_sd)
+    assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(merged)]
+
+
 def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it():
     twins_and_another = [(0.0, 0.0), (0.25, 0.0), (3.0, 1.0)]
     points = np.array([*twins_and_another, (0.12, 0.0), (3.0, 1.0)])  # the first is either twin
