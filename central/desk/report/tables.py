@@ -165,7 +165,10 @@ def team_rows(evaluation: Evaluation) -> Rows:
     rows += _association_rows(evaluation)
     rows += [("changes", change_words(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
-    rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
+    if evaluation.diagnosis:
+        rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
+    elif evaluation.scenario is not None and evaluation.scenario.fusion == "join":
+        rows.append(("cause of misfit", "none found"))
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("note", words) for words in evaluation.separate_times]
     rows += [("verdict", words) for words in evaluation.verdicts]
@@ -371,8 +374,8 @@ _PATH = (
     Column("in\n95 %", "online.coverage", ".0%"),
 )
 PATH_NOTE = (
-    "position RMSE, smoothed and online; aligned: moved as the map is, or as all paths together "
-    "where no true landmark is known"
+    "position RMSE, smoothed and online; aligned: after the rigid motion that aligns the map with "
+    "the true landmarks, or all paths with the true ones where no true landmark is known"
 )
 
 
