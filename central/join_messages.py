@@ -32,7 +32,7 @@ from teamslam.team.estimation.map_joining.distinctness import (
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
-from teamslam.team.estimation.map_joining.minima import RIVAL
+from teamslam.team.estimation.map_joining.minima import MISFIT, RIVAL
 from teamslam.team.estimation.map_joining.refusal import describe_refusals
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
@@ -185,12 +185,18 @@ def reasons(
     shown: Shown,
     biases: Sequence[BiasEstimate],
     landmark_submaps: int,
+    *,
+    is_explained: bool,
 ) -> tuple[str, ...]:
-    """List why robots and landmarks are not in the map, and warnings about it."""
+    """List why robots and landmarks are not in the map, and warnings about it.
+
+    is_explained: whether the diagnosis names a cause of the map's misfit.
+    """
+    diagnosed = (RIVAL, MISFIT) if is_explained else (RIVAL,)
     return (
         *_apart(fold),
         *_worded(describe_refusals(fold)),
-        *(words for words in fold.warnings if not words.startswith(RIVAL)),
+        *(words for words in fold.warnings if not words.startswith(diagnosed)),
         *(survey_warnings(fold) if fold.has_maps else ()),
         *(fix_warnings(fold) if fold.has_maps else ()),
         *(sensor_warnings(fold) if fold.has_maps else ()),

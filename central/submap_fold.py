@@ -242,7 +242,13 @@ class SubmapFold:
             scale,
             final=final,
         )
-        self.reasons = reasons(fold, shown, biases, self.config.landmark_submaps)
+        self.reasons = reasons(
+            fold,
+            shown,
+            biases,
+            self.config.landmark_submaps,
+            is_explained=any(each.cause != "noise_overestimated" for each in self.diagnosis),
+        )
         if final and not self.config.localise:
             fold = marginals.widen_covariances(fold, widening(self.diagnosis))
             biases = marginals.bias_estimates(fold)

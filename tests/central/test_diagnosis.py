@@ -16,6 +16,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.true_minimum import final_fold
 from teamslam.team.estimation.map_joining.marginals import landmark_map
+from teamslam.team.estimation.map_joining.minima import MISFIT
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from tests.final_maps import final_only, scenario_in
@@ -65,8 +66,10 @@ def test_one_number_of_two_landmarks_is_named(tmp_path):
 def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
     off = CarriedOff("r2", 4.0, 0.6, 50.0)
     of = scenario(replace(TEAM, carried_off=(off,)), tmp_path)
-    (found,) = diagnosed(of)
+    final = final_map(list(run_team(of, streams_of(of))))
+    (found,) = final.diagnosis
     assert (found.cause, found.robot) == ("carried_off", "r2")
+    assert not any(MISFIT in each for each in final.reasons), "it is explained"
     assert math.hypot(*found.value[:2]) == pytest.approx(4.0, abs=0.5)
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
 

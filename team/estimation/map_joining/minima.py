@@ -44,7 +44,8 @@ MORE_SOLUTIONS = 4
 FEW_LANDMARKS = 6
 """Most landmarks with which a chain may fold wrongly at an unsuspicious cost."""
 RIVAL = "another map fits about as well"
-"""First words of the warning about another minimum."""
+MISFIT = "the map does not fit its submaps"
+"""First words of the warnings about another minimum, and about the cost."""
 WIDE = 30.0
 """Cauchy's scale at which the annealed start begins."""
 
@@ -255,7 +256,7 @@ def warnings(search: Search) -> list[str]:
     dof = degrees_of_freedom(island)
     if is_suspicious(island, search.best.cost):
         found.append(
-            f"the map does not fit its submaps: chi² {search.best.cost:.1f} with {dof} degrees of "
+            f"{MISFIT}: chi² {search.best.cost:.1f} with {dof} degrees of "
             "freedom; it may be a wrong minimum, or the covariances are too small"
         )
     if search.best.change == math.inf:
