@@ -26,7 +26,7 @@ from tests.estimation.map_joining.test_joining import (
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import correlated, seen_from, solved, team, wrap
 
-RUNS = 200
+RUNS = 100
 
 
 def consistency(runs):
@@ -128,7 +128,7 @@ def nees_of_map_and_biases(seeds, *, blind=False):
     return of_map / dof, of_biases
 
 
-SEEDS = range(200)
+SEEDS = range(100)
 
 
 def test_map_and_biases_are_consistent_and_without_bias_states_they_are_not():

@@ -18,7 +18,7 @@ from tests.estimation.map_joining.test_range_scale import (
     fold_of,
 )
 
-SEEDS = range(200)
+SEEDS = range(100)
 
 
 def scale_errors(seeds, *, joined_ranges, way=0.01):

@@ -11,12 +11,11 @@ from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.studies.experiments import runner, xu_localisation
+from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
-from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
+from teamslam.sim.studies.experiments.catalogue import Entry
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
-from teamslam.sim.studies.experiments.output import write
-from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed, planned
+from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 
@@ -111,25 +110,6 @@ def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     assert Cases(tmp_path).found(counted(2.0)) is None
     monkeypatch.setattr("teamslam.sim.studies.experiments.task.program_of", lambda _: "0" * 16)
     assert Cases(tmp_path).found(counted(1.0)) is None
-
-
-def test_a_command_that_was_interrupted_ends_with_the_figures_of_one_that_was_not(tmp_path):
-    entry = next(each for each in ENTRIES if each.name == "xu-3.5")
-    options = Options((1, 2), quick=True)
-    tasks = tuple(xu_localisation.tasks(options)[:2])
-    experiment = planned(entry, options).experiment
-    whole = Plan(entry, options, experiment, tasks)
-    begun = Plan(entry, options, experiment, tasks[:1])
-    computed([begun], tmp_path / "resumed", 1, silent)
-    (resumed,) = computed([whole], tmp_path / "resumed", 2, silent)
-    (at_once,) = computed([whole], tmp_path / "at once", 1, silent)
-    pages = []
-    for name, concluded in (("resumed", resumed), ("at once", at_once)):
-        folder = tmp_path / name
-        pages.append(write([concluded], folder, "index", {}).read_bytes())
-        assert (folder / "xu-3.5.json").exists()
-    assert pages[0] == pages[1]
-    assert sum(count for _, count, _ in resumed.kinds) == len(tasks)
 
 
 RUN = CliRunner()

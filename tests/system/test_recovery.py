@@ -76,48 +76,33 @@ async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
     assert found.final_map() == map_in_memory(found.scenario)
 
 
-async def test_an_order_to_withdraw_a_robot_outlives_the_centre_that_heard_it(team):
-    found = await assembled(team, "4")  # the order takes a process, and comes before the end
-    found.robots["r1"] = await robot(team, found, found.endpoint, "r1")
+async def test_an_order_and_an_earlier_life_s_submaps_outlive_the_centre_that_received_them(team):
+    """r1 dies and resumes, r2 is withdrawn, then the centre dies."""
+    found = await assembled(team, "4")  # all of this comes before the end
+    first = await robot(team, found, found.endpoint, "r1")
     there = ["--connect", found.endpoint]
     with Observer(found.endpoint, [ch.SUBMAP]) as seen:
+        await seen.sees(1, ch.SUBMAP, "r1")
+        first.signal(signal.SIGKILL)
+        await first.ended()
+        found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
         await seen.sees(1, ch.SUBMAP, "r2")
         order = await team.start(
             "withdraw", "r2", "--team", load(found.scenario).team, *there, name="order"
         )
         assert await order.ended() == 0, order.said()
         assert "r2 is withdrawn; the map of" in order.said()
+        await seen.sees(2, ch.SUBMAP, "r1")
         centre = found.others.pop(1)
         centre.signal(signal.SIGKILL)
         await centre.ended()
     again = await team.start("central", found.scenario, *there)
     found.others.append(again)
     await found.ends_well(status=1)
+    assert "resumed after submap" in found.robots["r1"].said()
     assert "the final map is without r2: withdrawn" in again.said()
     fused = decoded(found.final_map(), m.FusedMap)
-    assert fused.withdrawn == ("r2",)
+    assert (fused.withdrawn, fused.missing) == (("r2",), ())
     assert {member.robot for member in fused.members} == {"r1"}
     verified = await team.start("rerun", found.log, "--verify", name="verified")
     assert await verified.ended() == 0, verified.said()
-
-
-async def test_a_centre_that_is_started_again_gets_what_a_resumed_robot_sent_in_its_earlier_life(
-    team,
-):
-    found = await assembled(team, "4")  # r1 comes back, and the centre goes, before the end
-    there = ["--connect", found.endpoint]
-    first = await robot(team, found, found.endpoint, "r1")
-    with Observer(found.endpoint, [ch.SUBMAP]) as seen:
-        await seen.sees(2, ch.SUBMAP, "r1")
-        first.signal(signal.SIGKILL)
-        await first.ended()
-        found.robots["r1"] = await robot(team, found, found.endpoint, "r1-again")
-        await seen.sees(3, ch.SUBMAP, "r1")
-        centre = found.others.pop(1)
-        centre.signal(signal.SIGKILL)
-        await centre.ended()
-    again = await team.start("central", found.scenario, *there)
-    found.others.append(again)
-    await found.ends_well()
-    assert "resumed after submap" in found.robots["r1"].said()
-    assert found.final_map() == map_in_memory(found.scenario)

@@ -75,7 +75,7 @@ def rms_over(seeds, options, *, wrong):
 
 
 def test_a_landmark_mistaken_for_another_leaves_chain_and_map_as_accurate_as_they_were():
-    seeds = range(20)
+    seeds = range(10)
     clean = rms_over(seeds, ROBUST, wrong=False)
     apart = rms_over(seeds, ROBUST, wrong=True)
     whole = rms_over(seeds, WHOLE, wrong=True)

@@ -11,26 +11,13 @@ from teamslam.sim.calibration.calibrate import Calibration, against_truth, calib
 from teamslam.sim.calibration.clocks import Clock, clocks_of, on_one_clock
 from teamslam.sim.calibration.figures import Figure
 from teamslam.sim.calibration.scenario import scenario_text
-from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team.wire.arrays import floats, ids
-from tests.final_maps import final_only, scenario_in
+from tests.final_maps import scenario_in
 from tests.trials.stress_world import StressWorld, write
 
 OFFSET_S = 0.5
 SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
-
-
-def map_error(scenario: Scenario) -> float:
-    """The RMSE of the final map in the team's frame [m]."""
-    streams = streams_of(scenario)
-    fused = final_map(list(run_team(final_only(scenario), streams)))
-    assert streams.landmarks is not None
-    true = dict(zip(streams.landmark_ids.tolist(), streams.landmarks, strict=True))
-    means = floats(fused.means, "means").reshape(-1, 2)
-    off = [m - true[i] for m, i in zip(means, ids(fused.ids, "ids").tolist(), strict=True)]
-    return float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +28,7 @@ def places(tmp_path_factory):
     return write(SMALL, root / "right"), write(late, root / "late")
 
 
-def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_good(
+def test_a_late_clock_is_found_without_a_mount_and_is_written_into_the_scenario(
     places, monkeypatch
 ):
     """The scenario has a part of the offset already; the rest adds to it.
@@ -50,7 +37,7 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
     """
     monkeypatch.setattr(calibrate, "joined_team", lambda *_: SimpleNamespace(fold=None))
     monkeypatch.setattr(calibrate, "central_figures", lambda *_: ())
-    right, late = (scenario_in(place) for place in places)
+    late = scenario_in(places[1])
     begun = msgspec.structs.replace(late.robots[1], clock_offset_s=0.1)
     scenario = msgspec.structs.replace(late, robots=(late.robots[0], begun))
     found = calibrate_models([("late", streams_of(scenario))], scenario, lambda _: None)
@@ -68,14 +55,6 @@ def test_a_late_clock_is_found_and_applied_without_a_mount_and_the_map_is_as_goo
         0.0,
         pytest.approx(figure.value, rel=1e-4),
     ]
-    clocks = [robot.clock_offset_s for robot in after.robots]
-    robots = [
-        msgspec.structs.replace(robot, clock_offset_s=clock)
-        for robot, clock in zip(late.robots, clocks, strict=True)
-    ]
-    on_time = msgspec.structs.replace(late, robots=tuple(robots))
-    # Self-calibration in the joined map corrects most of the late map's error by itself.
-    assert map_error(on_time) < 1.1 * map_error(right) < 0.5 * map_error(late)
     assert "clock_offset_s" in scenario_text(found, late, None, ["late"], learnt)
 
 

@@ -22,7 +22,6 @@ from teamslam.sim.world.config import GraphWorld
 from teamslam.team.estimation.se2 import between, compose
 from tests.final_maps import final_only
 
-CITY = Path(__file__).parents[4] / "shared" / "benchmarks" / "citytrees" / "cityTrees10000.txt"
 ISAM = """# three poses, one landmark
 ODOMETRY 0 1 2 0 1.5707963267948966 50 0 0 20 0 100
 LANDMARK 1 7 3 1 10 0 5
@@ -200,11 +199,3 @@ def test_import_writes_tables_of_a_graph(tmp_path):
     (again,), (whole,) = streams_of(scenario).streams, streams(path).streams
     assert np.array_equal(again.landmark_detections.points, whole.landmark_detections.points)
     assert np.allclose(again.intervals.covariances, whole.intervals.covariances)
-
-
-@pytest.mark.skipif(not CITY.is_file(), reason="no cityTrees10000 here")
-def test_city_trees_is_mapped_as_well_as_by_the_batch():
-    scenario = with_options(load("graph"), dataset=CITY, robots=5)
-    run = evaluate(run_team(final_only(scenario), streams_of(scenario)))
-    assert run.map.errors.aligned_rmse_m < 1.03 * 0.0510
-    assert 0.9 < run.map.cost_per_dof < 1.1
