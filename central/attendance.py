@@ -6,7 +6,7 @@ from heapq import heappop, heappush
 from typing import Generic, TypeVar
 
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.message_order import further, later_end, later_head
+from teamslam.team.wire.message_order import later_head, merge_ends, merge_progress
 
 MOST_NOTED = 1_000
 """Most announced ends of the team, and `Done` messages of a robot, that are stored."""
@@ -167,7 +167,7 @@ class TeamAttendance:
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Progress() if message.robot in self.robots:
                 robot = self.robots[message.robot]
-                robot.progress = further(message, robot.progress)
+                robot.progress = merge_progress(message, robot.progress)
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
                 robot = self.robots[message.robot]
@@ -177,7 +177,7 @@ class TeamAttendance:
                     robot.done = message
             case m.End():
                 self.note_end(message)
-                self.world_end = later_end(message, self.world_end)
+                self.world_end = merge_ends(message, self.world_end)
             case m.TeamEnd():
                 self.ordered = True
             case m.InitialPose() | m.StreamHead() if message.robot in self.robots:

@@ -7,7 +7,7 @@ from teamslam.team import translate
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
-from teamslam.team.wire.codec import unsound
+from teamslam.team.wire.codec import find_error
 
 START_POSES = "start poses"
 """The frame of a map that lies in the frame of the given initial poses."""
@@ -67,11 +67,11 @@ def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
 
 def receivable(fused: m.FusedMap) -> m.FusedMap:
     """Reduce a map to what every receiver accepts; `reasons` gains the reasons for omissions."""
-    if unsound(fused) is None:
+    if find_error(fused) is None:
         return fused
     refusals = []
     if not 0.0 <= fused.chi2 <= 1e300:
         refusals.append(f"the cost of the map is left out: it is {fused.chi2:g}")
         fused = msgspec.structs.replace(fused, chi2=0.0, dof=0)
-    fused, left_out = translate.receivable(fused)
+    fused, left_out = translate.make_receivable(fused)
     return msgspec.structs.replace(fused, reasons=(*fused.reasons, *refusals, *left_out))

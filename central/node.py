@@ -23,13 +23,13 @@ from teamslam.central.submap_fold import SubmapFold
 from teamslam.team.door import Door, absurd
 from teamslam.team.estimation.gaussian import NO_LANDMARKS
 from teamslam.team.pairs import RULES
-from teamslam.team.registry import loaded
+from teamslam.team.registry import load
 from teamslam.team.store import Stream, SubmapStore
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 
 MOST_ROBOTS = 100
 """Most robots of a team, admitted ones included."""
@@ -57,7 +57,7 @@ class CentralNode:
         self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
     ) -> None:
         self.config = config
-        self.announcement = configured("central", 0, 0, config)
+        self.announcement = announce_configuration("central", 0, 0, config)
         self.config_digest = self.announcement.digest
         self.attendance = TeamAttendance.of(
             robots, self.has_received, lambda stream: self.store.processed(stream)
@@ -411,7 +411,7 @@ def _stream_of(member: m.Submap | m.SightingFactor) -> Stream:
 
 def node_class(config: CentralConfig) -> type[CentralNode]:
     """Return the node class of the configured fusion rule; raises NotInstalledError."""
-    found: type[CentralNode] = loaded(
+    found: type[CentralNode] = load(
         RULES[config.fusion].made_by, f"the fusion rule {config.fusion}"
     )
     return found

@@ -43,7 +43,7 @@ from teamslam.team.store import Stream, SubmapStore
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
-from teamslam.team.wire.codec import encoded, unsound
+from teamslam.team.wire.codec import encoded, find_error
 from teamslam.team.wire.digest import digest_of
 
 
@@ -330,7 +330,7 @@ class SubmapFold:
         """Withhold messages that not every receiver accepts, with a warning."""
         accepted = []
         for each in out:
-            why = unsound(each.message)
+            why = find_error(each.message)
             if why is None:
                 accepted.append(each)
             else:

@@ -5,7 +5,7 @@ import os
 import time
 from collections.abc import Collection
 
-from teamslam.team.wire.bus import Bus, BusError, Sample, replied
+from teamslam.team.wire.bus import Bus, BusError, Sample, read_reply
 from teamslam.team.wire.channels import FINAL_MAP, KEPT, Channel, channel_of
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.messages import KeptRequest
@@ -21,12 +21,12 @@ _LOG = logging.getLogger("teamslam")
 _STARTED = time.monotonic()
 
 
-def _forked() -> None:
+def _note_fork() -> None:
     global _STARTED
     _STARTED = time.monotonic()
 
 
-os.register_at_fork(after_in_child=_forked)
+os.register_at_fork(after_in_child=_note_fork)
 
 
 class EndQuery:
@@ -54,7 +54,7 @@ class EndQuery:
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
         self._began = _STARTED
 
-    def missed(self) -> list[Sample]:
+    def find_missed(self) -> list[Sample]:
         """Return the samples that end the team, as published; query every FINAL_S."""
         now = time.monotonic()
         if now < self._due:
@@ -74,7 +74,7 @@ class EndQuery:
 
     def _ending(self, reply: bytes) -> list[Sample]:
         try:
-            sample = replied(KEPT, "", reply, 0)
+            sample = read_reply(KEPT, "", reply, 0)
         except WireError as error:
             _LOG.debug("%s", error)
             return []

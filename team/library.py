@@ -33,7 +33,7 @@ from teamslam.team.estimation.models import predicted as measurement_of
 from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.recording.reader import Log, LogError, open_log
-from teamslam.team.registry import loaded
+from teamslam.team.registry import load
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -261,7 +261,7 @@ def batch_map(
 
     Dellaert and Kaess 2006, Square root SAM.
     """
-    solve = loaded("teamslam.sim.studies.batch_map:solved_map", "batch_map")
+    solve = load("teamslam.sim.studies.batch_map:solved_map", "batch_map")
     return cast("BatchMap", solve(keyframes, sensors, initial_poses, robust_c))
 
 

@@ -26,7 +26,7 @@ def absence(place: str, what: str) -> str | None:
     return f"{what} is not installed: {place.partition(':')[0]} is not here"
 
 
-def loaded(place: str, what: str) -> Any:
+def load(place: str, what: str) -> Any:
     """Import `package.module:name`; raises NotInstalledError, which names `what`."""
     module, _, name = place.partition(":")
     absent = absence(place, what)

@@ -183,7 +183,7 @@ class Ros2Driver:
             self._held.setdefault(topic, deque(maxlen=HELD)).append(sample.payload)
             self._note(f"{topic}: no bridge has told its type; give it in `types`")
         elif topic in self._static:
-            self._decoded(topic, kind, sample.payload)
+            self._translate(topic, kind, sample.payload)
         else:
             self._backlog.put(topic, kind, sample.payload)
 
@@ -219,12 +219,12 @@ class Ros2Driver:
         for topic in self._backlog.waiting:
             queue = self._translated.setdefault(topic, deque())
             while not queue and (arrived := self._backlog.next_of(topic)) is not None:
-                queue.extend(self._decoded(topic, arrived.kind, arrived.payload))
+                queue.extend(self._translate(topic, arrived.kind, arrived.payload))
             if queue:
                 heads.append((queue[0].stamp_ns, topic))
         return min(heads)[1] if heads else None
 
-    def _decoded(self, topic: str, kind: str, payload: bytes) -> list[Measured]:
+    def _translate(self, topic: str, kind: str, payload: bytes) -> list[Measured]:
         self.taken[topic] += 1
         if kind not in READERS:
             self._note(f"{topic}: messages of type {kind} are not read")
@@ -239,9 +239,9 @@ class Ros2Driver:
                 self._translator.take_static(record)
             return []
         if self._on_odometry is not None and topic == self._topics.odometry:
-            self._report_odometry(_stamped(record))
+            self._report_odometry(_stamp(record))
         try:
-            return self._translator.take(topic, _stamped(record))
+            return self._translator.take(topic, _stamp(record))
         except Exception as error:  # a sound message that the translation does not know how to take
             place = place_of(error.__traceback__)
             self._note(f"{topic}: set aside", f"{type(error).__name__} at {place}: {error}")
@@ -381,7 +381,7 @@ class Ros2Driver:
         self._translator.said.clear()
 
 
-def _stamped(record: Record) -> Record:
+def _stamp(record: Record) -> Record:
     if isinstance(record, TransformsRecord) or record.stamp_ns:
         return record
     return record._replace(stamp_ns=time.time_ns())

@@ -49,7 +49,7 @@ class SpareTime:
             self.took_s = now - began
             self._next = now + self._rest * self.took_s
 
-    def failed(self) -> None:
+    def note_failure(self) -> None:
         """Record a piece that raised an exception."""
         self._next = time.monotonic() + FAILED_S
 
@@ -99,13 +99,13 @@ class FaultyRunError(RuntimeError):
 def judge(boundary: Boundary, final: FusedMap | None) -> None:
     """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
     warnings = [*boundary.warnings] if boundary.faults else []
-    if final is not None and (lacks := lacking(final)):
+    if final is not None and (lacks := describe_missing(final)):
         warnings.append(lacks)
     if warnings:
         raise FaultyRunError("; ".join(warnings))
 
 
-def lacking(final: FusedMap) -> str:
+def describe_missing(final: FusedMap) -> str:
     """Describe the robots that the final map lacks; empty: none."""
     found = []
     robots = [each for each in final.withdrawn if not each.startswith(MAP)]
@@ -172,9 +172,9 @@ class Shell:
         elif refreshes and not self._spare_time.wait_s and self._refresh is not None:
             self._stale = False
             began = time.monotonic()
-            out = self.contained("refresh", self._refresh)
+            out = self.contain("refresh", self._refresh)
             if out is None:
-                self._spare_time.failed()
+                self._spare_time.note_failure()
             else:
                 self._spare_time.note(began, useful=bool(out))
                 self.publish(out)
@@ -238,7 +238,7 @@ class Shell:
 
         self.bus.answer(channel, name, contained)
 
-    def contained(self, what: str, duty: Callable[[], T]) -> T | None:
+    def contain(self, what: str, duty: Callable[[], T]) -> T | None:
         """Run `duty`; an exception other than BusError is a fault, and the result None."""
         try:
             return duty()
@@ -250,7 +250,7 @@ class Shell:
 
     def query_end(self) -> None:
         """Query the router periodically for a missed end of the team."""
-        if missed := self.end_query.missed():
+        if missed := self.end_query.find_missed():
             self.take_end(missed)
 
     def note(self, samples: Iterable[Sample]) -> None:
@@ -343,7 +343,7 @@ class Shell:
             self._publish_status()
 
     def _publish_status(self) -> None:
-        status = self.contained("status", self.node.status)
+        status = self.contain("status", self.node.status)
         if status is None:
             status = Status(
                 stamp_ns=0,
@@ -379,7 +379,7 @@ class Shell:
         while self.going:
             self.take(self.believed(self.receive()))
             self.query_end()
-            self.contained("duty", duty)
+            self.contain("duty", duty)
             self.report()
         self.report(last=True)
 

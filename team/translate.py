@@ -36,7 +36,7 @@ from teamslam.team.wire.arrays import (
     octets,
     stamps,
 )
-from teamslam.team.wire.codec import unsound
+from teamslam.team.wire.codec import find_error
 
 
 def frame_name(robot: str, incarnation: int) -> str:
@@ -328,18 +328,18 @@ NAMED = 10
 """Number of omitted landmarks that are named."""
 
 
-def receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
+def make_receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:
     """Reduce the map to a form that every receiver accepts; describe the omissions.
 
     A joint covariance lost to rounding is replaced by the landmarks' own; a landmark with an
     invalid covariance or mean is omitted.
     """
     warnings = []
-    if message.joint and unsound(message) is not None:
+    if message.joint and find_error(message) is not None:
         warnings.append("the joint covariance is lost to rounding: each landmark has its own only")
         blocks = block_bytes(landmark_blocks_of(message))
         message = msgspec.structs.replace(message, joint=False, covariance=blocks)
-    if unsound(message) is not None:
+    if find_error(message) is not None:
         message, left_out = _with_sound_landmarks(message)
         warnings.append(f"left out, their covariance is none: {', '.join(map(str, left_out))}")
     return message, tuple(warnings)

@@ -22,7 +22,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests.air import Air
 
 AFTER_S = 3600.0
@@ -261,7 +261,7 @@ class PeerTeam:
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:
     """The world of a team without a centre; it does not wait for robots that join late."""
     names = [each.id for each in scenario.robots if each.id not in late]
-    announced = configured("world", 0, 0, scenario)
+    announced = announce_configuration("world", 0, 0, scenario)
     return WorldNode(
         streams,
         expected_nodes(names, recorder=False, centre=False),

@@ -41,5 +41,5 @@ def bus():
 )
 def test_only_the_ends_that_the_team_has_are_taken(bus, ends, robot, taken):
     end = EndQuery(bus, "robot/r2", ends, robot)
-    assert end.missed() == [Sample(key, encoded(FINAL), 3, 4, 5) for key in taken]
-    assert end.missed() == [], "it asks again only after a while"
+    assert end.find_missed() == [Sample(key, encoded(FINAL), 3, 4, 5) for key in taken]
+    assert end.find_missed() == [], "it asks again only after a while"

@@ -15,7 +15,7 @@ from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import NO_MAP, configured, digest_of
+from teamslam.team.wire.digest import NO_MAP, announce_configuration, digest_of
 from tests import build
 from tests.estimation.submap_world import correlated
 
@@ -155,7 +155,7 @@ def test_a_trajectory_comes_back_with_its_stamps():
 
 
 def test_the_digest_is_that_of_the_announced_text_and_tells_its_parts_apart():
-    announced = configured("robot/r1", 0, 0, RobotConfig("r1"))
+    announced = announce_configuration("robot/r1", 0, 0, RobotConfig("r1"))
     text = announced.configuration.encode()
     by_hand = hashlib.blake2b(len(text).to_bytes(8, "little") + text, digest_size=8).digest()
     assert announced.digest == by_hand
@@ -173,5 +173,5 @@ def test_every_field_of_a_configuration_changes_its_digest():
         RobotConfig("r1", fusion="kalman"),
         RobotConfig("r1", estimator="hybrid-thesis"),
     ]
-    digests = {configured("x", 0, 0, each).digest for each in (base, *others)}
+    digests = {announce_configuration("x", 0, 0, each).digest for each in (base, *others)}
     assert len(digests) == 1 + len(others)

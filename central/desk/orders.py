@@ -10,10 +10,10 @@ from teamslam.central.desk.evaluation.verdicts import pair_of
 from teamslam.central.desk.names import in_order
 from teamslam.team.keys.roster import ROBOT
 from teamslam.team.peers.members import Member, about
-from teamslam.team.peers.proofs import Signs, signed_order
+from teamslam.team.peers.proofs import Signs, sign_order
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Bus, Outgoing, sound
+from teamslam.team.wire.bus import Bus, Outgoing, open_valid
 from teamslam.team.wire.codec import encoded
 
 CENTRE_S = 10.0
@@ -51,7 +51,7 @@ class RunningTeam:
         """Valid messages that arrive within a time."""
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
-            for channel, name, message in sound(self.bus.receive(LOOK_S)):
+            for channel, name, message in open_valid(self.bus.receive(LOOK_S)):
                 self._has_peer |= channel in PEERS
                 if channel is ch.ROBOT_CONFIG:
                     self.robots.add(name)
@@ -93,7 +93,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
         member = Member(order.key, encoded(order.message), order.message)
         robot = about(order.message)
         if robot:
-            bus.publish(Outgoing(ch.ORDER_SIGNATURE, robot, signed_order(signer, member)))
+            bus.publish(Outgoing(ch.ORDER_SIGNATURE, robot, sign_order(signer, member)))
 
 
 def withdraw(

@@ -7,7 +7,7 @@ from statistics import median
 from teamslam.central.desk.names import in_order
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Bus, sound
+from teamslam.team.wire.bus import Bus, open_valid
 from teamslam.team.wire.message_order import later_head
 
 LOOK_S = 0.1
@@ -75,7 +75,7 @@ class Presence:
         until = time.monotonic() + for_s
         while time.monotonic() < until:
             for sample in bus.receive(LOOK_S):
-                for _, _, message in sound([sample]):
+                for _, _, message in open_valid([sample]):
                     self._take_message(message, sample.wall_ns)
 
     def _take_message(self, message: m.Message, wall_ns: int) -> None:

@@ -14,7 +14,7 @@ from teamslam.team.peers.node import PeerNode
 from teamslam.team.peers.proofs import OPERATOR, Proofs
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing, Sample, sound
+from teamslam.team.wire.bus import Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import decoded, encoded
 
 SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
@@ -163,7 +163,7 @@ class Peer:
 
     def take_end(self, samples: Sequence[Sample]) -> None:
         """Note the ends of robots that the router stores, each by the robot itself."""
-        for _, robot, message in sound(samples):
+        for _, robot, message in open_valid(samples):
             if isinstance(message, m.Concluded):
                 self.ended.add(robot)
 

@@ -85,7 +85,7 @@ class PeerRobot(Peer):
             for member in self.peer.replica.members()
             if signed_by(member) == self.robot and not isinstance(member.message, m.Certificate)
         )
-        signatures = [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(each)) for each in own]
+        signatures = [Outgoing(ch.SIGNATURE, self.robot, proofs.sign(each)) for each in own]
         self.peer.take(member_in(certificate), self.name)
         return [certificate, *signatures]
 
@@ -96,7 +96,7 @@ class PeerRobot(Peer):
         proofs = self.peer.proofs
         if proofs is None:
             return []
-        return [Outgoing(ch.SIGNATURE, self.robot, proofs.signed(member))]
+        return [Outgoing(ch.SIGNATURE, self.robot, proofs.sign(member))]
 
     def restore(self, members: Iterable[Member]) -> bool:
         """Restore the stored set of an earlier process, before `begin`; return whether its own

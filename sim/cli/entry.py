@@ -21,13 +21,13 @@ def main() -> None:
     try:
         _run(sys.argv[1:])
     except Exception as error:
-        from teamslam.team.wire.text import lines
+        from teamslam.team.wire.text import printable_lines
 
         advice = _advice(error)
         if advice is None:
             raise
         status, text = advice
-        typer.secho(f"error: {lines(text)}", fg="red", err=True)
+        typer.secho(f"error: {printable_lines(text)}", fg="red", err=True)
         sys.exit(status)
 
 

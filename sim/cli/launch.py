@@ -359,11 +359,11 @@ def _conclude(
     from teamslam.central.desk.evaluation.states import not_in_the_map
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.run import run_figures
-    from teamslam.team.recording.parts import join
+    from teamslam.team.recording.parts import join_parts
     from teamslam.team.recording.reader import LogError, open_log
 
     console = Console()
-    join(outcome.log)  # joined here, where it may take long
+    join_parts(outcome.log)  # joined here, where it may take long
     typer.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")

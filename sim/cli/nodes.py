@@ -395,9 +395,9 @@ def record(
     expected += [] if resolved.is_live else ["world"]
     configurations = []
     if resolved.is_live:  # saves other teams' recorders its 105 MB
-        from teamslam.team.wire.digest import configured
+        from teamslam.team.wire.digest import announce_configuration
 
-        configurations = [configured("world", 0, 0, resolved)]
+        configurations = [announce_configuration("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
         connect_bus(resolved.team, connect, keys, "recorder", stop) as bus,
@@ -425,9 +425,9 @@ def record(
 
 def _joined(log: Path) -> list[Path]:
     """Join the parts of a log; name remaining parts, with the remedy."""
-    from teamslam.team.recording.parts import join
+    from teamslam.team.recording.parts import join_parts
 
-    parts = join(log)
+    parts = join_parts(log)
     if len(parts) > 1:
         whole = log.with_stem(f"{log.stem}.whole")
         _LOG.warning(
@@ -451,7 +451,7 @@ def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
     ends: channels of final maps. Each author's last map counts: the others are not its final one.
     """
     from teamslam.team.recording.reader import LogError, open_log
-    from teamslam.team.shell import lacking
+    from teamslam.team.shell import describe_missing
     from teamslam.team.wire.codec import WireError, decoded
     from teamslam.team.wire.messages import FusedMap
 
@@ -459,7 +459,7 @@ def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
     for part in parts:
         try:
             for sample in open_log(part).samples(ends):
-                found[sample.key] = lacking(decoded(sample.payload, FusedMap))
+                found[sample.key] = describe_missing(decoded(sample.payload, FusedMap))
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
     return "; ".join(dict.fromkeys(filter(None, found.values())))

@@ -21,7 +21,7 @@ from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import MAP, Estimator, FusionRule
-from teamslam.team.wire.text import lines, one_line
+from teamslam.team.wire.text import one_line, printable_lines
 
 if TYPE_CHECKING:
     from teamslam.team.keys.credentials import Credentials
@@ -204,7 +204,7 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
 
 def fail(message: str, status: int) -> NoReturn:
     """Print an error and exit with this status."""
-    typer.secho(f"error: {lines(message)}", fg="red", err=True)
+    typer.secho(f"error: {printable_lines(message)}", fg="red", err=True)
     raise typer.Exit(status)
 
 

@@ -18,7 +18,7 @@ from teamslam.team.robot.node import RobotNode, robot_node
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 
 ROUND_S = 1.0
 """Team time [s] of one round, which keeps robots within a window of each other's messages, as in
@@ -89,7 +89,7 @@ def run_team(
 ) -> Iterator[Sample]:
     """Run the team to its final map; yields a recorder's samples, in order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
-    announced = configured("world", 0, 0, scenario)
+    announced = announce_configuration("world", 0, 0, scenario)
     world = WorldNode(
         streams, expected, announced, tells_map=tells_map(scenario, streams), batch_s=ROUND_S
     )

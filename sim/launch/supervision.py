@@ -12,7 +12,7 @@ from contextlib import suppress
 from teamslam.central.desk.orders import publish_order
 from teamslam.sim.launch.supervisor import Ended, Supervised
 from teamslam.sim.launch.watch import TURN_S, Watch
-from teamslam.team.shell import lacking
+from teamslam.team.shell import describe_missing
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, BusError, Outgoing
@@ -238,7 +238,7 @@ class Silence:
 
 def lacking_in(watch: Watch) -> str:
     """Robots missing in the final map, as text."""
-    return "" if watch.fused is None or not watch.fused.final else lacking(watch.fused)
+    return "" if watch.fused is None or not watch.fused.final else describe_missing(watch.fused)
 
 
 def names_only(ended: Ended, lacks: str) -> bool:

@@ -10,7 +10,7 @@ from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Bus, Sample, shown
+from teamslam.team.wire.bus import Bus, Sample, open_printable
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.message_order import is_newer_map
 
@@ -147,7 +147,7 @@ class Watch:
         if found is None or not self.errors.wants(*found, sample):
             return
         try:
-            channel, _, message = shown(sample)
+            channel, _, message = open_printable(sample)
         except WireError:
             return
         if isinstance(message, m.Status):

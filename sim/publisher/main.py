@@ -15,7 +15,7 @@ from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 
 PACE_S = 0.002
 """Wait [s] for the clock or credit."""
@@ -34,7 +34,7 @@ def run_world(
 ) -> None:
     """Publish every measurement of the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
-    announcement = configured("world", 0, 0, scenario)
+    announcement = announce_configuration("world", 0, 0, scenario)
     node = WorldNode(
         streams,
         expected_nodes(robots, recorder=recorder, centre=scenario.centre),
@@ -78,6 +78,6 @@ def run_world(
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
     """Configurations that centre and robots of a scenario announce, by node."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
-    robots = {node: configured(node, 0, 0, robot) for node, robot in nodes.items()}
-    central = configured("central", 0, 0, scenario.central)
+    robots = {node: announce_configuration(node, 0, 0, robot) for node, robot in nodes.items()}
+    central = announce_configuration("central", 0, 0, scenario.central)
     return ({"central": central} if scenario.centre else {}) | robots

@@ -20,7 +20,7 @@ from teamslam.team.driver.source import (
     CREDIT_MEASUREMENTS,
     CREDIT_RECORDER,
     FIRST_INCARNATION,
-    answered,
+    answer_request,
 )
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -359,7 +359,9 @@ class WorldNode:
                 return []
             first = source.counter - self.cache
         within_cache = msgspec.structs.replace(requested, first=first)
-        return answered(within_cache, source.counter, lambda n: source.message(source.base + n))
+        return answer_request(
+            within_cache, source.counter, lambda n: source.message(source.base + n)
+        )
 
     def _begin_incarnation(self, source: Source) -> None:
         """Restart an interrupted stream at an unknown pose."""

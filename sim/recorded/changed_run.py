@@ -22,7 +22,7 @@ from teamslam.team.config import (
     Sensor,
 )
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.registry import absence, loaded
+from teamslam.team.registry import absence, load
 from teamslam.team.robot.node import robot_node
 from teamslam.team.saved_map import read_map
 from teamslam.team.wire.bus import Sample
@@ -42,7 +42,7 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     world.announce(scenario)
     world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
-    node = loaded(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else robot_node
+    node = load(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else robot_node
     return list(run_nodes(scenario, world, conditions, node))
 
 

@@ -14,7 +14,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import WireError
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 
 STEP_NS = 1_000_000_000
 """Team time between two checks of the nodes' answers."""
@@ -117,7 +117,9 @@ class RecordedWorld:
                 stamp_ns=truth[0].stamp_ns, ids=truth[0].ids, positions=truth[0].positions
             )
             self._outgoing.append(Outgoing(ch.KNOWN_MAP, "", known))
-        self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", configured("world", 0, 0, scenario)))
+        self._outgoing.insert(
+            0, Outgoing(ch.WORLD_CONFIG, "", announce_configuration("world", 0, 0, scenario))
+        )
 
     def begin(self) -> list[Outgoing]:
         """First messages: scenario, true landmarks, and the known map of robots that only

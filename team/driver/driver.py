@@ -24,7 +24,7 @@ from teamslam.team.driver import journal as j
 from teamslam.team.driver import measurement_messages
 from teamslam.team.driver.link import Link
 from teamslam.team.driver.measurement_messages import DriverWarning, MeasurementError
-from teamslam.team.driver.motion import Odometer, Pose, between
+from teamslam.team.driver.motion import Odometer, Pose, relative_pose
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.keys.roster import KeysError
 from teamslam.team.saved_map import SavedMapError, read_map
@@ -103,7 +103,7 @@ class Driver:
         saved = None if map is None else _read_map(Path(map), with_keys=keys is not None)
         path = Path(f"{robot}.stream" if file is None else file)
         try:
-            self._journal, said = j.opened(path, robot, round(1e9 * latency_s))
+            self._journal, said = j.open_journal(path, robot, round(1e9 * latency_s))
         except (j.JournalError, OSError) as error:
             raise DriverError(str(error)) from None
         if said:
@@ -151,7 +151,7 @@ class Driver:
         """
         stamp_ns, length_ns = _times(t, duration, "odometry")
         what = f"odometry of {self.robot} at {t} s"
-        v, w = measurement_messages.pair(forward, yaw_rate, what)
+        v, w = measurement_messages.check_speeds(forward, yaw_rate, what)
         if abs(w) > self._fastest_turn:
             raise MeasurementError(
                 f"{what}: a yaw rate of {w:g} rad/s is {abs(w) / (2.0 * np.pi):.1f} turns a "
@@ -213,7 +213,7 @@ class Driver:
             if lasts_ns is not None and before is None:  # by speeds before, or a stream anew
                 self._begin_anew(stamp_ns - lasts_ns, stamp_ns)
             elif lasts_ns is not None and before is not None:
-                step = self._bridge_reset(between(before, pose), lasts_ns, stamp_ns, pose)
+                step = self._bridge_reset(relative_pose(before, pose), lasts_ns, stamp_ns, pose)
                 self._odometer.judge(step, lasts_ns, "odometry_pose", stamp_ns)
                 told = self._increment(stamp_ns, lasts_ns, step, covariance)
             if not self._incarnation:
@@ -488,7 +488,7 @@ class Driver:
         self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
     ) -> m.Increment:
         what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
-        return measurement_messages.sound(
+        return measurement_messages.check_sound(
             m.Increment(
                 **self._head(stamp_ns),
                 duration_ns=lasts_ns,
@@ -607,5 +607,7 @@ def _start_of(
         raise MeasurementError(f"{what}: theta is {pose[2]:g}; it is in radians, in one turn")
     packed = measurement_messages.square(covariance, what)
     if covariance is not None:
-        measurement_messages.definite(np.asarray(covariance, dtype=np.float64)[np.newaxis], what)
+        measurement_messages.check_definite(
+            np.asarray(covariance, dtype=np.float64)[np.newaxis], what
+        )
     return from_floats(pose), packed

@@ -88,7 +88,7 @@ class JournalError(RuntimeError):
 
 @dataclass
 class Journal:
-    """One robot's file, open for appending (`opened`). Any thread may read.
+    """One robot's file, open for appending (`open_journal`). Any thread may read.
 
     incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
     offsets of all records but marks, in order of arrival. driven_ns, pose: end of the last odometry
@@ -261,20 +261,20 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
     return _POSE.pack(*pose)
 
 
-def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
+def open_journal(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
     """Open a robot's journal for appending; return it with a description of its contents.
 
     A delivered stream, or one that has not grown for OLD_S, is moved aside; the new one begins with
     the next incarnation. Raises JournalError for a file of another robot, of no driver, or in use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    journal = _locked(path, robot)
+    journal = _lock_file(path, robot)
     age_s = time.time() - os.fstat(journal._file).st_mtime
     try:
         if not _read_whole(journal):
             left = f"{path}: {journal.cut} bytes of a beginning are left out" * bool(journal.cut)
             journal.first_incarnation = _first_after(_newest_aside(path), robot)
-            return _begun(journal, latency_ns), left
+            return _begin_file(journal, latency_ns), left
         if not journal.delivered and (age_s < OLD_S or was_set_since(journal.clock)):
             left = journal.cut_off()
             other = journal._sorter.latency_ns != latency_ns
@@ -289,10 +289,10 @@ def opened(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
     journal.close()
     aside = _set_aside(path)
     why = "has ended" if journal.delivered else f"is {age_s / 3600.0:.1f} h old, and not delivered"
-    fresh = _locked(path, robot)
+    fresh = _lock_file(path, robot)
     fresh.first_incarnation = journal.next_incarnation
     said = f"{path}: its stream {why}: it is now {aside}, and a new one begins"
-    return _begun(fresh, latency_ns), said
+    return _begin_file(fresh, latency_ns), said
 
 
 def _read_whole(journal: Journal) -> bool:
@@ -307,7 +307,7 @@ def _read_whole(journal: Journal) -> bool:
 def _first_after(aside: Path | None, robot: str) -> int:
     if aside is not None:
         with suppress(JournalError, OSError):
-            earlier = _locked(aside, robot)
+            earlier = _lock_file(aside, robot)
             try:
                 if _read_whole(earlier):
                     return earlier.next_incarnation
@@ -316,7 +316,7 @@ def _first_after(aside: Path | None, robot: str) -> int:
     return FIRST_INCARNATION
 
 
-def _begun(journal: Journal, latency_ns: int) -> Journal:
+def _begin_file(journal: Journal, latency_ns: int) -> Journal:
     head = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": journal.first_incarnation})
     os.ftruncate(journal._file, 0)
     journal._write(head, 0)
@@ -325,7 +325,7 @@ def _begun(journal: Journal, latency_ns: int) -> Journal:
     return journal
 
 
-def _locked(path: Path, robot: str) -> Journal:
+def _lock_file(path: Path, robot: str) -> Journal:
     journal = Journal(path, robot)
     journal._file = os.open(journal.path, os.O_RDWR | os.O_CREAT, 0o644)
     try:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from teamslam.team import core
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
-from teamslam.team.wire.codec import unsound
+from teamslam.team.wire.codec import find_error
 
 M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
@@ -45,7 +45,7 @@ def stamp_of(t: float | Decimal, what: str) -> int:
     return round(seconds * 1e9)
 
 
-def pair(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
+def check_speeds(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
     """Check a speed [m/s] and a yaw rate [rad/s]."""
     return _number(forward, f"forward of {what}"), _number(yaw_rate, f"yaw_rate of {what}")
 
@@ -69,7 +69,7 @@ def observations(
     what = f"observe at {1e-9 * stamp_ns:.3f} s"
     numbers = _numbers(ids, what)
     far, angles = _polar(polar, what, len(numbers))
-    return sound(
+    return check_sound(
         m.Observations(
             stamp_ns=stamp_ns,
             robot=robot,
@@ -96,7 +96,7 @@ def points(
             f"{what}: xy has the shape {positions.shape}; one row (ahead [m], left [m]) for each "
             f"of {len(numbers)} seen"
         )
-    return sound(
+    return check_sound(
         m.Points(
             stamp_ns=stamp_ns,
             robot=robot,
@@ -126,7 +126,7 @@ def detections(
             f"{what}: classes has the shape {likely.shape}; one row for each of {len(far)} seen, "
             "with the probability above 0 of its reported class given each class of the team"
         )
-    return sound(
+    return check_sound(
         m.Detections(
             stamp_ns=stamp_ns,
             robot=robot,
@@ -156,7 +156,7 @@ def sightings(
     if robot in names:
         raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
     far, angles = _polar((ranges, bearings), what, len(names))
-    return sound(
+    return check_sound(
         m.Sightings(
             stamp_ns=stamp_ns,
             robot=robot,
@@ -180,9 +180,9 @@ def fix(
         P = np.asarray(covariance, dtype=np.float64)
         if P.shape != (2, 2):
             raise MeasurementError(f"{what}: its covariance is not 2 × 2")
-        definite(P[np.newaxis], what)
+        check_definite(P[np.newaxis], what)
         stated = from_floats([P[0, 0], P[0, 1], P[1, 1]])
-    return sound(
+    return check_sound(
         m.Fix(
             stamp_ns=stamp_ns,
             robot=robot,
@@ -224,11 +224,11 @@ def _blocks(covariances: ArrayLike | None, count: int, what: str) -> bytes:
         raise MeasurementError(
             f"{what}: covariances have the shape {blocks.shape}; {count} of 2 × 2 are needed"
         )
-    definite(blocks, what)
+    check_definite(blocks, what)
     return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]].ravel())
 
 
-def definite(covariances: np.ndarray, what: str) -> None:
+def check_definite(covariances: np.ndarray, what: str) -> None:
     """Raise MeasurementError unless each is finite, symmetric and positive definite."""
     finite = np.isfinite(covariances).all(axis=(1, 2))
     checked = np.where(finite[:, np.newaxis, np.newaxis], covariances, 0.0)
@@ -243,9 +243,9 @@ def definite(covariances: np.ndarray, what: str) -> None:
         )
 
 
-def sound(message: M, what: str) -> M:
+def check_sound(message: M, what: str) -> M:
     """Return the message; raise MeasurementError if a receiver would refuse it."""
-    why = unsound(message)
+    why = find_error(message)
     if why is not None:
         raise MeasurementError(f"{what}: {why.detail}")
     return message
@@ -313,10 +313,10 @@ def _wrapped(angles: np.ndarray, what: str) -> np.ndarray:
         raise MeasurementError(
             f"{what}: a bearing of {angles[np.abs(angles).argmax()]:g}; bearings are in radians"
         )
-    return wrapped(angles)
+    return wrap_angles(angles)
 
 
-def wrapped(angles: np.ndarray) -> np.ndarray:
+def wrap_angles(angles: np.ndarray) -> np.ndarray:
     """Wrap angles to (−π, π]; angles within keep their bits."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)

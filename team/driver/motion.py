@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.team.config import Bounds
-from teamslam.team.driver.measurement_messages import MeasurementError, wrapped
+from teamslam.team.driver.measurement_messages import MeasurementError, wrap_angles
 from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
 
 TOLERANCE = 0.1
@@ -124,9 +124,9 @@ class Odometer:
         return f"{call} of {self.robot} at {1e-9 * stamp_ns:.3f} s"
 
 
-def between(before: Pose, after: Pose) -> Pose:
+def relative_pose(before: Pose, after: Pose) -> Pose:
     """Express a pose in the frame of the one before: (ahead, left, turn)."""
     dx, dy = after[0] - before[0], after[1] - before[1]
     c, s = float(np.cos(before[2])), float(np.sin(before[2]))
-    turn = float(wrapped(np.array(after[2] - before[2])))
+    turn = float(wrap_angles(np.array(after[2] - before[2])))
     return c * dx + s * dy, c * dy - s * dx, turn

@@ -13,7 +13,7 @@ from teamslam.team.driver.source import (
     BATCH,
     CREDIT_MEASUREMENTS,
     CREDIT_RECORDER,
-    answered,
+    answer_request,
     channel_of,
 )
 from teamslam.team.wire import channels as ch
@@ -242,7 +242,9 @@ class SourceNode:
         if requested.robot != self._robot or incarnation not in self.journal.incarnations:
             return []
         count = self.journal.count(incarnation)
-        return answered(requested, count, lambda number: self.journal.message(incarnation, number))
+        return answer_request(
+            requested, count, lambda number: self.journal.message(incarnation, number)
+        )
 
     @property
     def is_delivered(self) -> bool:

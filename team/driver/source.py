@@ -22,7 +22,7 @@ def channel_of(measurement: m.Measurement) -> ch.Channel:
     return next(row for row in ch.SENSORS if isinstance(measurement, row.kinds))
 
 
-def answered(
+def answer_request(
     requested: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
 ) -> list[bytes]:
     """Encode the requested ones of `count` measurements, at most ANSWER."""

@@ -21,7 +21,7 @@ from teamslam.team.keys.roster import (
     ROSTER,
     KeysError,
     Roster,
-    chosen,
+    choose_nodes,
     common_name,
     load_roster,
     roster_bytes,
@@ -67,10 +67,10 @@ def make_keys(
     if roster.team != team:
         raise KeysError(f"{folder} holds the keys of the team {roster.team!r}, not of {team!r}")
     authority = _authority(folder, team, now)
-    gone = chosen(revoke, roster)
+    gone = choose_nodes(revoke, roster)
     if "router" in gone:
         raise KeysError("the router is not in its own roster of clients: renew it instead")
-    renewed = [node for node in chosen(renew, roster) if node not in gone]
+    renewed = [node for node in choose_nodes(renew, roster) if node not in gone]
     every_host = tuple(dict.fromkeys((*roster.hosts, *hosts)))
     if every_host != roster.hosts and "router" in roster.nodes and "router" not in renewed:
         renewed.append("router")  # its certificate names the hosts
@@ -82,7 +82,7 @@ def make_keys(
     ends = now + timedelta(days=days)
     for node in (*missing, *renewed):
         name = common_name(node, generations[node])
-        _write_pair(folder, node, *_issued(authority, team, name, node, every_host, now, ends))
+        _write_pair(folder, node, *_issue(authority, team, name, node, every_host, now, ends))
     for node in gone:
         for suffix in ("pem", "key"):
             (folder / f"{node}.{suffix}").unlink(missing_ok=True)
@@ -120,7 +120,7 @@ def _authority(folder: Path, team: str, now: datetime) -> _Authority:
     return certificate, key
 
 
-def _issued(
+def _issue(
     authority: _Authority,
     team: str,
     name: str,

@@ -81,7 +81,7 @@ def credentials_of(
                 f"{path}: not valid before {found.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; this "
                 f"machine's clock reads {now:%Y-%m-%d %H:%M}: put the clock right"
             )
-    common, owner = _named(certificate)
+    common, owner = _read_names(certificate)
     if not re.fullmatch(rf"{re.escape(node)}(\.\d+)?", common):
         raise KeysError(f"{paths[1]}: a certificate of {common!r}, not of {node}: {_REMEDY}")
     if team is not None and owner != team:
@@ -119,7 +119,7 @@ def _check_fit(
         ) from None
 
 
-def _named(certificate: x509.Certificate) -> tuple[str, str]:
+def _read_names(certificate: x509.Certificate) -> tuple[str, str]:
     found = []
     for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
         values = certificate.subject.get_attributes_for_oid(oid)

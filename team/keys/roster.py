@@ -95,7 +95,7 @@ def roster_bytes(roster: Roster) -> bytes:
     return msgspec.json.format(msgspec.json.encode(roster, order="deterministic"), indent=2) + b"\n"
 
 
-def chosen(nodes: Sequence[str], roster: Roster) -> list[str]:
+def choose_nodes(nodes: Sequence[str], roster: Roster) -> list[str]:
     """Select named nodes, or `all`; raises KeysError for one without a certificate."""
     if "all" in nodes:
         return sorted(roster.nodes)

@@ -124,7 +124,7 @@ def make_answer(
     """
     batches: list[list[Member]] = [[]]
     total = size = 0
-    for each in _asked(replica, request):
+    for each in _list_members(replica, request):
         member = each if sign is None else replace(each, signature=sign(each))
         proven = bool(member.signature) or isinstance(member.message, m.Certificate)
         if sign is not None and not proven:
@@ -139,7 +139,7 @@ def make_answer(
     return [_message(node, request.stamp_ns, batch) for batch in batches if batch]
 
 
-def _asked(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
+def _list_members(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
     for robot in dict.fromkeys(request.statements):
         found = replica.statements.get(robot, {})
         yield from (found[name] for name in sorted(found))

@@ -321,11 +321,11 @@ class PeerNode:
         if not self._given.allows(self._now_s):
             self._refuse(f"requests for more than {GIVEN_BYTES} bytes a second")
             return []
-        batches = [encoded(batch) for batch in self._answered(query)]
+        batches = [encoded(batch) for batch in self._answer_request(query)]
         self._given.note(sum(map(len, batches)))
         return batches
 
-    def _answered(self, request: m.MembersRequest) -> list[m.Members]:
+    def _answer_request(self, request: m.MembersRequest) -> list[m.Members]:
         sign = None if self.proofs is None else self.proofs.of
         return make_answer(self.replica, request, self.node, sign)
 

@@ -60,7 +60,7 @@ class Proofs:
         """Return the robot's own certificate, as a member."""
         return m.Certificate(stamp_ns=0, robot=self._robot, certificate=self._signer.certificate)
 
-    def signed(self, member: Member) -> m.Signature:
+    def sign(self, member: Member) -> m.Signature:
         """Sign an own member; the message is published after it."""
         signature = self.of(member)
         return m.Signature(
@@ -158,7 +158,7 @@ def signed_by(member: Member) -> str:
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 
-def signed_order(signer: Signs, member: Member) -> m.Signature:
+def sign_order(signer: Signs, member: Member) -> m.Signature:
     """Sign an operator's order, with its certificate in front."""
     certificate = signer.certificate
     proof = len(certificate).to_bytes(2, "little") + certificate + signer.sign(member.hash)

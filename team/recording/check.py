@@ -171,7 +171,7 @@ def _of_file(log: Log) -> list[Finding]:
 
 
 def _evidence(log: Log) -> _Evidence:
-    return _Evidence(part=_noted(log, CUT), repaired=_noted(log, REPAIRED))
+    return _Evidence(part=_has_note(log, CUT), repaired=_has_note(log, REPAIRED))
 
 
 def _unsound(sample: Sample) -> str | None:
@@ -186,5 +186,5 @@ def _unsound(sample: Sample) -> str | None:
     return None
 
 
-def _noted(log: Log, note: str) -> bool:
+def _has_note(log: Log, note: str) -> bool:
     return any(name.partition("@")[0] == note for name in log.metadata)

@@ -29,7 +29,7 @@ def open_file(path: Path) -> LogFile:
     """Open one file, without further parts; raises `LogError`."""
     try:
         with path.open("rb") as file:
-            return _opened(file, path)
+            return _open_stream(file, path)
     except FileNotFoundError:
         what = "give the path of a log that was recorded, or of the folder of its run"
         raise LogError(path, "not found", what) from None
@@ -37,7 +37,7 @@ def open_file(path: Path) -> LogFile:
         raise LogError(path, str(error.strerror), "give the path of a readable file") from error
 
 
-def _opened(file: IO[bytes], path: Path) -> LogFile:
+def _open_stream(file: IO[bytes], path: Path) -> LogFile:
     size = os.fstat(file.fileno()).st_size
     if size == 0:
         raise LogError(path, "empty file", "its recorder was stopped before it began")

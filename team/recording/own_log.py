@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from teamslam.team.recording.inventory import Inventory
-from teamslam.team.recording.parts import join, next_part
+from teamslam.team.recording.parts import join_parts, next_part
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.wire.bus import Sample
@@ -66,4 +66,4 @@ def own_log(path: Path, team: str) -> Iterator[OwnLog]:
     finally:
         if not own.failed:
             recorder.close()
-            join(path)
+            join_parts(path)

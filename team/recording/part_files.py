@@ -24,7 +24,7 @@ def parts_of(path: Path) -> list[Path]:
     numbered = _numbered_parts(path)
     opened = {number: open_part(part) for number, part in numbered.items()}
     first = next((log for log in opened.values() if log is not None), None)
-    joined = _joined(opened.get(1))
+    joined = _last_joined(opened.get(1))
     return [
         part
         for number, part in numbered.items()
@@ -35,7 +35,7 @@ def parts_of(path: Path) -> list[Path]:
 def next_number(path: Path) -> int:
     """Return the number of the next part, above all earlier ones."""
     numbered = _numbered_parts(path)
-    return max((_joined(open_part(path)), *numbered)) + 1 if numbered else 1
+    return max((_last_joined(open_part(path)), *numbered)) + 1 if numbered else 1
 
 
 def joined_leftovers(path: Path) -> list[Path]:
@@ -44,7 +44,7 @@ def joined_leftovers(path: Path) -> list[Path]:
     return [
         part
         for number, part in _numbered_parts(path).items()
-        if 1 < number <= _joined(first) and _is_of(first, open_part(part), part)
+        if 1 < number <= _last_joined(first) and _is_of(first, open_part(part), part)
     ]
 
 
@@ -61,7 +61,7 @@ def _numbered_parts(path: Path) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _joined(log: LogFile | None) -> int:
+def _last_joined(log: LogFile | None) -> int:
     number = "" if log is None else log.metadata.get(JOINED, "")
     return int(number) if number.isascii() and number.isdigit() else 1
 

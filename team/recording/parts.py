@@ -44,7 +44,7 @@ def check_continues(
     same_run: bool = False,
     ends: Sequence[Channel] = (FINAL_MAP,),
 ) -> bool:
-    """Return whether the run of the log continues; False: it has ended and only `join` remains.
+    """Return whether the run of the log continues; False: it has ended and only joining remains.
 
     The same run has the same team and scenario and wrote within the hour, or before the wall clock
     was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
@@ -120,7 +120,7 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
     return inventory
 
 
-def join(path: Path) -> list[Path]:
+def join_parts(path: Path) -> list[Path]:
     """Join a log's parts; return the remaining files, one on success.
 
     Undamaged chunks are copied in order of arrival. A full disk changes nothing.

@@ -95,7 +95,7 @@ class Log:
     ) -> Iterator[list[Sample] | DamagedChunkError]:
         with part.path.open("rb") as file:
             # The index repeats the channels, since a chunk that introduced one may be damaged.
-            keys = self._indexed(file, part.path, names) if part.complete else {}
+            keys = self._read_indexed_keys(file, part.path, names) if part.complete else {}
             for frame in read_frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
                     self.reading((before + frame.offset) / whole)
@@ -109,7 +109,7 @@ class Log:
         if part.complete:
             raise LogError(part.path, "ends before its own index", REPAIR)
 
-    def _indexed(
+    def _read_indexed_keys(
         self, file: IO[bytes], path: Path, names: set[str] | None
     ) -> dict[int, str | None]:
         keys: dict[int, str | None] = {}

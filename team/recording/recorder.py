@@ -56,7 +56,7 @@ class Recorder:
         """Number of samples dropped beyond MOST_CHANNELS keys."""
         try:
             self._file: IO[bytes] = self.path.open("xb")
-            self._writer = _opened_writer(self._file, {**metadata, "team": team})
+            self._writer = _open_writer(self._file, {**metadata, "team": team})
         except FileExistsError:
             raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
         except OSError as error:
@@ -169,7 +169,7 @@ class Recorder:
         return self._writer.register_channel(self._prefix + key, declaration.encoding, number)
 
 
-def _opened_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
+def _open_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
     """Open a writer and write header and metadata first, for a log whose recorder is killed."""
     writer = Writer(file)
     try:

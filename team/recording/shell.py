@@ -148,10 +148,12 @@ class RecordLoop:
         A new submap is reported at once, since its robot stays until then. A writing thread far
         behind stops the reports, which are credit.
         """
-        noted = [(each, self._noted(each)) for each in samples if row_of(each.key) is not None]
+        noted = [
+            (each, self._note_sample(each)) for each in samples if row_of(each.key) is not None
+        ]
         self._dropped += len(samples) - len(noted)
         self._write([own for sample, own in noted if self._inventory.is_new(sample)])
-        leaving = [tally for each, _ in noted if (tally := self._noted_tally(each)) is not None]
+        leaving = [tally for each, _ in noted if (tally := self._note_tally(each)) is not None]
         if self._is_far_behind:
             return
         for tally in leaving:
@@ -175,7 +177,7 @@ class RecordLoop:
     def _is_far_behind(self) -> bool:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
-    def _noted_tally(self, sample: Sample) -> Tally | None:
+    def _note_tally(self, sample: Sample) -> Tally | None:
         if TALLY.owner(sample.key) is None:
             return None
         with suppress(WireError):
@@ -186,7 +188,7 @@ class RecordLoop:
         return None
 
     def _report_lacking(self, tally: Tally) -> None:
-        found = self._inventory.received.lacking(tally, self._bus.awaited())
+        found = self._inventory.received.lacking(tally, self._bus.find_awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
         self._bus.publish(Outgoing(RECORDED, tally.node, has))
 
@@ -198,16 +200,16 @@ class RecordLoop:
         except RecorderError as error:
             if self._more is None:
                 raise
-            self._stopped(error)
+            self._note_failure(error)
         else:
             self._messages += len(samples)
 
-    def _stopped(self, error: RecorderError) -> None:
+    def _note_failure(self, error: RecorderError) -> None:
         _LOG.error("nothing is recorded any more: %s; trying again every %g s", error, _RETRY_S)
         self._recorder, self._failure = None, error
         self._retry_s = time.monotonic() + _RETRY_S
 
-    def _go_on(self, now_s: float) -> None:
+    def _open_next_part(self, now_s: float) -> None:
         if self._recorder is not None or self._more is None or now_s < self._retry_s:
             return
         self._retry_s = now_s + _RETRY_S
@@ -218,7 +220,7 @@ class RecordLoop:
             return
         self._failure = None
         self._reported.clear()
-        self._bus.again()
+        self._bus.redeliver()
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
     def write_scenario(self, scenario: Sequence[Configuration]) -> None:
@@ -238,7 +240,7 @@ class RecordLoop:
 
     def request_missing(self, now_s: float) -> None:
         """Request long-missing messages from sources and robots, without blocking."""
-        self._go_on(now_s)
+        self._open_next_part(now_s)
         for stream in self._request_times.due(self._inventory.gaps, now_s):
             kind, robot, incarnation = stream
             first, last = self._inventory.span(stream)
@@ -268,18 +270,18 @@ class RecordLoop:
         numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
         others = [
             f"{key}: {intervals(lost)}"
-            for key, lost in self._bus.lacking().items()
+            for key, lost in self._bus.find_missing().items()
             if (found := channel_of(key)) is None or found[0] not in (*SENSORS, SUBMAP)
         ]
         return [*numbered, *others]
 
-    def _noted(self, sample: Sample) -> Sample:
+    def _note_sample(self, sample: Sample) -> Sample:
         found = channel_of(sample.key)
         if found is None:
             return sample
         channel, name = found
         if channel is ALIVE:
-            return self._noted_alive(sample, name)
+            return self._note_liveliness(sample, name)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
         self._has_map = self._has_map or channel is FINAL_MAP
         if channel is CONCLUDED or channel is ORDER:
@@ -288,7 +290,7 @@ class RecordLoop:
             self._unconcluded.discard(robot_of(name) or "")
         return sample
 
-    def _noted_alive(self, sample: Sample, node: str) -> Sample:
+    def _note_liveliness(self, sample: Sample, node: str) -> Sample:
         try:
             came = _is_alive(sample.payload)
         except WireError as error:  # not a node name: recorded unchanged
@@ -303,7 +305,7 @@ class RecordLoop:
 
     def check_end(self, end: EndQuery) -> None:
         """Request a missed end, and remove processes that left unannounced."""
-        missed = end.missed()
+        missed = end.find_missed()
         if missed and not self._has_ended:
             self.take(missed)
         if missed and self._has_ended:

@@ -30,7 +30,7 @@ class Tail:
 
     def more(self) -> list[Sample]:
         """Return newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
-        if self.ended or (self.log is None and not self._opened()):
+        if self.ended or (self.log is None and not self._try_open()):
             return []
         assert self.log is not None
         found: list[Sample] = []
@@ -51,7 +51,7 @@ class Tail:
                     break
         return found
 
-    def _opened(self) -> bool:
+    def _try_open(self) -> bool:
         if not self.path.exists() or self.path.stat().st_size == 0:
             return False
         try:

@@ -21,7 +21,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.door import absurd
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.pairs import COMPARISON_ROBOT, PAIRS
-from teamslam.team.registry import loaded
+from teamslam.team.registry import load
 from teamslam.team.robot.ledger import Ledger, OnDisposition
 from teamslam.team.robot.mapper import Mapper, Replaced
 from teamslam.team.robot.poses import RunningPoses
@@ -30,8 +30,8 @@ from teamslam.team.robot.stream import EndOfStream, Inbox
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
-from teamslam.team.wire.codec import unsound
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.codec import find_error
+from teamslam.team.wire.digest import announce_configuration
 
 
 @dataclass
@@ -141,7 +141,7 @@ class RobotNode:
     ) -> None:
         self.config = config
         self.robot = config.id
-        self._announcement = configured(ch.robot_node(config.id), 0, 0, config)
+        self._announcement = announce_configuration(ch.robot_node(config.id), 0, 0, config)
         if announced is not None:
             self._announcement = msgspec.structs.replace(self._announcement, digest=announced)
         self.inbox = Inbox()
@@ -357,10 +357,10 @@ class RobotNode:
         """
         sound = []
         for each in self.out:
-            why = unsound(each.message)
+            why = find_error(each.message)
             if why is not None and isinstance(each.message, m.MapEstimate):
-                each = each._replace(message=translate.receivable(each.message)[0])
-                why = unsound(each.message)
+                each = each._replace(message=translate.make_receivable(each.message)[0])
+                why = find_error(each.message)
             if why is None:
                 sound.append(each)
             else:
@@ -431,5 +431,5 @@ def robot_node(config: RobotConfig, exchange: Exchange = "continuous", **options
     """The node of a robot: for a rule over submaps `RobotNode`, else the robot of a comparison."""
     if PAIRS[config.estimator, config.fusion] == "submap":
         return RobotNode(config, exchange, **options)
-    made: type[RobotNode] = loaded(COMPARISON_ROBOT, f"the estimator {config.estimator}")
+    made: type[RobotNode] = load(COMPARISON_ROBOT, f"the estimator {config.estimator}")
     return made(config, exchange, **options)

@@ -3,7 +3,7 @@
 from teamslam.team.door import MOST_COUNT, MOST_LIVES, absurd, another_time
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.message_order import later_end, later_head
+from teamslam.team.wire.message_order import later_head, merge_ends
 
 NEAR_LIVES = 16
 """Largest accepted step of the incarnation, which grows one by one, and seldom."""
@@ -262,7 +262,7 @@ class EndOfStream:
 
     def take(self, end: m.End) -> None:
         """Take a world's end; one that does not name this robot ends its stream where it is."""
-        self._world_end = end = later_end(end, self._world_end)
+        self._world_end = end = merge_ends(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
         if self.at_source is not None:  # no other word counts any more
             incarnation, count = self.at_source

@@ -203,13 +203,15 @@ class Translator:
                 return []
             case TagsRecord():
                 tags = [(self._name(tag), tag.position, tag.covariance) for tag in record.tags]
-                return self._seen(record.stamp_ns, record.frame, tags)
+                return self._make_scans(record.stamp_ns, record.frame, tags)
             case TransformsRecord():
                 found = []
                 shared = topic in self.owners.shared or None
                 for t in record.transforms:
                     if self._is_tag(t) and self._is_ours(t.parent, shared):
-                        found += self._seen(t.stamp_ns, t.parent, [(t.child, t.position, None)])
+                        found += self._make_scans(
+                            t.stamp_ns, t.parent, [(t.child, t.position, None)]
+                        )
                 return found
             case _:
                 self.dropped["no detection in a message of a detections topic"] += 1
@@ -259,7 +261,7 @@ class Translator:
         frames = {frame for frame in self._unclaimed if self.owners.owner(frame) is None}
         return self.owners.question(self.robot, frames) if frames and self.undecided else ""
 
-    def _seen(self, stamp_ns: int, frame: str, tags: list[tuple]) -> list[Measured]:  # type: ignore[type-arg]
+    def _make_scans(self, stamp_ns: int, frame: str, tags: list[tuple]) -> list[Measured]:  # type: ignore[type-arg]
         mount = self._mount(frame)
         landmarks: list[tuple[int, tuple[float, float], tuple[float, float, float] | None]] = []
         teammates: list[tuple[str, tuple[float, float]]] = []

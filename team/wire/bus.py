@@ -43,7 +43,7 @@ from teamslam.team.wire.messages import (
     Withdrawal,
     WithdrawalHeard,
 )
-from teamslam.team.wire.text import readable
+from teamslam.team.wire.text import make_printable
 
 _IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, WithdrawalHeard)
 """Messages with texts for people."""
@@ -138,13 +138,13 @@ class Bus(Protocol):
         No effect while the same query is open.
         """
 
-    def again(self) -> None:
+    def redeliver(self) -> None:
         """Request and deliver all samples of `all` channels and whole subscriptions again."""
 
-    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+    def find_missing(self) -> dict[str, list[tuple[int, int]]]:
         """Return the missing samples: by key, intervals of a publisher's counters."""
 
-    def awaited(self) -> set[str]:
+    def find_awaited(self) -> set[str]:
         """Return the keys with missing samples that their publisher may still have."""
 
     def publish_totals(self) -> Tally | None:
@@ -192,17 +192,17 @@ def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
         return None
 
 
-def shown(sample: Sample) -> tuple[Channel, str, Message]:
+def open_printable(sample: Sample) -> tuple[Channel, str, Message]:
     """Decode a sample as `opened` does, with printable texts."""
     channel, name, message = opened(sample)
-    return channel, name, readable(message) if isinstance(message, _IN_WORDS) else message
+    return channel, name, make_printable(message) if isinstance(message, _IN_WORDS) else message
 
 
-def sound(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
-    """Decode the valid samples as `shown` does, and leave out the others."""
+def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
+    """Decode the valid samples as `open_printable` does, and leave out the others."""
     for sample in samples:
         try:
-            yield shown(sample)
+            yield open_printable(sample)
         except WireError as error:
             LOG.debug("dropped %s: %s", sample.key[:80], error)
 
@@ -218,13 +218,13 @@ def _sender_of(channel: Channel, message: Message) -> str | None:
     return message.by if is_order and isinstance(message, Withdrawal | TeamEnd) else None
 
 
-def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
+def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
     """Convert a reply to a sample of the channel of its message.
 
     Raises `WireError` if the message does not answer this query, or belongs to another robot.
     """
     if channel is KEPT:
-        return _kept(payload)
+        return _read_stored(payload)
     message: Message = decoded(payload)
     of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
@@ -235,7 +235,7 @@ def replied(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample
     return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)
 
 
-def _kept(payload: bytes) -> Sample:
+def _read_stored(payload: bytes) -> Sample:
     kept = decoded(payload, Kept)
     sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
     if opened(sample)[0] not in REPLIES[KEPT]:
@@ -394,9 +394,9 @@ class MemoryBus:
         """Send a query; `receive` returns the replies with its next samples."""
         for payload in self.ask(channel, name, request, 0.0):
             with suppress(WireError):  # invalid replies are dropped
-                self._arrived.append(replied(channel, name, payload, 0))
+                self._arrived.append(read_reply(channel, name, payload, 0))
 
-    def again(self) -> None:
+    def redeliver(self) -> None:
         """Deliver the stored samples of whole subscriptions and of `all` channels again."""
         for key, stored in self._network.stored.items():
             found = channel_of(key)
@@ -405,11 +405,11 @@ class MemoryBus:
             if found[0].delivery == "all" or found[0].name in self._whole:
                 self._arrived.extend(sample for source, sample in stored if source is not self)
 
-    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+    def find_missing(self) -> dict[str, list[tuple[int, int]]]:
         """Return an empty table: no sample is lost in memory."""
         return {}
 
-    def awaited(self) -> set[str]:
+    def find_awaited(self) -> set[str]:
         """Return an empty set: no sample is lost in memory."""
         return set()
 

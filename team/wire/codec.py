@@ -88,7 +88,7 @@ def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exceptio
     raise WireError("damaged", text) from None
 
 
-def unsound(message: Message) -> WireError | None:
+def find_error(message: Message) -> WireError | None:
     """Return the error with which every receiver refuses this message; None for a valid one."""
     try:
         decoded(encoded(message), type(message))

@@ -41,7 +41,7 @@ def digest_of(*parts: bytes) -> bytes:
     return digest.value
 
 
-def configured(
+def announce_configuration(
     node: str, incarnation: int, stamp_ns: int, configuration: msgspec.Struct
 ) -> m.Configuration:
     """Return the announcement of a configuration, with its digest."""

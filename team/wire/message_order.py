@@ -41,7 +41,7 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
     return known is None or order(new) > order(known)
 
 
-def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
+def merge_progress(new: m.Progress, known: m.Progress | None) -> m.Progress:
     """Return the larger numbers of both messages, or the message of the newer incarnation.
 
     A restarted process first reports smaller numbers; the larger ones remain valid.
@@ -60,7 +60,7 @@ def further(new: m.Progress, known: m.Progress | None) -> m.Progress:
     )
 
 
-def later_end(new: m.End, known: m.End | None) -> m.End:
+def merge_ends(new: m.End, known: m.End | None) -> m.End:
     """Return the end with the larger counter of each stream; notes of `new`."""
     if known is None:
         return new

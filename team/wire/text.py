@@ -18,7 +18,7 @@ def one_line(text: str) -> str:
     return text if text.isprintable() else "".join(map(_printable, text))
 
 
-def lines(text: str) -> str:
+def printable_lines(text: str) -> str:
     """Apply `one_line` to each line of a text of this program."""
     return "\n".join(one_line(line) for line in text.split("\n"))
 
@@ -28,7 +28,7 @@ def cut(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
-def readable(value: T) -> T:
+def make_printable(value: T) -> T:
     """Apply `one_line` to all texts of a message; an unchanged message is returned itself."""
     return cast("T", _readable(value))
 

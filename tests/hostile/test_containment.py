@@ -201,7 +201,7 @@ def test_a_status_that_raises_is_a_fault_and_the_status_says_that(heard):
     assert (fault.origin, fault.text) == ("status", "no word")
     assert isinstance(status, m.Status)
     assert status.figures["faults"] == 1.0
-    assert "status: RuntimeError at teamslam.team.shell:Shell.contained:" in status.warnings[-1]
+    assert "status: RuntimeError at teamslam.team.shell:Shell.contain:" in status.warnings[-1]
 
 
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew():

@@ -14,7 +14,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.support import example, submap
 from tests.teams import Submaps, of, published, stream, world_of
@@ -172,7 +172,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
 
 def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own():
     streams = world_of(*STREAMS.values())
-    announced = configured("world", 0, 0, RobotConfig("r1"))
+    announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
     assert node.publish(0.0)
     node.ended = False
@@ -276,7 +276,7 @@ def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source
 def test_a_world_goes_on_when_others_took_what_a_stranger_has_published():
     """A robot, and the recorder, counted further than there is: their progress gave no credit."""
     streams = world_of(*STREAMS.values())
-    announced = configured("world", 0, 0, RobotConfig("r1"))
+    announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
     here = build.liveliness(node="recorder")
     given(boundary, node, (ch.ALIVE, "recorder", here))

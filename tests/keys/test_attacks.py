@@ -21,7 +21,7 @@ from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import load_roster, nodes_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened, replied
+from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened, read_reply
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh import session
 from teamslam.team.wire.zenoh.bus import ZenohBus
@@ -163,13 +163,14 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
             names = tuple(channel.name for channel in ch.REPLIES[ch.KEPT])
             request = build.kept_request(channels=names, run_ns=3600 * 10**9)
             return [
-                replied(ch.KEPT, "", each, 0).key for each in victim.ask(ch.KEPT, "", request, 5.0)
+                read_reply(ch.KEPT, "", each, 0).key
+                for each in victim.ask(ch.KEPT, "", request, 5.0)
             ]
 
         def ends(bus: ZenohBus, *channels: ch.Channel) -> list[Sample]:
             end = EndQuery(bus, "robot/r1", channels or (ch.FINAL_MAP,))
             end._began -= 3600.0
-            return end.missed()
+            return end.find_missed()
 
         operator.publish(order)
         wait_until(lambda: order.key in stored(), what="the order")
@@ -219,7 +220,7 @@ def test_a_robot_that_was_taken_over_answers_no_query_of_another(keys, *, locked
         try:
             found = answers(robot, ch.MEASUREMENTS, "r1", wanted)
             found += answers(robot, ch.SUBMAPS, "", build.submaps_request())
-            ended = EndQuery(robot).missed()
+            ended = EndQuery(robot).find_missed()
         finally:
             over.set()
             serving.join()

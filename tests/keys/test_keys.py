@@ -15,7 +15,7 @@ from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import KeysError, load_roster, nodes_of
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire.zenoh.access import owned
+from teamslam.team.wire.zenoh.access import list_owned_keys
 from tests.keys.certificates import TEAM, Folders
 
 
@@ -120,7 +120,7 @@ def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors():
     def owners(key: str) -> list[str]:
         def owns(node: str) -> bool:
             of_team = zenoh.KeyExpr(key)
-            return any(zenoh.KeyExpr(each).includes(of_team) for each in owned(node))
+            return any(zenoh.KeyExpr(each).includes(of_team) for each in list_owned_keys(node))
 
         return [node for node in nodes if owns(node)]
 

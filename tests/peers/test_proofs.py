@@ -15,7 +15,7 @@ from teamslam.team.keys.roster import nodes_of
 from teamslam.team.keys.signing import Signer
 from teamslam.team.peers.members import Member
 from teamslam.team.peers.node import PeerNode
-from teamslam.team.peers.proofs import OPERATOR, Proofs, signed_order
+from teamslam.team.peers.proofs import OPERATOR, Proofs, sign_order
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded
@@ -66,7 +66,7 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(nodes):
     for each in said:
         nodes["r1"].take(each, "robot/r1")
         nodes["r2"].take(each, "robot/r1")
-        own = proofs_of(nodes["r1"]).signed(each)
+        own = proofs_of(nodes["r1"]).sign(each)
         proofs_of(nodes["r2"]).take_signature(own, "r1")
         wrong = msgspec.structs.replace(own, robot="r3", signature=b"of somebody else")
         proofs_of(nodes["r2"]).take_signature(wrong, "r3")
@@ -97,14 +97,14 @@ def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(node
         node="robot/r2",
         keys=(said.key,),
         payloads=(said.payload,),
-        signatures=(signed_order(carrier, said).signature,),
+        signatures=(sign_order(carrier, said).signature,),
     )
     assert nodes["r3"].take_carried(batch) == []
     assert "an order with a certificate of robot-r2" in nodes["r3"].last_refused
     assert nodes["r3"].take_carried(msgspec.structs.replace(batch, signatures=(b"",))) == []
     operator = Signer(credentials_of(folder, "operator", "t"))
     nodes["r2"].take(said, "operator")
-    proofs_of(nodes["r2"]).take_signature(signed_order(operator, said), OPERATOR)
+    proofs_of(nodes["r2"]).take_signature(sign_order(operator, said), OPERATOR)
     nodes["r3"].tick(20.0)
     news = carried_to(nodes["r3"], nodes["r2"])
     assert said.payload in [each.payload for each in news]
@@ -141,7 +141,7 @@ class Renewed:
         self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
         for each in members:
             self.r2.take(each, "robot/r1")
-            proofs_of(self.r2).take_signature(proofs.signed(each), "r1")
+            proofs_of(self.r2).take_signature(proofs.sign(each), "r1")
 
     def submaps_of_r3(self) -> int:
         """The submaps of r1 at r3 after some exchanges with r2 alone."""
@@ -246,7 +246,7 @@ def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_o
                 node="robot/r2",
                 keys=(said.key,),
                 payloads=(said.payload,),
-                signatures=(signed_order(signer, said).signature,),
+                signatures=(sign_order(signer, said).signature,),
             )
         )
 
@@ -280,7 +280,7 @@ def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present
 def test_a_robot_that_signs_anothers_member_does_not_take_the_others_signature(nodes):
     (of_r1,) = parcel("r1", 7)
     hearing = proofs_of(nodes["r2"])
-    hearing.take_signature(proofs_of(nodes["r1"]).signed(of_r1), "r1")
+    hearing.take_signature(proofs_of(nodes["r1"]).sign(of_r1), "r1")
     good = hearing.of(of_r1)
     junk = m.Signature(stamp_ns=0, robot="r3", member=of_r1.hash, signature=bytes(len(good)))
     hearing.take_signature(junk, "r3")

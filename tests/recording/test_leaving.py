@@ -75,7 +75,7 @@ def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path):
     with router() as at, ZenohBus("t", at) as centre, ZenohBus("t", at) as there:
         loop = RecordLoop(there, Recorder(path, "t", {}), ())
         lost = {c.TRAJECTORY.key(robot) for robot in TRAJECTORIES[:12]}
-        arrived = there._recovery.arrived
+        arrived = there._recovery.take_sample
 
         def lossy(sample: Sample, source: object) -> list[Sample]:
             if sample.key in lost:  # the first time: the cache has it
@@ -83,7 +83,7 @@ def test_a_centre_stays_for_what_was_lost_on_the_way(tmp_path):
                 return []
             return arrived(sample, source)
 
-        there._recovery.arrived = lossy
+        there._recovery.take_sample = lossy
 
         def turn() -> None:
             loop.take(there.receive(0.02))

@@ -19,7 +19,7 @@ from teamslam.team.recording.inventory import Inventory
 from teamslam.team.recording.merge import merge
 from teamslam.team.recording.own_log import own_log
 from teamslam.team.recording.part_files import part_of, parts_of
-from teamslam.team.recording.parts import check_continues, join, next_part
+from teamslam.team.recording.parts import check_continues, join_parts, next_part
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.records import read_frames
@@ -78,7 +78,7 @@ def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path):
         thread.join(60.0)
         second.close()
     assert parts_of(path) == [path, part]
-    assert join(path) == [path]
+    assert join_parts(path) == [path]
     log = open_log(path)
     assert log.complete
     measurements = [decoded(s.payload, m.Odometry) for s in log.samples([c.ODOMETRY])]
@@ -173,11 +173,11 @@ def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice
     with monkeypatch.context() as patched:
         patched.setattr(Path, "unlink", dies)
         with pytest.raises(KeyboardInterrupt):
-            join(path)
+            join_parts(path)
     assert len(list(path.parent.iterdir())) == 3 - removed
     assert numbers(path) == list(range(10)), "what was joined is not read from its part"
     assert not check_continues(path, "t", {"scenario": "s"})
-    assert join(path) == [path]
+    assert join_parts(path) == [path]
     assert numbers(path) == list(range(10))
     assert list(path.parent.iterdir()) == [path]
 
@@ -190,7 +190,7 @@ def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path):
     wait_until(lambda: logged(path, c.ODOMETRY) == 3)
     assert numbers(path) == [0, 1, 2]
     final_part(path, 3, samples_of(4)[3:])
-    assert join(path) == [path]
+    assert join_parts(path) == [path]
     assert numbers(path) == [0, 1, 2, 3]
     assert part_of(path, 2).exists()
 
@@ -292,7 +292,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
         loop.request_missing(now_s)
         loop.take(bus.receive())
     loop.close()
-    assert join(path) == [path]
+    assert join_parts(path) == [path]
     log = open_log(path)
     assert logged(path, c.ODOMETRY) == logged(path, c.OWN_POSE) == said
     assert holes(log) == []

@@ -19,7 +19,7 @@ from teamslam.team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
 from teamslam.team.ros2.topics import RobotTopics, TopicsError, load_topics
 from teamslam.team.ros2.translator import Measured
 from teamslam.team.ros2_driver import BEHIND_S, SILENT_S, Ros2Driver
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -200,9 +200,9 @@ def test_what_was_published_once_before_the_driver_began_is_received(network, to
 def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path):
     node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
     mounted = RobotConfig("r1", sensor=Sensor(mount=(0.2, 0.0, 1.0)))
-    node.handle(configured("robot/r2", 0, 0, RobotConfig("r2")), 0)
+    node.handle(announce_configuration("robot/r2", 0, 0, RobotConfig("r2")), 0)
     assert node.models is None
-    told = configured("robot/r1", 0, 0, mounted)
+    told = announce_configuration("robot/r1", 0, 0, mounted)
     node.handle(told, 0)
     assert node.models == mounted
     node.handle(msgspec.structs.replace(told, configuration='{"sensor": 7}'), 0)

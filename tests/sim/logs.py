@@ -17,7 +17,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.support import fused_map
 
@@ -54,7 +54,7 @@ def samples(out: Sequence[Outgoing]) -> list[Sample]:
 
 def world_log(of: Scenario) -> list[Sample]:
     """Everything that the world publishes, with nobody listening."""
-    node = WorldNode(streams(of), frozenset(), configured("world", 0, 0, of))
+    node = WorldNode(streams(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
         out += node.publish(0.0)

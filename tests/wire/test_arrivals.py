@@ -24,7 +24,7 @@ def test_what_has_not_come_is_missing(come, newest):
     for number in sorted(come):
         arrivals.take(number, number)
     arrivals.know(newest)
-    lost = {n for begin, end in arrivals.lacking for n in range(begin, end + 1)}
+    lost = {n for begin, end in arrivals.missing_intervals for n in range(begin, end + 1)}
     assert lost == set(range(max([newest, *come]) + 1)) - come
     assert arrivals.missing == ((min(lost), max(lost)) if lost else None)
 
@@ -66,9 +66,9 @@ def test_what_the_publisher_has_no_more_is_gone_and_named():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(1, 1)
     arrivals.take(4, 4)
-    assert arrivals.answered(0, 3) == [1, 4]
+    assert arrivals.take_answer(0, 3) == [1, 4]
     assert arrivals.missing is None
-    assert arrivals.lacking == [(0, 0), (2, 3)]
+    assert arrivals.missing_intervals == [(0, 0), (2, 3)]
 
 
 def test_numbers_of_32_bits_cost_no_memory_and_no_time():
@@ -77,8 +77,8 @@ def test_numbers_of_32_bits_cost_no_memory_and_no_time():
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.know(newest)
     arrivals.take(7, 7)
-    assert arrivals.answered(0, newest) == [7]
-    assert arrivals.lacking == [(0, 6), (8, newest)]
+    assert arrivals.take_answer(0, newest) == [7]
+    assert arrivals.missing_intervals == [(0, 6), (8, newest)]
     assert arrivals.take(newest + 1, 8) == [8]
     assert arrivals.missing is None
 
@@ -89,9 +89,9 @@ def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(mon
     delivered = []
     for number in range(1, 2_001, 2):
         delivered += arrivals.take(number, number)
-        assert len(arrivals.lacking) <= 22
+        assert len(arrivals.missing_intervals) <= 22
     assert delivered == list(range(1, 1_981, 2)), "the oldest gap is given up for each new one"
-    lost = {n for begin, end in arrivals.lacking for n in range(begin, end + 1)}
+    lost = {n for begin, end in arrivals.missing_intervals for n in range(begin, end + 1)}
     assert set(range(0, 2_000, 2)) <= lost
 
 
@@ -102,8 +102,8 @@ def test_a_number_that_the_publisher_never_had_is_unlearnt():
     arrivals.know(500)
     assert arrivals.due(0.0) is None
     assert arrivals.due(PATIENCE_S) == (1, 500)
-    assert arrivals.answered(1, 0, known=500) == []
-    assert (arrivals.missing, arrivals.lacking) == (None, [])
+    assert arrivals.take_answer(1, 0, known=500) == []
+    assert (arrivals.missing, arrivals.missing_intervals) == (None, [])
     assert arrivals.take(1, 1) == [1]
 
 
@@ -113,8 +113,8 @@ def test_a_heartbeat_that_comes_during_the_reply_is_not_unlearnt():
     arrivals.know(1)
     known = arrivals.newest
     arrivals.know(2)
-    arrivals.answered(1, 1, known=known)
-    assert arrivals.lacking == [(1, 1), (2, 2)]
+    arrivals.take_answer(1, 1, known=known)
+    assert arrivals.missing_intervals == [(1, 1), (2, 2)]
 
 
 def test_of_the_newest_alone_nothing_older_is_asked_for_or_waited_for():

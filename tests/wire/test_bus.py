@@ -18,7 +18,7 @@ from teamslam.team.wire.bus import (
     Outgoing,
     Sample,
     opened,
-    replied,
+    read_reply,
 )
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
@@ -250,4 +250,4 @@ def test_replies_to_a_request_come_with_what_arrives(joined):
 @pytest.mark.parametrize("reply", [encoded(submap(0, "bravo")), encoded(odometry(0)), b"\xc1"])
 def test_what_is_no_reply_to_the_question_is_dropped(reply):
     with pytest.raises(WireError):
-        replied(c.SENT, "alpha", reply, 0)
+        read_reply(c.SENT, "alpha", reply, 0)

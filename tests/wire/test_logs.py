@@ -6,9 +6,9 @@ from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import logs
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, shown
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, open_printable
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.text import lines, one_line, readable
+from teamslam.team.wire.text import make_printable, one_line, printable_lines
 from tests import build
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"
@@ -18,7 +18,7 @@ PRINTABLE = r"\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\x0d\x0a[  1.0 s] forged l
 def test_a_hostile_text_is_one_printable_line():
     assert one_line(HOSTILE) == PRINTABLE
     assert one_line("σ = 0.1 m, 12 %, “a” – b…") == "σ = 0.1 m, 12 %, “a” – b…"
-    assert lines("one\ntwo\x1b") == "one\ntwo\\x1b"
+    assert printable_lines("one\ntwo\x1b") == "one\ntwo\\x1b"
 
 
 def test_one_place_logs_so_many_lines_at_once_and_counts_the_others(request, caplog):
@@ -53,15 +53,17 @@ def hostile_fault() -> m.Fault:
 
 def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message_without():
     sample = Sample(ch.STATUS.key("robot/r1"), encoded(hostile_status()), 0, 0, 0)
-    _, _, message = shown(sample)
+    _, _, message = open_printable(sample)
     assert isinstance(message, m.Status)
     texts = [message.state, *message.figures, *message.warnings]
     assert texts == [PRINTABLE] * 4
-    assert readable(message) is message
+    assert make_printable(message) is message
     json = '{\n  "a": 1}'
     configured = build.configuration(incarnation=0, configuration=json)
     key = ch.ROBOT_CONFIG.key("r1")
-    assert shown(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "is data, not words"
+    assert open_printable(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, (
+        "is data, not words"
+    )
 
 
 def test_a_launch_keeps_no_control_character_of_others_for_its_terminal():

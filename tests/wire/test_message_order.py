@@ -5,7 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.message_order import further, is_newer_map, is_newer_prior, later_end
+from teamslam.team.wire.message_order import (
+    is_newer_map,
+    is_newer_prior,
+    merge_ends,
+    merge_progress,
+)
 from tests import build
 from tests.support import example
 
@@ -72,7 +77,7 @@ counters = st.builds(progress, st.integers(0, 3), st.integers(1, 2), st.integers
 def test_progress_never_goes_back(said):
     held = None
     for each in said:
-        before, held = held, further(each, held)
+        before, held = held, merge_progress(each, held)
         assert before is None or held.incarnation >= before.incarnation
         if before is not None and held.incarnation == before.incarnation:
             assert held.measurements >= before.measurements
@@ -90,5 +95,5 @@ def test_an_older_end_does_not_take_measurements_back():
             m.StreamEnd(robot="r2", incarnation=1, measurements=50),
         ),
     )
-    assert later_end(first, later).streams == later.streams
-    assert later_end(later, first).streams == later.streams
+    assert merge_ends(first, later).streams == later.streams
+    assert merge_ends(later, first).streams == later.streams

@@ -5,7 +5,7 @@ import pytest
 
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, replied
+from teamslam.team.wire.bus import Sample, read_reply
 from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 from tests import build
@@ -35,7 +35,7 @@ def of(
     request = build.kept_request(
         channels=tuple(c.name for c in channels), node=node, run_ns=round(run_s * S)
     )
-    return [replied(ch.KEPT, "", reply, 0) for reply in stored.answer(request, now_s)]
+    return [read_reply(ch.KEPT, "", reply, 0) for reply in stored.answer(request, now_s)]
 
 
 def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone():
@@ -135,4 +135,4 @@ def test_the_router_can_not_be_made_to_reply_with_another_channel():
         payload=encoded(build.team_end(reason="so")),
     )  # fmt: skip
     with pytest.raises(WireError, match="stores nothing on the key"):
-        replied(ch.KEPT, "", encoded(kept), 0)
+        read_reply(ch.KEPT, "", encoded(kept), 0)

@@ -254,7 +254,7 @@ def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(endpoint, caplog
         source.publish(Outgoing(c.SUBMAP, "alpha", submap(2)))
         wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or len(arrived) >= 2))
         assert counters(arrived, key) == [0, 2]
-        assert sink.lacking() == {key: [(1, 1)]}
+        assert sink.find_missing() == {key: [(1, 1)]}
         assert sink.dropped >= 1
     assert why in caplog.text
 
@@ -276,7 +276,7 @@ def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(endp
             source.publish(Outgoing(c.SUBMAP, "alpha", submap(k)))
         assert counters(received(sink, 3), "robot/alpha/submap") == [0, 1, 2]
         assert (misled, sink.dropped) == (["team/t/robot/alpha/submap"], 1)
-        assert sink.lacking() == {}
+        assert sink.find_missing() == {}
 
 
 def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
@@ -295,7 +295,7 @@ def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
         until = time.monotonic() + 1.0  # what is missing is asked for after half a second
         while time.monotonic() < until:
             bus.receive(0.05)
-        assert bus.lacking() == {}
+        assert bus.find_missing() == {}
     assert "asked for" not in caplog.text
 
 
@@ -315,7 +315,7 @@ def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
         for key in ("robot/r1/submap", "robot/r2/submap"):
             for k in range(1_000):
                 recovery.take_heartbeat(Heartbeat(key, f"{key}/{k}", 2**32 - 2))
-        lost = {key: len(intervals) for key, intervals in recovery.lacking().items()}
+        lost = {key: len(intervals) for key, intervals in recovery.find_missing().items()}
         assert lost == {"robot/r1/submap": 10, "robot/r2/submap": 5}
         assert recovery.untracked == 1_985
         assert len(caplog.records) < 120
@@ -331,12 +331,12 @@ def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endp
         source = zenoh.SourceInfo(session.declare_publisher("any").id, 0)
         recovery = Recovery(session, "team/t/", lambda item: None)
         own = Sample("robot/r1/submap", b"", 0, 0, 0)
-        assert recovery.arrived(own, source) == [own]
+        assert recovery.take_sample(own, source) == [own]
         name = f"{source.source_id.zid}/{source.source_id.eid}"
         recovery.take_heartbeat(Heartbeat("robot/r2/submap", name, 25))
-        assert recovery.lacking() == {}
+        assert recovery.find_missing() == {}
         recovery.take_heartbeat(Heartbeat("robot/r1/submap", name, 2))
-        assert recovery.lacking() == {"robot/r1/submap": [(1, 2)]}
+        assert recovery.find_missing() == {"robot/r1/submap": [(1, 2)]}
 
 
 def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(endpoint, monkeypatch):
@@ -418,25 +418,29 @@ def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint
             source.publish(progress(i))
         sink.subscribe(c.ROBOT_PROGRESS, whole=True)
         assert counters(received(sink, 50), "robot/alpha/progress") == list(range(50))
-        assert sink.lacking() == {}
+        assert sink.find_missing() == {}
 
 
 def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, monkeypatch):
     first, final = (f for f in [FINAL, msgspec.structs.replace(FINAL, dof=99)])
     with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
-        assert EndQuery(centre).missed() == []
+        assert EndQuery(centre).find_missed() == []
         centre.publish(Outgoing(c.FINAL_MAP, "", first))
         centre.publish(Outgoing(c.FINAL_MAP, "", final))
-        wait_until(lambda: bool(EndQuery(centre).missed()))
-        assert EndQuery(stranger).missed() == []
+        wait_until(lambda: bool(EndQuery(centre).find_missed()))
+        assert EndQuery(stranger).find_missed() == []
     with ZenohBus("t", endpoint) as straggler:
-        (sample,) = EndQuery(straggler).missed()
+        (sample,) = EndQuery(straggler).find_missed()
         assert decoded(sample.payload, m.FusedMap) == final
         assert (sample.key, sample.stamp_ns) == (c.FINAL_MAP.key(), final.stamp_ns)
         monkeypatch.setattr(end_query, "_STARTED", time.monotonic())
-        assert EndQuery(straggler).missed() == [], "a process begins that knows nothing of that run"
+        assert EndQuery(straggler).find_missed() == [], (
+            "a process begins that knows nothing of that run"
+        )
         monkeypatch.setenv(end_query.SINCE, str(time.time_ns() - 60 * 10**9))
-        assert EndQuery(straggler).missed(), "whoever started it says that it belongs to that run"
+        assert EndQuery(straggler).find_missed(), (
+            "whoever started it says that it belongs to that run"
+        )
 
 
 def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):

@@ -1,7 +1,7 @@
 """Collect a log's contents for an evaluation, in one pass.
 
 Measurements, most of a log, are counted by head (robot, incarnation, measurement) and added to
-their stream's `Timed`. All other messages are decoded and checked by `shown`.
+their stream's `Timed`. All other messages are decoded and checked by `open_printable`.
 """
 
 from collections import defaultdict
@@ -17,7 +17,7 @@ from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, shown
+from teamslam.team.wire.bus import Sample, open_printable
 from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError, decoded
 
@@ -140,7 +140,7 @@ class Collected:
         if sample is None:
             return None
         try:
-            return shown(sample)[2]
+            return open_printable(sample)[2]
         except WireError:
             self._refuse(sample)
             return None

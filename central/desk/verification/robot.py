@@ -10,7 +10,7 @@ from teamslam.central.desk.verification.recorded import Identity, Recorded, iden
 from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.registry import loaded
+from teamslam.team.registry import load
 from teamslam.team.robot.node import robot_node
 from teamslam.team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
 from teamslam.team.wire import channels as ch
@@ -93,7 +93,7 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
     lives = _alone
     if config.fusion in FEEDBACK:
-        lives = loaded(LOCKSTEP, f"the fusion rule {config.fusion}")
+        lives = load(LOCKSTEP, f"the fusion rule {config.fusion}")
     found: dict[Identity, m.Message] = {}
     for out in lives(log, robot, new):
         found.setdefault(identity(out.key, out.message), out.message)

@@ -43,7 +43,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
                 stamp_ns=0, node=NODE, state="viewing", figures={"messages": float(published)}
             )
             bus.publish(Outgoing(ch.STATUS, NODE, status))
-        for sample in with_centre_messages(centre, (*bus.receive(WAIT_S), *end.missed())):
+        for sample in with_centre_messages(centre, (*bus.receive(WAIT_S), *end.find_missed())):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
             try:

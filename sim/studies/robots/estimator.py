@@ -13,7 +13,7 @@ from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import ESTIMATORS
-from teamslam.team.registry import loaded
+from teamslam.team.registry import load
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.maps import AT_ORIGIN, Cloud, InitialPose
 from teamslam.team.shapes import Float, UInt32
@@ -106,7 +106,5 @@ def estimator_of(
     known: KnownMap = NOTHING_KNOWN,
 ) -> RobotEstimator:
     """Make the configured estimator at the beginning of an incarnation."""
-    made: Factory = loaded(
-        ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}"
-    )
+    made: Factory = load(ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}")
     return made(config, incarnation, initial, known)

@@ -25,7 +25,7 @@ TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
 """Channels that no estimator may receive."""
 
 
-def owned(node: str) -> tuple[str, ...]:
+def list_owned_keys(node: str) -> tuple[str, ...]:
     """Return the keys, relative to the team, that only this node may publish and answer on.
 
     The world drives every robot's sensors, so it shares those keys with each `source-…`.
@@ -70,7 +70,7 @@ def access_control(roster: Roster) -> dict[str, Any]:
         {"rules": ["ask at the door", "be told at the door"], "subjects": ["any certificate"]}
     ]
     for node in sorted(roster.nodes):
-        rules.append(_rule(f"own {node}", "ingress", _SAYS, _keys(prefix, owned(node))))
+        rules.append(_rule(f"own {node}", "ingress", _SAYS, _keys(prefix, list_owned_keys(node))))
         subjects.append({"id": node, "cert_common_names": [roster.common_name(node)]})
         blind = ["no truth"] if node == "central" or "-" in node else []
         policies.append({"rules": ["listen", "hear", *blind, f"own {node}"], "subjects": [node]})

@@ -56,7 +56,7 @@ class Arrivals(Generic[T]):
         if self._loose or not self.in_order:
             return [item]
         self._delayed[number] = item
-        return self._released(self._whole)
+        return self._release(self._whole)
 
     def know(self, newest: int) -> None:
         """Record the last number of a heartbeat."""
@@ -69,7 +69,7 @@ class Arrivals(Generic[T]):
         return (self._whole, last) if last >= self._whole else None
 
     @property
-    def lacking(self) -> list[tuple[int, int]]:
+    def missing_intervals(self) -> list[tuple[int, int]]:
         """Missing intervals, first those that the publisher no longer has."""
         return [*self._gone, *self._open()]
 
@@ -97,9 +97,9 @@ class Arrivals(Generic[T]):
         if self._since_s is None or now_s - self._since_s < DELAY_S:
             return []
         self._loose = True
-        return self._released(self.newest + 1)
+        return self._release(self.newest + 1)
 
-    def answered(self, first: int, newest: int, known: int | None = None) -> list[T]:
+    def take_answer(self, first: int, newest: int, known: int | None = None) -> list[T]:
         """Record the complete reply for `first` to `newest`; return the items to deliver.
 
         Numbers still missing are gone. known: the last number at the request; if it exceeds the
@@ -109,7 +109,7 @@ class Arrivals(Generic[T]):
             self._give_up(max(begin, first), min(end, newest))
         if self.newest == known:
             self.newest = max(newest, self._settled.last)
-        return self._released(self._whole)
+        return self._release(self._whole)
 
     @property
     def _whole(self) -> int:
@@ -124,5 +124,5 @@ class Arrivals(Generic[T]):
     def _open(self) -> list[tuple[int, int]]:
         return self._settled.gaps(self.first, self.newest)
 
-    def _released(self, end: int) -> list[T]:
+    def _release(self, end: int) -> list[T]:
         return [self._delayed.pop(n) for n in sorted(n for n in self._delayed if n < end)]

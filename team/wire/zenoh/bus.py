@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Self
 import zenoh
 from zenoh.handlers import Callback
 
-from teamslam.team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, replied
+from teamslam.team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, read_reply
 from teamslam.team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
 from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.messages import Liveliness, Message, Tally
 from teamslam.team.wire.text import cut
 from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
-from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declared, subscribe
+from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declare_publisher, subscribe
 from teamslam.team.wire.zenoh.queries import Queries, Question, Reply
 from teamslam.team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
 from teamslam.team.wire.zenoh.session import RouterLink, client
@@ -177,7 +177,7 @@ class ZenohBus:
         try:
             publisher = self._publishers.get(sample.key)
             if publisher is None:
-                publisher = self._publishers[sample.key] = declared(
+                publisher = self._publishers[sample.key] = declare_publisher(
                     self._session, self._prefix, sample.key
                 )
             publisher.put(sample.payload, attachment=attachment)
@@ -280,9 +280,9 @@ class ZenohBus:
             case Heartbeat():
                 self._recovery.take_heartbeat(item)
             case CacheAnswer():
-                samples += self._recovery.answered(item)
+                samples += self._recovery.take_answer(item)
             case Reply():
-                samples += self._queries.taken(item)
+                samples += self._queries.read_reply(item)
             case zenoh.Sample():
                 self._take_sample(item, samples)
 
@@ -298,21 +298,21 @@ class ZenohBus:
         if item.source_info is None or self._can_do_without(key):  # lost samples are not requested
             samples.append(sample)
         else:
-            samples += self._recovery.arrived(sample, item.source_info)
+            samples += self._recovery.take_sample(sample, item.source_info)
 
-    def again(self) -> None:
+    def redeliver(self) -> None:
         """Request and deliver all samples of `all` channels and whole subscriptions again."""
-        self._recovery.again()
+        self._recovery.redeliver()
 
-    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+    def find_missing(self) -> dict[str, list[tuple[int, int]]]:
         """Return the missing samples, available or not: by key, intervals of a publisher's
         counters.
         """
-        return self._recovery.lacking()
+        return self._recovery.find_missing()
 
-    def awaited(self) -> set[str]:
+    def find_awaited(self) -> set[str]:
         """Return the keys with missing samples that their publisher may still have."""
-        return self._recovery.awaited()
+        return self._recovery.find_awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer the queries of `channel` within `receive`; a ValueError's text is the reply."""
@@ -329,7 +329,7 @@ class ZenohBus:
         if self.tap is not None and channel in REPLIES and channel is not KEPT:
             wall_ns = time.time_ns()
             with suppress(WireError):  # the caller decodes them and reports the error
-                self.tap([replied(channel, name, payload, wall_ns) for payload in payloads])
+                self.tap([read_reply(channel, name, payload, wall_ns) for payload in payloads])
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:

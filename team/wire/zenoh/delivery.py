@@ -23,7 +23,7 @@ _REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=PRIORITY)
 Publisher = zenoh.Publisher | ext.AdvancedPublisher
 
 
-def declared(session: zenoh.Session, prefix: str, key: str) -> Publisher:
+def declare_publisher(session: zenoh.Session, prefix: str, key: str) -> Publisher:
     """Declare a publisher with the key's delivery (default: stream)."""
     row = row_of(key)
     if row is None or row.delivery == "stream":

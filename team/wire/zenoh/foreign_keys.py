@@ -141,12 +141,12 @@ class ForeignKeys:
         """Return up to AT_ONCE samples per subscription; wait `timeout_s` for the first."""
         until = time.monotonic() + timeout_s
         while True:
-            found = self._taken()
+            found = self._take_samples()
             if found or time.monotonic() >= until:
                 return found
             time.sleep(LOOK_S)
 
-    def _taken(self) -> list[ForeignSample]:
+    def _take_samples(self) -> list[ForeignSample]:
         """Return tokens first: they announce the types of the samples that follow."""
         found = [_of_token(sample) for sample in self._first]
         self._first.clear()

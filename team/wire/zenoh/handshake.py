@@ -60,11 +60,15 @@ def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT
     except OSError as error:
         return Examined(waits_for=error.strerror or str(error))
     with link:
-        found = _without_keys(link, connect) if keys is None else _with(link, host, connect, keys)
+        found = (
+            _examine_plain(link, connect)
+            if keys is None
+            else _examine_tls(link, host, connect, keys)
+        )
     return replace(found, accepts=True)
 
 
-def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> Examined:
+def _examine_tls(link: socket.socket, host: str, connect: str, keys: "Credentials") -> Examined:
     try:
         context = keys.context()
     except OSError as error:  # as while a renewed pair is copied
@@ -79,7 +83,7 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
             f"authority than {keys.authority}: copy both from one folder"
         )
     except OSError as error:
-        return _failed(error, connect, keys)
+        return _explain_failure(error, connect, keys)
     with tls:
         ends = (tls.getpeercert() or {}).get("notAfter")
         router_ends = ssl.cert_time_to_seconds(ends) if isinstance(ends, str) else None
@@ -88,11 +92,11 @@ def _with(link: socket.socket, host: str, connect: str, keys: "Credentials") -> 
         except TimeoutError:
             pass
         except OSError as error:
-            return _failed(error, connect, keys)
+            return _explain_failure(error, connect, keys)
     return Examined(router_ends=router_ends)
 
 
-def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
+def _explain_failure(error: OSError, connect: str, keys: "Credentials") -> Examined:
     if isinstance(error, TimeoutError):
         return Examined(waits_for="connections are accepted, TLS is not answered")
     reason = (error.reason if isinstance(error, ssl.SSLError) else error.strerror) or str(error)
@@ -106,7 +110,7 @@ def _failed(error: OSError, connect: str, keys: "Credentials") -> Examined:
     return Examined(waits_for=f"the TLS handshake was broken off ({reason})")
 
 
-def _without_keys(link: socket.socket, connect: str) -> Examined:
+def _examine_plain(link: socket.socket, connect: str) -> Examined:
     """Test for a router with keys, which answers a greeting in TLS."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import zenoh
 from zenoh.handlers import Callback
 
-from teamslam.team.wire.bus import Answer, BusError, Sample, replied
+from teamslam.team.wire.bus import Answer, BusError, Sample, read_reply
 from teamslam.team.wire.channels import Channel
 from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.messages import Message
@@ -105,7 +105,7 @@ class Queries:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def taken(self, reply: Reply) -> list[Sample]:
+    def read_reply(self, reply: Reply) -> list[Sample]:
         """Convert a reply to a sample; empty for the end or an invalid reply."""
         key = reply.channel.key(reply.name)
         if reply.payload is None:
@@ -114,7 +114,7 @@ class Queries:
                 _LOG.warning("%s: %s (waited at most %s s)", key, reply.wrong, _ANSWER_S)
             return []
         try:
-            return [replied(reply.channel, reply.name, reply.payload, time.time_ns())]
+            return [read_reply(reply.channel, reply.name, reply.payload, time.time_ns())]
         except WireError as error:
             _LOG.warning("%s: dropped a reply: %s", key, error)
             return []

@@ -120,7 +120,7 @@ class Recovery:
             arrivals.know(beat.newest)
             self._incomplete.add((beat.key, beat.publisher))
 
-    def answered(self, answer: CacheAnswer) -> list[Sample]:
+    def take_answer(self, answer: CacheAnswer) -> list[Sample]:
         """Record a cache's complete reply; return the samples to deliver now."""
         if not answer.repeated or answer.failed or answer.newest < 0:
             return []
@@ -129,11 +129,11 @@ class Recovery:
             return []
         if answer.newest < arrivals.newest:
             self._beats.clear()  # the next heartbeats count as new
-        return arrivals.answered(answer.first, answer.newest, answer.known)
+        return arrivals.take_answer(answer.first, answer.newest, answer.known)
 
-    def arrived(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
+    def take_sample(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
         """Record a received publication; return the samples to deliver now, in order."""
-        publisher, number = _numbered(source)
+        publisher, number = _read_source(source)
         arrivals = self._arrivals_of(sample.key, publisher, number)
         if arrivals is None:
             return [sample]
@@ -193,7 +193,7 @@ class Recovery:
             if reply.ok is None:
                 answer.failed = True
             elif reply.ok.source_info is not None:
-                author, number = _numbered(reply.ok.source_info)
+                author, number = _read_source(reply.ok.source_info)
                 if author == publisher:
                     answer.newest = max(answer.newest, number)
                 self._put(reply.ok)
@@ -209,7 +209,7 @@ class Recovery:
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 
-    def again(self) -> None:
+    def redeliver(self) -> None:
         """Request and deliver all samples of `all` channels and whole subscriptions again."""
         self._arrivals.clear()
         self._tracked.clear()
@@ -217,7 +217,7 @@ class Recovery:
         self._incomplete.clear()
         self._beats.clear()  # the next heartbeats count as new
 
-    def awaited(self) -> set[str]:
+    def find_awaited(self) -> set[str]:
         """Return the keys with missing samples that their publisher may still have."""
         return {
             key
@@ -225,13 +225,13 @@ class Recovery:
             if self._arrivals[key, publisher].missing is not None
         }
 
-    def lacking(self) -> dict[str, list[tuple[int, int]]]:
+    def find_missing(self) -> dict[str, list[tuple[int, int]]]:
         """Return the missing samples, available or not: by key, intervals of a publisher's
         counters.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
-            if intervals := arrivals.lacking:
+            if intervals := arrivals.missing_intervals:
                 found.setdefault(key, []).extend(intervals)
         return found
 
@@ -241,5 +241,5 @@ def _node_of(key: str) -> str:
     return f"{first}/{rest.partition('/')[0]}" if first in ("robot", "source") else first
 
 
-def _numbered(info: zenoh.SourceInfo) -> tuple[str, int]:
+def _read_source(info: zenoh.SourceInfo) -> tuple[str, int]:
     return f"{info.source_id.zid}/{info.source_id.eid}", info.source_sn

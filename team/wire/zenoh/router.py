@@ -19,7 +19,7 @@ from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.messages import KeptRequest
 from teamslam.team.wire.zenoh.access import access_control
 from teamslam.team.wire.zenoh.attachment import AttachmentError, unpack
-from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, opened
+from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, open_session
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 
 if TYPE_CHECKING:  # not needed without keys
@@ -84,7 +84,7 @@ def router(
         zenoh.init_log_from_env_or(REFUSALS)
         settings |= _router_tls(*keys)
     try:
-        session = opened(settings)
+        session = open_session(settings)
     except zenoh.ZError as error:
         raise BusError(
             f"can not listen at {listen}: the port is taken or the address is not this machine's; "

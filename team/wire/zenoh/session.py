@@ -35,7 +35,7 @@ DOOR = "router/door"
 ACCEPTED, REVOKED = b"accepted", b"revoked"
 
 
-def opened(settings: dict[str, object]) -> zenoh.Session:
+def open_session(settings: dict[str, object]) -> zenoh.Session:
     """Open a session with these settings and those that all processes of a team share."""
     config = zenoh.Config()
     always: dict[str, object] = {
@@ -79,7 +79,7 @@ def client(
     wait_s = min(FIRST_LOOK_S, patience_s)
     while True:
         try:
-            return opened(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
+            return open_session(settings | {"connect/timeout_ms": max(1, round(1e3 * wait_s))})
         except zenoh.ZError as error:
             from teamslam.team.wire.zenoh.handshake import examine  # ssl: only here
 

@@ -20,7 +20,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.support import examples
 
@@ -49,7 +49,7 @@ def concluded(robot: str, fused: m.FusedMap = TRUE, serial: int = 1) -> Sample:
 def scenario(*, peers: bool) -> Sample:
     robots = tuple(RobotConfig(robot) for robot in ROBOTS)
     team = TeamConfig(name="t", team="t", robots=robots, peers=peers, centre=not peers)
-    return sample(ch.WORLD_CONFIG, "", configured("world", 0, 0, team))
+    return sample(ch.WORLD_CONFIG, "", announce_configuration("world", 0, 0, team))
 
 
 HONEST = [part for robot in ROBOTS for part in (final(robot), concluded(robot))]

@@ -25,7 +25,7 @@ from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.final_maps import scenario_in
 from tests.sim.logs import final_map, samples
@@ -37,7 +37,7 @@ LATE_S = 0.1
 def published(world: StressWorld, place: Path) -> list[Sample]:
     """The log of a data set's measurements, without the data set's truth, and a final map."""
     of = scenario_in(write(world, place))
-    node = WorldNode(streams_of(of), frozenset(), configured("world", 0, 0, of))
+    node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
         out += node.publish(0.0)
@@ -126,7 +126,7 @@ def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path)
     of = with_options(load(str(scenario_beside(tmp_path / "mine"))), dataset=tmp_path / "mine")
     *_, before = _time_warnings(streams_of(of))
     assert expected in before
-    node = WorldNode(streams_of(of), frozenset(), configured("world", 0, 0, of))
+    node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
         out += node.publish(0.0)

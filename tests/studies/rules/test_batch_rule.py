@@ -13,7 +13,7 @@ from teamslam.sim.studies.rules.batch_rule import taken_as_white
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, RobotConfig, Sensor
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.sim.reruns import messages, team_samples
 from tests.teams import config, published, stream
@@ -62,7 +62,7 @@ def heard(configs, **options):
     node = make_centre(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():
-        out += node.handle(configured(ch.robot_node(name), 0, 0, told), 0)
+        out += node.handle(announce_configuration(ch.robot_node(name), 0, 0, told), 0)
         for measurement in MEASUREMENTS[name]:
             out += node.handle(measurement, 0)
         out += node.handle(build.done(robot=name, measurements=len(MEASUREMENTS[name])), 0)

@@ -21,7 +21,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.digest import configured
+from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.teams import config, published, stream
 
@@ -34,7 +34,7 @@ LAST_WORDS = [build.done(robot=name, measurements=len(each)) for name, each in M
 
 
 def announced(name):
-    return configured(ch.robot_node(name), 0, 0, CONFIGS[name])
+    return announce_configuration(ch.robot_node(name), 0, 0, CONFIGS[name])
 
 
 def end(measurements=MEASUREMENTS):
