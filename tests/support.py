@@ -528,6 +528,7 @@ def examples() -> Iterator[m.Message]:
         state="recording",
         figures={"messages": 12.0},
         warnings=("slow disk",),
+        run="0123456789abcdef",
     )
     yield build.given_up(stamp_ns=9_000, node="robot/alpha", reason="it fell into the water")
     yield build.kept_request(channels=("final_map",), node="robot/alpha", run_ns=5_000_000_000)

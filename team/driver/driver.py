@@ -103,23 +103,29 @@ class Driver:
         saved = None if map is None else _read_map(Path(map), with_keys=keys is not None)
         path = Path(f"{robot}.stream" if file is None else file)
         try:
-            self._journal, said = j.open_journal(path, robot, round(1e9 * latency_s))
+            journal, said, left = j.open_journal(
+                path, robot, round(1e9 * latency_s), team, self._start
+            )
         except (j.JournalError, OSError) as error:
             raise DriverError(str(error)) from None
         if said:
-            _LOG.info("%s", said)
+            _LOG.log(logging.WARNING if journal.calls else logging.INFO, "%s", said)
+        if left:
+            warnings.warn(left, DriverWarning, stacklevel=2)
         self._odometer = Odometer(robot, self._bounds)
         self._incarnation = 0
-        self._again: int | None = None if self._journal.calls else -1
-        self._node = SourceNode(self._journal)
+        self._node = SourceNode(journal)
         self._node.on_message = on_message
         self._node.maps = () if saved is None else (saved,)
         self._link = Link(self._node, team=team, connect=connect, keys=keys, lock=self._lock)
         try:
-            self._link.open(0.0 if self._journal.calls else patience_s)
+            left = self._link.open(0.0 if journal.calls else patience_s)
         except (BusError, KeysError) as error:
             self._journal.close()
             raise DriverError(str(error)) from None
+        if left:
+            warnings.warn(left, DriverWarning, stacklevel=2)
+        self._again: int | None = None if self._journal.calls else -1
         self._closed = False
 
     def __enter__(self) -> Self:
@@ -376,6 +382,10 @@ class Driver:
         self._journal.close()
 
     # The stream and its file.
+
+    @property
+    def _journal(self) -> j.Journal:
+        return self._node.journal
 
     def _check_open(self) -> None:
         if self._closed:

@@ -82,6 +82,10 @@ _LONGEST = 9
 """Length of the longest number in a head [bytes]."""
 
 
+Start = tuple[bytes, bytes]
+"""Pose and covariance of an `InitialPose`; empty: unknown."""
+
+
 class JournalError(RuntimeError):
     """A driver's file cannot be used; the text names file, reason and remedy."""
 
@@ -93,7 +97,9 @@ class Journal:
     incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
     offsets of all records but marks, in order of arrival. driven_ns, pose: end of the last odometry
     interval, and the odometry pose there. cut: number of bytes behind the last whole record;
-    is_damaged: they are no incomplete record. clock: the wall clock at the last mark.
+    is_damaged: they are no incomplete record. clock: the wall clock at the last mark. team: "" in
+    files of earlier versions. start: pose and covariance of the first incarnation, as in an
+    `InitialPose`. run: the team's run that receives the stream; "": none is known.
     """
 
     path: Path
@@ -109,6 +115,9 @@ class Journal:
     cut: int = 0
     is_damaged: bool = False
     clock: dict[str, str] = field(default_factory=dict)
+    team: str = ""
+    start: Start = (b"", b"")
+    run: str = ""
     _numbered: dict[int, "array[int]"] = field(default_factory=dict)
     _sorter: Sorter = field(default_factory=lambda: Sorter(0))
     _file: int = -1
@@ -142,6 +151,11 @@ class Journal:
         """Return the payload of the record at this offset."""
         length = _HEAD.unpack(os.pread(self._file, _HEAD.size, at))[0]
         return os.pread(self._file, length, at + _HEAD.size)
+
+    @property
+    def latency_ns(self) -> int:
+        """Longest delay of a measurement behind newer ones [ns]."""
+        return self._sorter.latency_ns
 
     def too_late(self, stamp_ns: int, kind: int) -> bool:
         """Return whether a measurement of a later place already has its number."""
@@ -185,13 +199,24 @@ class Journal:
             "incarnation": incarnation,
             "delivered": delivered,
             "clock": wall_clock(),
+            "team": self.team,
+            "start": self.start,
         }
         self.append(MARK, 0, msgpack.packb(said))
+
+    def mark_run(self, run: str) -> None:
+        """Append the run that receives the stream; waiting measurements stay so."""
+        self.append(MARK, 0, msgpack.packb({"run": run}))
 
     def _take(self, at: int, kind: int, stamp_ns: int, payload: bytes) -> None:
         with self._lock:
             if kind == MARK:
                 said = msgpack.unpackb(payload)
+                if "run" in said:
+                    self.run = said["run"]
+                    return
+                if "team" in said:
+                    self.team, self.start = said["team"], tuple(said["start"])
                 self.state, self.delivered = said["state"], said["delivered"]
                 self.clock = said.get("clock", {})
                 if self.incarnation:
@@ -261,38 +286,88 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
     return _POSE.pack(*pose)
 
 
-def open_journal(path: Path, robot: str, latency_ns: int) -> tuple[Journal, str]:
-    """Open a robot's journal for appending; return it with a description of its contents.
+def open_journal(
+    path: Path, robot: str, latency_ns: int, team: str = "", start: Start = (b"", b"")
+) -> tuple[Journal, str, str]:
+    """Open a robot's journal for appending; return it with a description of the stream that it
+    continues or has delivered, and one of a stream that is set aside undelivered.
 
-    A delivered stream, or one that has not grown for OLD_S, is moved aside; the new one begins with
-    the next incarnation. Raises JournalError for a file of another robot, of no driver, or in use.
+    A stream that is delivered, that has not grown for OLD_S, or that is of another team or start is
+    set aside (`replace_journal`). Raises JournalError for a file of another robot, of no driver, or in
+    use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _lock_file(path, robot)
-    age_s = time.time() - os.fstat(journal._file).st_mtime
+    written_s = os.fstat(journal._file).st_mtime
+    age_s = time.time() - written_s
     try:
         if not _read_whole(journal):
             left = f"{path}: {journal.cut} bytes of a beginning are left out" * bool(journal.cut)
             journal.first_incarnation = _first_after(_newest_aside(path), robot)
-            return _begin_file(journal, latency_ns), left
-        if not journal.delivered and (age_s < OLD_S or was_set_since(journal.clock)):
+            return _begin_file(journal, latency_ns, team, start), left, ""
+        is_old = age_s >= OLD_S and not was_set_since(journal.clock)
+        why = _why_not_continued(journal, team, start, age_s if is_old else 0.0)
+        if not why:
             left = journal.cut_off()
-            other = journal._sorter.latency_ns != latency_ns
-            if other or journal.state == "left":
+            is_other = (journal.team, journal.start) != (team, start)
+            journal.team, journal.start = team, start
+            if is_other or journal.latency_ns != latency_ns or journal.state == "left":
                 journal.mark("open", latency_ns=latency_ns)
-            count = journal.count(journal.incarnation)
-            said = f"{path}: goes on after measurement {count - 1}, {age_s:.0f} s old{left}"
-            return journal, said
+            said = ""
+            if journal.calls:
+                said = (
+                    f"continues {path} of {time.strftime('%H:%M', time.localtime(written_s))}, "
+                    f"{journal.count(journal.incarnation)} measurements, {_name_start(start)}{left}"
+                )
+            return journal, said, ""
     except BaseException:
         journal.close()
         raise
+    delivered = journal.delivered
+    fresh, said = replace_journal(journal, why, latency_ns, team, start)
+    return (fresh, said, "") if delivered else (fresh, "", said)
+
+
+def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) -> str:
+    """Reason not to continue the stream of an open file; empty: it is continued.
+
+    A start matters in a stream with measurements, a team that an earlier version did not store in
+    none. age_s: of a stream that is too old, else 0.
+    """
+    if journal.delivered:
+        return "has ended"
+    if age_s:
+        return f"is {age_s / 3600.0:.1f} h old, and not delivered"
+    if not (journal.calls and journal.team):
+        return ""
+    if journal.team != team:
+        return f"is of team {journal.team}, and this driver of team {team}"
+    if journal.start != start:
+        return (
+            f"begins with {_name_start(journal.start)}, and this driver with {_name_start(start)}"
+        )
+    return ""
+
+
+def replace_journal(
+    journal: Journal, why: str, latency_ns: int, team: str, start: Start
+) -> tuple[Journal, str]:
+    """Rename the file of an open journal, and begin an empty one with the next incarnation; return
+    it with a description. why: the reason, after "its stream".
+    """
     journal.close()
-    aside = _set_aside(path)
-    why = "has ended" if journal.delivered else f"is {age_s / 3600.0:.1f} h old, and not delivered"
-    fresh = _lock_file(path, robot)
+    aside = _set_aside(journal.path)
+    fresh = _lock_file(journal.path, journal.robot)
     fresh.first_incarnation = journal.next_incarnation
-    said = f"{path}: its stream {why}: it is now {aside}, and a new one begins"
-    return _begin_file(fresh, latency_ns), said
+    said = f"{journal.path}: its stream {why}: it is now {aside}, and a new one begins"
+    return _begin_file(fresh, latency_ns, team, start), said
+
+
+def _name_start(start: Start) -> str:
+    if not start[0]:
+        return "no start"
+    pose = ", ".join(f"{value:g}" for value in _POSE.unpack(start[0]))
+    return f"start ({pose})" + " and a covariance" * bool(start[1])
 
 
 def _read_whole(journal: Journal) -> bool:
@@ -316,11 +391,12 @@ def _first_after(aside: Path | None, robot: str) -> int:
     return FIRST_INCARNATION
 
 
-def _begin_file(journal: Journal, latency_ns: int) -> Journal:
+def _begin_file(journal: Journal, latency_ns: int, team: str, start: Start) -> Journal:
     head = MAGIC + msgpack.packb({"robot": journal.robot, "incarnation": journal.first_incarnation})
     os.ftruncate(journal._file, 0)
     journal._write(head, 0)
     journal._size = len(head)
+    journal.team, journal.start = team, start
     journal.mark("open", latency_ns=latency_ns)
     return journal
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from teamslam.team.door import MOST_LIVES
+from teamslam.team.driver.journal import JournalError, replace_journal
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.end_query import EndQuery
 from teamslam.team.keys.credentials import credentials_of
@@ -29,6 +30,10 @@ SECOND_PATIENCE_S = 6.0
 """Wait [s] for another driver's token: that of a cut-off driver lasts for its lease of 5 s."""
 HEAR_S = 0.5
 """Time [s] within which a present robot's process reports its progress."""
+HEAR_RUN_S = 3.0
+"""Longest time [s] until a present recorder's status names the run, for a stream of some run."""
+FIRST_S = 10.0
+"""Longest time [s] for a first attempt that reaches the router."""
 LAST_S = 5.0
 """Longest time [s] for the remaining publications at the end."""
 _LOG = logging.getLogger("teamslam")
@@ -56,6 +61,9 @@ class Link:
         self._lock = lock
         self._leaving = threading.Event()
         self._up = threading.Event()
+        self._tried = threading.Event()
+        self._is_open = False
+        self._left = ""
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
         self._failure: Exception | None = None
@@ -63,10 +71,12 @@ class Link:
         self._attempt_s = ATTEMPT_S
         self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
 
-    def open(self, patience_s: float) -> None:
+    def open(self, patience_s: float) -> str:
         """Start the thread and wait for the router; raises BusError or KeysError after patience_s.
 
-        patience_s = 0: return at once, and log the first failure.
+        patience_s = 0: log the first failure; a stream that a run has received waits for the first
+        attempt, since another run does not continue it. Returns a description of a stream that is
+        set aside so, or an empty text.
         """
         self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S
@@ -77,6 +87,11 @@ class Link:
                 self.close()
                 raise self._trouble or BusError(f"no router answers at {self._connect}")
             self._up.wait(0.02)
+        if self._node.journal.run:
+            self._tried.wait(FIRST_S)
+        with self._lock:
+            self._is_open = True
+        return self._left
 
     def close(self) -> None:
         """Publish the remaining messages and stop the thread."""
@@ -119,15 +134,22 @@ class Link:
             try:
                 self._connected()
                 self._trouble = None
+            except JournalError as error:  # the driver's next call raises it
+                _LOG.error("%s", error)
+                self._trouble = self._failure = error
+                return
             except (BusError, KeysError) as error:
                 if self._up.is_set() or self._unheard:
                     _LOG.warning("%s", error)
                 self._unheard = False
                 self._trouble = error
+                self._tried.set()
                 self._leaving.wait(AGAIN_S)
             except Exception as error:  # the driver's next call raises it
                 self._trouble = self._failure = error
                 raise
+            finally:
+                self._tried.set()
 
     def _connected(self) -> None:
         own = None
@@ -141,6 +163,7 @@ class Link:
             own_ends = (ch.FINAL_MAP, ch.TEAM_FINAL)  # without a centre its own robot's
             shell.end_query = EndQuery(bus, self._name, own_ends, self._node.journal.robot)
             self._node.alive.clear()
+            self._node.run = ""
             for channel in self._node.listens:
                 bus.subscribe(channel, self._node.journal.robot)
             if self._node.on_message is not None:
@@ -148,10 +171,13 @@ class Link:
                     bus.subscribe(channel, self._node.journal.robot)
                 bus.subscribe(ch.STATUS, ch.robot_node(self._node.journal.robot))
             bus.subscribe(ch.HEAD)
+            bus.subscribe(ch.STATUS, "recorder")
             bus.subscribe(ch.SET_SUMMARY, ch.robot_node(self._node.journal.robot))
             bus.watch_alive()
             shell.answer(ch.MEASUREMENTS, self._node.journal.robot, self._node.measurements)
             self._check_progress(shell, bus)
+            if not self._up.is_set():
+                self._check_run()
             others = [] if self._node.alive else bus.other_teams()
             if others:
                 _LOG.warning(
@@ -160,6 +186,7 @@ class Link:
                 )  # fmt: skip
             shell.begin()
             self._up.set()
+            self._tried.set()
             self._trouble, self._attempt_s = None, ATTEMPT_S
             self._serve(shell, bus)
 
@@ -174,10 +201,15 @@ class Link:
 
     def _check_progress(self, shell: Shell, bus: ZenohBus) -> None:
         """Compare the robot's progress with the file: more means that it had another file."""
-        until = time.monotonic() + HEAR_S
+        began = time.monotonic()
         journal = self._node.journal
         self._node.listening = True
-        while time.monotonic() < until:
+        while (passed_s := time.monotonic() - began) < HEAR_S or (
+            passed_s < HEAR_RUN_S
+            and journal.run
+            and "recorder" in self._node.alive
+            and not self._node.run
+        ):
             shell.take(bus.receive(0.05))
         self._node.listening = False
         incarnation, measurements = self._node.delivered
@@ -204,6 +236,35 @@ class Link:
             )
         _LOG.warning("%s", self._node.warnings[-1])
 
+    def _check_run(self) -> None:
+        """Set the stream of an earlier run aside, of which this run's robot has nothing.
+
+        Raises JournalError if the program has continued it before the team was reached.
+        """
+        journal, run = self._node.journal, self._node.run
+        is_earlier = journal.run and run not in ("", journal.run)
+        if not is_earlier or not journal.calls or self._node.delivered > (0, 0):
+            return
+        with self._lock:
+            if self._is_open:
+                raise JournalError(
+                    f"{journal.path} is of an earlier run of team {self._team}, and was continued "
+                    "before this run was reached"
+                )
+            fresh, self._left = replace_journal(
+                journal,
+                f"is of an earlier run of team {self._team}",
+                journal.latency_ns,
+                journal.team,
+                journal.start,
+            )
+            self._node.replace(fresh)
+
+    def _note_run(self) -> None:
+        if self._node.run not in ("", self._node.journal.run):
+            with self._lock:
+                self._node.journal.mark_run(self._node.run)
+
     def _serve(self, shell: Shell, bus: ZenohBus) -> None:
         head_due, last, said = 0.0, 0.0, 0
         while True:
@@ -214,6 +275,7 @@ class Link:
                 head_due = now + HEAD_S
             shell.publish(out)
             shell.take(bus.receive(0.0 if out else PACE_S))
+            self._note_run()
             if self._node.ordered_to_end and self._node.journal.state == "open":
                 with self._lock:
                     self._node.journal.mark("ended")

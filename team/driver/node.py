@@ -55,9 +55,9 @@ class SourceNode:
         self._robot = self.journal.robot
         self.alive: set[str] = set()
         """The nodes of the team that are present."""
-        incarnations = self.journal.incarnations
-        self._incarnation = incarnations[0] if incarnations else 0
-        self._published = self.journal.count(self._incarnation)
+        self.run = ""
+        """The team's run by its recorder; empty: none is known."""
+        self._read_journal()
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
@@ -68,6 +68,16 @@ class SourceNode:
         """Saved maps of earlier days, for the team's set."""
         self.listening = True
         """True until the robot's earlier progress has been received."""
+
+    def replace(self, journal: Journal) -> None:
+        """Publish another journal from its beginning."""
+        self.journal = journal
+        self._read_journal()
+
+    def _read_journal(self) -> None:
+        incarnations = self.journal.incarnations
+        self._incarnation = incarnations[0] if incarnations else 0
+        self._published = self.journal.count(self._incarnation)
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
@@ -80,7 +90,9 @@ class SourceNode:
         ch.TEAM_END,
         ch.FINAL_MAP,
     )
-    """Channels of this robot or the team; the link adds all heads and the robot's set summary."""
+    """Channels of this robot or the team; the link adds all heads, the robot's set summary and the
+    recorder's status.
+    """
 
     results: ClassVar[tuple[ch.Channel, ...]] = (
         ch.FUSED_MAP,
@@ -181,6 +193,9 @@ class SourceNode:
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
         """Update the state by progress, liveliness, orders and the final map."""
+        if isinstance(message, m.Status) and message.node == "recorder":
+            self.run = message.run or self.run
+            return []
         if self.on_message is not None:
             self.on_message(message)
         self._update(message)

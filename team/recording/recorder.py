@@ -44,6 +44,7 @@ class Recorder:
 
     def __init__(self, path: str | Path, team: str, metadata: Mapping[str, str]) -> None:
         self.path = Path(path)
+        self.metadata = {**metadata, "team": team}
         self._prefix = f"team/{team}/"
         self._queue: SimpleQueue[Sample | None] = SimpleQueue()
         self._channels: dict[tuple[str, str], int] = {}
@@ -56,7 +57,7 @@ class Recorder:
         """Number of samples dropped beyond MOST_CHANNELS keys."""
         try:
             self._file: IO[bytes] = self.path.open("xb")
-            self._writer = _open_writer(self._file, {**metadata, "team": team})
+            self._writer = _open_writer(self._file, self.metadata)
         except FileExistsError:
             raise RecorderError(f"{self.path} exists: choose another name or remove it") from None
         except OSError as error:

@@ -10,6 +10,7 @@ import msgspec
 
 from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
+from teamslam.team.recording.part_files import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
 from teamslam.team.wire.channels import (
@@ -104,6 +105,7 @@ class RecordLoop:
         self._are_peers = bool(peers)
         self._unconcluded = set(peers)
         self._recorder: Recorder | None = recorder
+        self._run = recorder.metadata.get(LOG_ID, "")
         self._more = more
         self._failure: RecorderError | None = None
         self._retry_s = 0.0
@@ -330,6 +332,7 @@ class RecordLoop:
             state=state,
             figures=figures,
             warnings=(*failure, *absent, *lacking),
+            run=self._run,
         )
         self._bus.publish(Outgoing(STATUS, NODE, status))
         self._write([_own(STATUS.key(NODE), status, self._statuses)])

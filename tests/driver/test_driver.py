@@ -314,6 +314,110 @@ def test_a_robot_gets_all_from_a_driver_that_was_killed_and_the_driver_waits_for
         robot.bus.close()
 
 
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"team": "bench"}, "is of team bench, and this driver of team lab"),
+        (
+            {"start": (5.0, 5.0, 1.0)},
+            r"begins with start \(5, 5, 1\), and this driver with start \(0, -3, 0\)",
+        ),
+        ({"start": None}, r"begins with no start, and this driver with start \(0, -3, 0\)"),
+    ],
+)
+def test_a_stream_of_another_team_or_start_is_not_delivered_to_this_one(tmp_path, changed, why):
+    own = {"team": "lab", "start": (0.0, -3.0, 0.0)}
+    common = {
+        "file": tmp_path / "r1.stream",
+        "connect": "tcp/127.0.0.1:1",
+        "patience_s": 0.0,
+        "latency_s": 0.0,
+    }
+    bench = Driver("r1", **{**common, **own, **changed})
+    drive(bench, range(20))
+    bench.close()
+    with pytest.warns(DriverWarning, match=f"{why}: it is now .*r1.stream.1"):
+        robot = Driver("r1", **common, **own)
+    assert robot.last_time is None
+    drive(robot, range(3))
+    begun = messages(robot)
+    assert begun[0].incarnation == 2
+    assert floats(begun[0].pose, "pose").tolist() == [0.0, -3.0, 0.0]
+    robot.close()
+    assert robot.path.with_name("r1.stream.1").exists()
+
+
+def test_a_driver_that_continues_a_stream_names_its_time_size_and_start(alone, caplog):
+    robot = alone(start=(5.0, 5.0, 1.0))
+    drive(robot, range(20))
+    count = len(messages(robot))
+    robot.close()
+    alone(start=(5.0, 5.0, 1.0)).close()
+    said = rf"continues \S*r1.stream of \d\d:\d\d, {count} measurements, start \(5, 5, 1\)"
+    assert re.search(said, caplog.text)
+    assert [each.levelname for each in caplog.records if "continues" in each.message] == ["WARNING"]
+
+
+@pytest.mark.parametrize("second", ["first", "second"])
+def test_a_stream_that_an_earlier_run_received_is_not_delivered_to_the_next(tmp_path, second):
+    options = {"team": "lab", "file": tmp_path / "r1.stream", "start": (0.0, 0.0, 0.0)}
+    with router() as endpoint, ZenohBus("lab", endpoint) as bus:
+        bus.declare_alive("recorder")
+
+        def records(run):
+            status = build.status(node="recorder", state="recording", figures={}, run=run)
+            bus.publish(Outgoing(ch.STATUS, "recorder", status))
+
+        records("first")
+        killed = Driver("r1", connect=endpoint, **options)
+        drive(killed, range(20))
+        wait_until(lambda: killed._journal.run == "first")
+        count = len(killed._journal.calls)
+        killed._link._leaving.set()
+        killed._link._thread.join()
+        killed._journal.close()
+        records(second)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            robot = Driver("r1", connect=endpoint, **options)
+        told = [str(each.message) for each in caught if each.category is DriverWarning]
+        if second == "first":  # the driver alone was killed
+            assert not told
+            assert len(robot._journal.calls) == count
+        else:
+            assert ["is of an earlier run of team lab: it is now" in each for each in told] == [
+                True
+            ]
+            assert robot.last_time is None
+            drive(robot, range(5))
+            assert messages(robot)[0].incarnation == 2
+            wait_until(lambda: robot._journal.run == "second")
+        assert robot.path.with_name("r1.stream.1").exists() == (second == "second")
+        robot.close()
+
+
+def test_a_stream_that_is_continued_where_no_team_is_does_not_enter_a_later_run(tmp_path):
+    options = {"team": "lab", "file": tmp_path / "r1.stream"}
+    first = Driver("r1", connect="tcp/127.0.0.1:1", patience_s=0.0, **options)
+    drive(first, range(5))
+    first._journal.mark_run("first")
+    first.close()
+    with router() as endpoint:
+        robot = Driver("r1", connect="tcp/127.0.0.1:1", **options)
+        drive(robot, range(5, 8))
+        robot._link._connect = endpoint  # the run begins where the driver is
+        with ZenohBus("lab", endpoint) as bus:
+            bus.declare_alive("recorder")
+            status = build.status(node="recorder", state="recording", figures={}, run="second")
+            bus.publish(Outgoing(ch.STATUS, "recorder", status))
+            wait_until(lambda: robot._link.failure is not None)
+            with pytest.raises(DriverError, match=r"of an earlier run of team lab.*start it again"):
+                drive(robot, range(8, 9))
+            robot.close()
+            with pytest.warns(DriverWarning, match="is of an earlier run of team lab: it is now"):
+                Driver("r1", connect=endpoint, **options).close()
+
+
 def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):
     driver = Driver("r1", team="lab", file=tmp_path / "r1.stream", patience_s=0.0)
     drive(driver, range(5))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from teamslam.team.recording import recorder as recorder_module
 from teamslam.team.recording.check import holes
+from teamslam.team.recording.parts import next_part
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.shell import RecordLoop, record, replay, schedule
@@ -216,6 +217,19 @@ def test_what_a_restarted_world_publishes_again_is_written_once(path):
     assert messages_of(list(open_log(path).samples()), c.ODOMETRY) == [
         odometry(i) for i in range(4)
     ]
+
+
+def test_the_recorder_names_the_run_by_its_log_also_after_a_restart(tmp_path):
+    runs = []
+    for name in ("log.mcap", "log.mcap", "other.mcap"):
+        recorder, inventory = next_part(tmp_path / name, "t", {"scenario": "s"})
+        with recorder:
+            runs.append(
+                RecordLoop(MemoryBus(MemoryNetwork()), recorder, (), inventory).status().run
+            )
+    first, restarted, other = runs
+    assert first == restarted == open_log(tmp_path / "log.mcap").metadata["log_id"]
+    assert other not in ("", first)
 
 
 def flows(source: ZenohBus, path: Path) -> None:

@@ -41,12 +41,16 @@ class Progress(Message, frozen=True, kw_only=True, tag="progress/1"):
 
 
 class Status(Message, frozen=True, kw_only=True, tag="status/1"):
-    """State, figures and warnings of a node, for people."""
+    """State, figures and warnings of a node, for people.
+
+    run: id of the recorder's log, which names the run; empty from other nodes.
+    """
 
     node: Text
     state: Text
     figures: dict[str, Real]
     warnings: tuple[Text, ...] = ()
+    run: Text = ""
 
 
 class Fault(Message, frozen=True, kw_only=True, tag="fault/1"):
