@@ -293,8 +293,8 @@ def open_journal(
     continues or has delivered, and one of a stream that is set aside undelivered.
 
     A stream that is delivered, that has not grown for OLD_S, or that is of another team or start is
-    set aside (`replace_journal`). Raises JournalError for a file of another robot, of no driver, or in
-    use.
+    set aside (`replace_journal`). Raises JournalError for a file of another robot, of no driver, or
+    in use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _lock_file(path, robot)
