@@ -185,7 +185,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
 
 
 def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
-    """Decode a sample as `opened` does; None if it is invalid or of no channel."""
+    """Decode a sample; None if it is invalid or of no channel."""
     try:
         return opened(sample)
     except WireError:
@@ -193,13 +193,13 @@ def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
 
 
 def open_printable(sample: Sample) -> tuple[Channel, str, Message]:
-    """Decode a sample as `opened` does, with printable texts."""
+    """Decode a sample, with printable texts."""
     channel, name, message = opened(sample)
     return channel, name, make_printable(message) if isinstance(message, _IN_WORDS) else message
 
 
 def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
-    """Decode the valid samples as `open_printable` does, and leave out the others."""
+    """Decode the valid samples, with printable texts, and leave out the others."""
     for sample in samples:
         try:
             yield open_printable(sample)
@@ -406,11 +406,11 @@ class MemoryBus:
                 self._arrived.extend(sample for source, sample in stored if source is not self)
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return an empty table: no sample is lost in memory."""
+        """Return nothing: no sample is lost in memory."""
         return {}
 
     def find_awaited(self) -> set[str]:
-        """Return an empty set: no sample is lost in memory."""
+        """Return nothing: no sample is lost in memory."""
         return set()
 
     def publish_totals(self) -> Tally | None:

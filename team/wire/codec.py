@@ -143,7 +143,7 @@ _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
 
 
 def read_tag(payload: bytes) -> str:
-    """The tag with which a message begins; raises `WireError` where there is none."""
+    """Return the tag of a message; raises `WireError` where there is none."""
     count, at = _group_at(payload)
     if count > MOST_VALUES:
         raise WireError("too large", f"an array of {count} values, {MOST_VALUES} at most")
@@ -165,10 +165,7 @@ def read_tag(payload: bytes) -> str:
 
 
 def check_structure(payload: bytes) -> None:
-    """Raise `WireError` where a payload has more values, or nests deeper, than any message.
-
-    Bytes behind the message are not looked at.
-    """
+    """Raise `WireError` where a payload has more values, or nests deeper, than any message."""
     at = values = 0
     left = [1]
     while left:

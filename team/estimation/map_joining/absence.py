@@ -1,9 +1,9 @@
 """Landmarks of a saved map that today's robots should have observed and have not.
 
 The probability p(d) that a submap observes a landmark at distance d from its path is learnt from
-today's own landmarks, by their distance, and bounded by that of a window beside it
-(`visibility.OVERLOOKED`). A landmark at distances d_s from the paths of today's submaps is expected
-Σ p(d_s) times, and missed by all of them with probability Π (1 − p(d_s)).
+today's landmarks, and at most that of a window beside it (`visibility.OVERLOOKED`). A landmark at
+distances d_s from the paths is expected Σ p(d_s) times, and missed by all with probability Π (1 −
+p(d_s)).
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ BINS = 8
 REACH = 0.95
 """Share of today's observations that are nearer than the farthest distance."""
 STEPS = 4
-"""Points of a path between two poses from which its distance is measured."""
+"""Points of a path between two poses."""
 
 
 class Absence(NamedTuple):
-    """How often a landmark was expected to be observed, and the probability to miss it always."""
+    """Expected number of observations of a landmark, and the probability to miss it always."""
 
     expected: float
     chance: float
@@ -56,7 +56,7 @@ def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
 
 
 def _path(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
-    """Positions along a submap's path: its poses, and points between them."""
+    """Interpolate positions along a submap's path."""
     poses = len(submap.contribution.local.node_stamps)
     start, end, *between = submap.nodes[: 2 + poses].tolist()
     at = island.graph.offset[[start, *between, end]]

@@ -1,15 +1,15 @@
 """Seams: places where a robot's view changes at once although its odometry measures no motion.
 
 The landmarks of the last scans before a place and of the first scans behind it are seen from about
-one pose. Where a robot was carried off, or its odometry slips by metres, all of them are replaced:
-each landmark of one side in the view of the other one is absent there. The evidence for a seam is
+one pose. Where a robot was carried off, or its odometry slips by metres, all of them are replaced.
+The evidence for a seam, the log-likelihood ratio of a robot elsewhere against one that overlooks
+landmarks, is
 
-    ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there),
+  ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
-the log-likelihood ratio of a robot elsewhere against one that overlooks landmarks; a landmark may
-be another one within the gate of association. The view of a side is the sector of its landmarks, by
-direction and to the greatest distance of both sides. A seam is between two submaps, or inside one,
-which then is spoilt. Landmarks with identities have a test of their own (`central.carried_off`).
+The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam is
+between two submaps, or inside one, which then is spoilt. Landmarks with identities have a test of
+their own (`central.carried_off`).
 """
 
 import math
@@ -26,17 +26,17 @@ from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float, Int64
 
 SCANS = 3
-"""Number of scans with detections of a side."""
+"""Scans with detections of a side."""
 LEAST_SCANS = 2 * SCANS
-"""Least number of scans of a submap: with fewer the last ones are not beside its end."""
+"""Least scans of a submap: with fewer the last ones are not beside its end."""
 LEAST_COUNT = 2
-"""Least number of measurements of a landmark: single ones may be clutter."""
+"""Least measurements of a landmark: single ones may be clutter."""
 ABSENT, PRESENT = 1.5, 2.0
 """−ln P(overlooked), and ln of P(seen) over P(another landmark is within the gate)."""
 EVIDENCE = 6.0
 """Least evidence of a seam: four absent landmarks."""
 LEAST_BEFORE = 2
-"""Least number of submaps of a stream or part before a seam."""
+"""Least submaps of a stream or part before a seam."""
 AROUND = math.pi
 """Gap between the directions of neighbouring landmarks above which a view does not close round."""
 
@@ -47,7 +47,7 @@ class Seam(NamedTuple):
     """A place at which a stream is cut.
 
     before, after: numbers of the last submap before it and of the first one behind it; one between
-    is spoilt. begin_ns, end_ns: the end of the former and the beginning of the latter. evidence:
+    is spoilt. begin_ns, end_ns: end of the former and beginning of the latter. evidence:
     log-likelihood ratio.
     """
 
@@ -64,8 +64,8 @@ def find_seam(
 ) -> Seam | None:
     """Find a seam of at least this evidence before a submap of a stream, or inside it.
 
-    A stream or part must have LEAST_BEFORE submaps before it: a sensor whose views often change at
-    once shows no seams.
+    With fewer than LEAST_BEFORE submaps before it none is found: a sensor whose views often change
+    at once shows no seams.
     """
     if sequence - first_of(stream) < LEAST_BEFORE:
         return None
@@ -93,9 +93,7 @@ def find_seam(
 
 
 def _compare_inside(island: Island, submap: Joined) -> float:
-    """Compare the scans before and behind each scan of a submap, SCANS or more from its ends;
-    return the most evidence.
-    """
+    """Return the most evidence of a seam at a scan SCANS or more from the submap's ends."""
     scans = _count_scans(submap)
     found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):
@@ -110,7 +108,7 @@ def _count_scans(submap: Joined) -> int:
 
 
 class _Side(NamedTuple):
-    """The nodes of the landmarks in the scans beside a place, and in all scans of that side."""
+    """Nodes of the landmarks in the scans beside a place, and in all scans of that side."""
 
     beside: Indices
     all: Indices
@@ -121,7 +119,6 @@ class _Side(NamedTuple):
 
 
 def _seen(submap: Joined, scans: slice) -> Indices:
-    """Return the nodes of the unnamed landmarks in some scans of a submap."""
     local = submap.contribution.local
     unnamed = local.unnamed
     seen = unnamed.seen[:, scans].any(axis=1) & (unnamed.counts >= LEAST_COUNT)
@@ -130,7 +127,6 @@ def _seen(submap: Joined, scans: slice) -> Indices:
 
 
 def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2"]:
-    """Interpolate the robot's place between the start and the end of a submap."""
     start, end = (island.state[island.graph.offset[node] :][:2] for node in submap.nodes[:2])
     return np.asarray((1.0 - share) * start + share * end)
 
@@ -138,7 +134,7 @@ def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2
 def _compare_sides(
     island: Island, before: _Side, after: _Side, place: Float[np.ndarray, "2"]
 ) -> float:
-    """Compute the evidence of a seam between two sides; two common landmarks settle it: none."""
+    """Compute the evidence of a seam between two sides; none with two common landmarks."""
     one, two = before.beside, after.beside
     if not len(one) or not len(two) or len(np.intersect1d(before.all, after.all)) > 1:
         return 0.0

@@ -1,14 +1,12 @@
-"""The observations of condensed submaps for association: landmarks seen together, viewed places.
+"""Observations of condensed submaps for association: landmarks seen together, viewed places.
 
-Association needs the landmarks of a submap, which of them a keyframe saw together, and thereby the
-viewed area; the quadratic has none of it. Only the newest MOST submaps of each landmark are stored,
-whole: their number depends on the landmarks, not on the duration of the run, and counts of submaps
-end there. Of older ones the pairs of landmarks that they kept apart remain.
+Only the newest MOST submaps of each landmark are stored, whole, so their number depends on the
+landmarks, not on the duration of the run. Of older ones the pairs of landmarks that they kept apart
+remain.
 
-False detections create landmarks that would slow a team down for good. A landmark of n < MOST
-submaps is dropped when every landmark of MOST or more, that was observed with it when it was last
-observed, has been observed by MOST n submaps since: fewer than one in MOST of the submaps that look
-there found it. A real landmark there is created anew when it is observed.
+False detections create landmarks that would slow a team down. A landmark of n < MOST submaps is
+dropped when every landmark of MOST or more, observed with it when it was last observed, has been
+observed by MOST n submaps since.
 """
 
 from collections.abc import Sequence
@@ -23,7 +21,7 @@ from teamslam.team.shapes import Bool, Int64
 Indices = Int64[np.ndarray, " _"]
 
 MOST = 8
-"""Number of newest condensed submaps stored for each landmark."""
+"""Newest condensed submaps stored for each landmark."""
 
 
 NO_COUNTS: Indices = np.zeros(0, np.int64)
@@ -32,7 +30,7 @@ NO_COUNTS: Indices = np.zeros(0, np.int64)
 class Observed(NamedTuple):
     """A submap, and the node of each of its landmarks; −1 for a dropped one.
 
-    counts: number of condensed submaps with each landmark, this one included; none if not
+    counts: number of condensed submaps with each landmark, this one included; empty if not
     condensed.
     """
 
@@ -42,7 +40,7 @@ class Observed(NamedTuple):
 
     @property
     def known(self) -> Indices:
-        """The nodes of its landmarks without the dropped ones."""
+        """Nodes of its landmarks without the dropped ones."""
         return self.landmarks[self.landmarks >= 0]
 
 

@@ -27,7 +27,7 @@ class MapEstimate(Message, frozen=True, kw_only=True, tag="map/1"):
     means: Floats
     covariance: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_landmarks(self.ids, self.means, self.covariance, joint=self.joint)
 
 
@@ -49,7 +49,7 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
     frame: Text = ""
     in_team_frame: bool = True
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.pose, "pose", 3)
         check_pose_covariance(self.covariance, "covariance")
 
@@ -61,7 +61,7 @@ class ParticleCloud(Message, frozen=True, kw_only=True, tag="particles/1"):
     poses: Floats
     weights: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.poses, "poses", 3 * len(floats(self.weights, "weights")))
         check_finite(self.weights, "weights")
 

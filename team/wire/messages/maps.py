@@ -204,7 +204,7 @@ class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
     diagnosis: tuple[Diagnosis, ...] = ()
     left_out: tuple[VersionEntry, ...] = ()
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         for each in self.memberships:
             n = len(ids(each.identities, "identities"))
             if not len(ids(each.sequences, "sequences")) == len(ids(each.locals, "locals")) == n:
@@ -246,7 +246,7 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     frame: Text = ""
     in_team_frame: bool = True
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_ascending(self.ids, "ids")
         n = 2 * len(ids(self.ids, "ids")) + 3 * self.in_team_frame
         if n == 0 and (self.mean or self.covariance):
@@ -274,7 +274,7 @@ class Trajectory(Message, frozen=True, kw_only=True, tag="trajectory/1"):
     start_covariance: Floats = b""
     crosses: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         k = len(stamps(self.stamps, "stamps"))
         if self.start or self.start_covariance or self.crosses:
             check_finite(self.start, "start", 3)
@@ -341,7 +341,7 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
         """Name of its member of the set."""
         return MAP + self.name
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         n = len(ids(self.ids, "ids"))
         if self.author == SURVEY:
             raise ValueError("wrong field: the name is that of the surveyed landmarks")

@@ -42,7 +42,7 @@ class InitialPose(Measurement, frozen=True, kw_only=True, tag="start/1"):
     pose: Floats
     covariance: Floats
 
-    def check(self) -> None:  # noqa: D102 - as in the base class
+    def check(self) -> None:
         if len(floats(self.pose, "pose")) not in (0, 3):
             raise ValueError("wrong length: pose has neither 0 nor 3 numbers")
         check_finite(self.pose, "pose")
@@ -72,7 +72,7 @@ class Increment(Measurement, frozen=True, kw_only=True, tag="increment/1"):
     increment: Floats
     covariance: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.increment, "increment", 3)
         if not abs(float(floats(self.increment, "increment")[2])) <= math.pi:
             raise ValueError("out of bounds: increment turns outside (−π, π]")
@@ -91,7 +91,7 @@ class Steering(Measurement, frozen=True, kw_only=True, tag="steering/1"):
     wheel_speed: Real
     steering: Real
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         if not abs(self.steering) < 0.5 * math.pi:
             raise ValueError("out of bounds: steering is not within a quarter turn")
 
@@ -108,7 +108,7 @@ class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1")
     bearings: Floats
     covariances: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_named(self.ids, "ids")
         n = len(ids(self.ids, "ids"))
         check_ranges(self.ranges, "ranges", n)
@@ -128,7 +128,7 @@ class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
     positions: Floats
     covariances: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_named(self.ids, "ids")
         n = len(ids(self.ids, "ids"))
         check_finite(self.positions, "positions", 2 * n)
@@ -155,7 +155,7 @@ class Detections(Measurement, frozen=True, kw_only=True, tag="detections/1"):
     signatures: Floats = b""
     classes: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         n = len(floats(self.ranges, "ranges"))
         check_ranges(self.ranges, "ranges")
         check_angles(self.bearings, "bearings", n)
@@ -173,7 +173,7 @@ class Sightings(Measurement, frozen=True, kw_only=True, tag="sightings/1"):
     ranges: Floats
     bearings: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_ranges(self.ranges, "ranges", len(self.teammates))
         check_angles(self.bearings, "bearings", len(self.teammates))
 
@@ -187,7 +187,7 @@ class Fix(Measurement, frozen=True, kw_only=True, tag="fix/1"):
     position: Floats
     covariance: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.position, "position", 2)
         if self.covariance:
             check_blocks(self.covariance, 1, "covariance")

@@ -90,7 +90,7 @@ class Tally(Message, frozen=True, kw_only=True, tag="tally/1"):
     keys: tuple[Text, ...]
     counts: tuple[Count, ...]
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         if len(self.keys) != len(self.counts):
             raise ValueError(f"{len(self.counts)} counts of {len(self.keys)} keys")
 

@@ -62,7 +62,7 @@ class Verdict(Message, frozen=True, kw_only=True, tag="verdict/1"):
     reason: Text
     withdrawn: bool = False
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         if self.judgement.first == self.judgement.second:
             raise ValueError("out of bounds: a verdict on one landmark and itself")
         if self.robot != self.judgement.first.robot:

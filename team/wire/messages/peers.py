@@ -44,7 +44,7 @@ class SetSummary(Message, frozen=True, kw_only=True, tag="set_summary/1"):
     holdings: tuple[Holding, ...]
     statements: tuple[Statements, ...]
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         for holding in self.holdings:
             ends = holding.sequences
             if len(ends) % 2 or any(a > b for a, b in zip(ends[::2], ends[1::2], strict=True)):
@@ -89,7 +89,7 @@ class Members(Message, frozen=True, kw_only=True, tag="members/1"):
     payloads: tuple[bytes, ...]
     signatures: tuple[bytes, ...]
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         if not len(self.keys) == len(self.payloads) == len(self.signatures):
             raise ValueError("wrong length: keys, payloads and signatures")
 

@@ -62,7 +62,7 @@ class Submap(Message, frozen=True, kw_only=True, tag="submap/1"):
     classes: Floats = b""
     curvature: bytes = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_ascending(self.ids, "ids")
         times = stamps(self.nodes, "nodes")
         n = 3 + 3 * len(times) + 2 * len(ids(self.ids, "ids"))
@@ -110,7 +110,7 @@ class Association(Message, frozen=True, kw_only=True, tag="association/1"):
     rows: Ids
     landmarks: Ids
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         detections = len(ids(self.landmarks, "landmarks"))
         check_counts(self.counts, len(stamps(self.stamps, "stamps")), detections)
         if len(ids(self.rows, "rows")) != detections:
@@ -142,7 +142,7 @@ class SightingFactor(Message, frozen=True, kw_only=True, tag="sighting_factor/1"
     measurements: tuple[Count, ...]
     point: Floats = b""
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.point, "point", 2 if self.point else 0)
         if self.teammate.startswith(MAP) and self.teammate != GNSS:
             raise ValueError("out of bounds: the teammate is a saved map")

@@ -12,7 +12,7 @@ class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):
     stamps: Stamps
     poses: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.poses, "poses", 3 * len(stamps(self.stamps, "stamps")))
 
 
@@ -22,7 +22,7 @@ class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"
     ids: Ids
     positions: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_ascending(self.ids, "ids")
         check_named(self.ids, "ids")
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
@@ -40,7 +40,7 @@ class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
     counts: Ids
     labels: Ids
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_counts(self.counts, len(stamps(self.stamps, "stamps")), len(self.labels) // 4)
         ids(self.labels, "labels")
 
@@ -59,7 +59,7 @@ class TruthPositions(Message, frozen=True, kw_only=True, tag="truth_positions/1"
     stamps: Stamps
     positions: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_finite(self.positions, "positions", 2 * len(stamps(self.stamps, "stamps")))
 
 
@@ -69,7 +69,7 @@ class KnownMap(Message, frozen=True, kw_only=True, tag="known_map/1"):
     ids: Ids
     positions: Floats
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         check_ascending(self.ids, "ids")
         check_named(self.ids, "ids")
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
@@ -86,7 +86,7 @@ class RadioPlan(Message, frozen=True, kw_only=True, tag="radio/1"):
     ends_ns: tuple[StampNs, ...]
     pairs: bytes
 
-    def check(self) -> None:  # noqa: D102
+    def check(self) -> None:
         n = len(self.robots)
         width = max((n * (n - 1) // 2 + 7) // 8, 1)
         if len(self.ends_ns) != n or not self.pairs or len(self.pairs) % width:
