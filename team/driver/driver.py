@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -167,12 +167,13 @@ class Driver:
         with self._lock:
             lasts_ns = self._until(stamp_ns, length_ns, "odometry")
             seconds = 1e-9 * (lasts_ns or 10**9)
-            self._odometer.judge((v * seconds, 0.0, w * seconds), lasts_ns or 10**9, "odometry",
-                                 stamp_ns)  # fmt: skip
-            told = None if lasts_ns is None else m.Odometry(
-                **self._head(stamp_ns), duration_ns=lasts_ns, forward=v, yaw_rate=w
-            )  # fmt: skip
-            self._drive(stamp_ns, told, (v * seconds, 0.0, w * seconds))
+            step = v * seconds, 0.0, w * seconds
+            self._odometer.judge(step, lasts_ns or 10**9, "odometry", stamp_ns)
+            interval = None
+            if lasts_ns is not None:
+                head = measurement_messages.head_of(self.robot, stamp_ns)
+                interval = m.Odometry(**head, duration_ns=lasts_ns, forward=v, yaw_rate=w)
+            self._drive(stamp_ns, interval, step)
 
     def odometry_increment(
         self,
@@ -191,11 +192,11 @@ class Driver:
         )
         with self._lock:
             lasts_ns = self._until(stamp_ns, length_ns, "odometry_increment")
-            told = None
+            interval = None
             if lasts_ns is not None:
                 self._odometer.judge(step, lasts_ns, "odometry_increment", stamp_ns)
-                told = self._increment(stamp_ns, lasts_ns, step, covariance)
-            self._drive(stamp_ns, told, step)
+                interval = self._increment(stamp_ns, lasts_ns, step, covariance)
+            self._drive(stamp_ns, interval, step)
 
     def odometry_pose(
         self,
@@ -215,17 +216,17 @@ class Driver:
         )
         with self._lock:
             lasts_ns = self._until(stamp_ns, None, "odometry_pose", longest_s=AWAY_S)
-            before, told, step = self._odometer.pose, None, (0.0, 0.0, 0.0)
+            before, interval, step = self._odometer.pose, None, (0.0, 0.0, 0.0)
             if lasts_ns is not None and before is None:  # by speeds before, or a stream anew
                 self._begin_anew(stamp_ns - lasts_ns, stamp_ns)
             elif lasts_ns is not None and before is not None:
                 step = self._bridge_reset(relative_pose(before, pose), lasts_ns, stamp_ns, pose)
                 self._odometer.judge(step, lasts_ns, "odometry_pose", stamp_ns)
-                told = self._increment(stamp_ns, lasts_ns, step, covariance)
+                interval = self._increment(stamp_ns, lasts_ns, step, covariance)
             if not self._incarnation:
                 self._begin(stamp_ns, known=True)
             self._put(j.POSE, stamp_ns, j.pose_payload(pose))
-            self._drive(stamp_ns, told, step, pose)
+            self._drive(stamp_ns, interval, step, pose)
 
     def observe(
         self,
@@ -490,17 +491,13 @@ class Driver:
         )
         return self._odometer.as_before(lasts_ns)
 
-    def _head(self, stamp_ns: int) -> dict[str, Any]:
-        """Return the fields of every measurement; ordering sets incarnation and number."""
-        return {"stamp_ns": stamp_ns, "robot": self.robot, "incarnation": 0, "number": 0}
-
     def _increment(
         self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
     ) -> m.Increment:
         what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
         return measurement_messages.check_sound(
             m.Increment(
-                **self._head(stamp_ns),
+                **measurement_messages.head_of(self.robot, stamp_ns),
                 duration_ns=lasts_ns,
                 increment=from_floats(step),
                 covariance=measurement_messages.square(covariance, what),
@@ -531,10 +528,10 @@ class Driver:
         return self._odometer.until(stamp_ns, length_ns, call)
 
     def _drive(
-        self, stamp_ns: int, told: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
+        self, stamp_ns: int, interval: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
     ) -> None:
         """Append an odometry interval to the file, after one that bridges the gap before it."""
-        lasts_ns = 0 if told is None else told.duration_ns
+        lasts_ns = 0 if interval is None else interval.duration_ns
         begin_ns = stamp_ns - lasts_ns
         gap_ns = self._odometer.gap_ns
         if not self._incarnation:
@@ -551,8 +548,8 @@ class Driver:
             over, covariance = self._odometer.bridge()
             bridged = self._increment(begin_ns, gap_ns, over, np.reshape(covariance, (3, 3)))
             self._message(j.ODOMETRY, bridged)
-        if told is not None:
-            self._message(j.ODOMETRY, told)
+        if interval is not None:
+            self._message(j.ODOMETRY, interval)
         self._odometer.add(stamp_ns, step, lasts_ns, pose)
 
     def _see(self, kind: int, seen: m.Measurement) -> None:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,11 @@ def stamp_of(t: float | Decimal, what: str) -> int:
     return round(seconds * 1e9)
 
 
+def head_of(robot: str, stamp_ns: int) -> dict[str, Any]:
+    """Return the fields of every measurement; ordering sets incarnation and number."""
+    return {"stamp_ns": stamp_ns, "robot": robot, "incarnation": 0, "number": 0}
+
+
 def check_speeds(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
     """Check a speed [m/s] and a yaw rate [rad/s]."""
     return _number(forward, f"forward of {what}"), _number(yaw_rate, f"yaw_rate of {what}")
@@ -71,10 +76,7 @@ def observations(
     far, angles = _polar(polar, what, len(numbers))
     return check_sound(
         m.Observations(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=0,
-            number=0,
+            **head_of(robot, stamp_ns),
             ids=from_ids(numbers),
             ranges=from_floats(far),
             bearings=from_floats(angles),
@@ -98,10 +100,7 @@ def points(
         )
     return check_sound(
         m.Points(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=0,
-            number=0,
+            **head_of(robot, stamp_ns),
             ids=from_ids(numbers),
             positions=from_floats(positions.ravel()),
             covariances=_blocks(covariances, len(numbers), what),
@@ -128,10 +127,7 @@ def detections(
         )
     return check_sound(
         m.Detections(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=0,
-            number=0,
+            **head_of(robot, stamp_ns),
             ranges=from_floats(far),
             bearings=from_floats(angles),
             covariances=_polar_blocks(covariances, len(far), what),
@@ -158,10 +154,7 @@ def sightings(
     far, angles = _polar((ranges, bearings), what, len(names))
     return check_sound(
         m.Sightings(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=0,
-            number=0,
+            **head_of(robot, stamp_ns),
             teammates=names,
             ranges=from_floats(far),
             bearings=from_floats(angles),
@@ -184,10 +177,7 @@ def fix(
         stated = from_floats([P[0, 0], P[0, 1], P[1, 1]])
     return check_sound(
         m.Fix(
-            stamp_ns=stamp_ns,
-            robot=robot,
-            incarnation=0,
-            number=0,
+            **head_of(robot, stamp_ns),
             position=from_floats([_number(x, f"a position of {what}") for x in position]),
             covariance=stated,
         ),

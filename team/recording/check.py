@@ -9,7 +9,7 @@ from teamslam.team.recording.counters import Counters
 from teamslam.team.recording.cut import CUT
 from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.inventory import MISSING, Inventory
-from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.reader import Log
 from teamslam.team.recording.records import check_index
 from teamslam.team.recording.repair import REPAIRED, read_undamaged
 from teamslam.team.recording.unannounced_ends import LastWords
@@ -40,16 +40,14 @@ def check_log(log: Log) -> list[Finding]:
     found = _of_file(log)
     evidence = _evidence(log)
     unsound: dict[str, tuple[int, str]] = {}
-    for chunk in read_undamaged(log):
-        if isinstance(chunk, LogError):
-            found.append(Finding(FILE, chunk.what))
-            continue
-        for sample in chunk:
-            reason = _unsound(sample)
-            if reason is not None:
-                count, first = unsound.get(sample.key, (0, reason))
-                unsound[sample.key] = (count + 1, first)
-            evidence.take(sample)
+    damaged: list[str] = []
+    for sample in read_undamaged(log, damaged):
+        reason = _unsound(sample)
+        if reason is not None:
+            count, first = unsound.get(sample.key, (0, reason))
+            unsound[sample.key] = (count + 1, first)
+        evidence.take(sample)
+    found += [Finding(FILE, what) for what in damaged]
     declarations = read_declarations(log)
     for key in sorted(declarations):
         wrong = find_misdeclaration(declarations[key])
@@ -64,14 +62,10 @@ def check_log(log: Log) -> list[Finding]:
 def holes(log: Log) -> list[Finding]:
     """Find missing and duplicate messages, and an unfinished recording."""
     evidence = _evidence(log)
-    damaged = [] if log.complete else [Finding(FILE, UNFINISHED)]
-    for chunk in read_undamaged(log):
-        if isinstance(chunk, LogError):
-            damaged.append(Finding(FILE, chunk.what))
-            continue
-        for sample in chunk:
-            evidence.take(sample)
-    return [*damaged, *evidence.findings()]
+    damaged = [] if log.complete else [UNFINISHED]
+    for sample in read_undamaged(log, damaged):
+        evidence.take(sample)
+    return [*(Finding(FILE, what) for what in damaged), *evidence.findings()]
 
 
 @dataclass

@@ -113,10 +113,8 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
     inventory = Inventory(has_earlier_parts=bool(parts))
     for part in parts:
         file = open_part(part)
-        for chunk in () if file is None else read_undamaged(log_of([file])):
-            if not isinstance(chunk, LogError):
-                for sample in chunk:
-                    inventory.remember(sample)
+        for sample in () if file is None else read_undamaged(log_of([file]), []):
+            inventory.remember(sample)
     return inventory
 
 
@@ -142,9 +140,8 @@ def join_parts(path: Path) -> list[Path]:
     try:
         with Recorder(whole, logs[0].team, {**logs[0].metadata, **joined}) as recorder:
             for log in logs:
-                for chunk in read_undamaged(log_of([log])):
-                    if not isinstance(chunk, LogError):
-                        recorder.write(chunk)
+                for sample in read_undamaged(log_of([log]), []):
+                    recorder.write([sample])
     except RecorderError:
         whole.unlink(missing_ok=True)
         return parts

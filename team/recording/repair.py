@@ -26,12 +26,16 @@ class Report(NamedTuple):
     damaged: tuple[str, ...]
 
 
-def read_undamaged(log: Log) -> Iterator[list[Sample] | LogError]:
-    """Yield the samples of every undamaged chunk, and the error of a damaged one."""
+def read_undamaged(log: Log, damaged: list[str]) -> Iterator[Sample]:
+    """Yield the samples of every undamaged chunk; add the damage of others to `damaged`."""
     try:
-        yield from log.chunks()
+        for chunk in log.chunks():
+            if isinstance(chunk, LogError):
+                damaged.append(chunk.what)
+            else:
+                yield from chunk
     except LogError as error:  # nothing further can be located
-        yield error
+        damaged.append(error.what)
 
 
 def repair_log(path: str | Path, out: str | Path) -> Report:
@@ -45,14 +49,10 @@ def repair_log(path: str | Path, out: str | Path) -> Report:
     damaged: list[str] = []
     note = {} if log.complete else {REPAIRED: log.path.name}
     with Recorder(out, log.team, {**log.metadata, **note}) as recorder:
-        for chunk in read_undamaged(log):
-            if isinstance(chunk, LogError):
-                damaged.append(chunk.what)
-                continue
-            recorder.write(chunk)
-            messages += len(chunk)
-            for sample in chunk:
-                until_ns = sample.stamp_ns if until_ns is None else max(until_ns, sample.stamp_ns)
+        for sample in read_undamaged(log, damaged):
+            recorder.write([sample])
+            messages += 1
+            until_ns = sample.stamp_ns if until_ns is None else max(until_ns, sample.stamp_ns)
     return Report(messages, until_ns, tuple(damaged))
 
 

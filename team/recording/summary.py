@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.reader import Log
 from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import SENSORS, row_of
@@ -59,17 +59,11 @@ class Summary(NamedTuple):
 def summarise_log(log: Log) -> Summary:
     """Summarise every whole chunk of a possibly damaged log in one pass."""
     found: dict[str, KeySummary] = {}
-    damaged = []
-    for chunk in read_undamaged(log):
-        if isinstance(chunk, LogError):
-            damaged.append(chunk.what)
-            continue
-        for sample in chunk:
-            if sample.key not in found:
-                row = row_of(sample.key)
-                name = FOREIGN if row is None else row.name
-                found[sample.key] = KeySummary(
-                    sample.key, name, 0, 0, sample.stamp_ns, sample.stamp_ns
-                )
-            found[sample.key].take(sample)
+    damaged: list[str] = []
+    for sample in read_undamaged(log, damaged):
+        if sample.key not in found:
+            row = row_of(sample.key)
+            name = FOREIGN if row is None else row.name
+            found[sample.key] = KeySummary(sample.key, name, 0, 0, sample.stamp_ns, sample.stamp_ns)
+        found[sample.key].take(sample)
     return Summary(tuple(found.values()), tuple(damaged))

@@ -378,11 +378,7 @@ def recorded(tmp_path_factory):
 
 
 def saved(path: Path) -> list[Sample]:
-    found: list[Sample] = []
-    for chunk in read_undamaged(open_log(path)):
-        if not isinstance(chunk, LogError):
-            found += chunk
-    return found
+    return list(read_undamaged(open_log(path), []))
 
 
 def heads(path: Path) -> list[int]:
