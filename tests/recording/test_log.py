@@ -269,3 +269,14 @@ def test_a_record_longer_than_any_of_ours_is_refused_unread(path):
         file.truncate(LARGEST_CHUNK + 2**20)
     with pytest.raises(LogError, match=f"record of {LARGEST_CHUNK + 1} bytes"):
         list(open_log(path).samples())
+
+
+def test_a_recorder_names_a_missing_folder(tmp_path):
+    with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
+        Recorder(tmp_path / "nowhere" / "log.mcap", "t", {})
+
+
+def test_a_disk_that_is_full_at_once_is_told_at_once(path, monkeypatch):
+    monkeypatch.setattr(Path, "open", lambda self, mode: open("/dev/full", "wb"))  # noqa: SIM115 - the recorder closes it
+    with pytest.raises(RecorderError, match="No space left on device; choose another place"):
+        Recorder(path, "t", {})

@@ -27,10 +27,11 @@ from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import NO_COUNTER, Sample
+from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.recording.test_log import chunks_of
-from tests.support import submap
+from tests.support import odometry, submap
 
 SECOND = 10**9
 
@@ -428,3 +429,25 @@ def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):
         rows = rows_of(path)
         assert len(rows) == count
         assert list(rows[0])[:3] == ["key", "counter", "wall_ns"]
+
+
+def test_unsound_messages_are_counted_and_the_first_is_explained(path):
+    samples = drive("alpha", 1)
+    samples[3] = msgspec.structs.replace(samples[3], payload=samples[3].payload[:-1])
+    samples[4] = msgspec.structs.replace(samples[4], payload=encoded(odometry(4, "bravo")))
+    samples[5] = msgspec.structs.replace(samples[5], stamp_ns=5)
+    *_, line = found(recorded(path, samples))
+    assert line.startswith("source/alpha/odometry: 3 unsound, the first: message 2: truncated")
+    samples[3:5] = drive("alpha", 1)[3:5]
+    (line,) = found(recorded(path.with_name("b.mcap"), samples))
+    assert line.endswith("message 4: logged at 5 ns, of 100400000000 ns")
+
+
+def test_damage_is_told_before_a_new_log_is_made(whole, tmp_path):
+    ((offset, length),) = chunks_of(whole.path)
+    flip(whole.path, offset + length - 5)
+    with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
+        cut(whole, tmp_path / "a.mcap", 1.0)
+    with pytest.raises(LogError, match="damaged chunk"):
+        merge([whole], tmp_path / "a.mcap")
+    assert not (tmp_path / "a.mcap").exists()

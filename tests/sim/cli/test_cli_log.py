@@ -181,3 +181,12 @@ def test_a_log_with_a_hole_says_so_in_every_command(tmp_path, monkeypatch, words
     assert failed is None or isinstance(failed, SystemExit | LogError | DatasetError)
     said = " ".join(f"{result.stdout} {result.stderr} {failed}".split())
     assert "not whole, source/r2: 3 measurements of incarnation 1 missing" in said
+
+
+def test_chosen_channels_are_exported_as_csv(log, tmp_path):
+    status, out, _ = run("export", log, "-o", tmp_path / "out", "--channels", "odometry, truth")
+    assert status == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "odometry.csv", "truth.csv",
+    ]  # fmt: skip
+    assert "odometry.csv: 40 rows" in out
