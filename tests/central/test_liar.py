@@ -11,7 +11,7 @@ import pytest
 from teamslam.central import tick_fold
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
-from teamslam.central.withdrawal import Trial, disagreement, hold_trial
+from teamslam.central.withdrawal import Trial, hold_trial
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.simulator import simulated
@@ -268,12 +268,6 @@ def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree():
         return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, ())
 
     assert hold_trial(without(()), 4.0, without).robot == "r1"
-
-
-def test_chance_alone_makes_nobody_suspect():
-    """Five degrees of freedom reach nine per degree once in 10^8."""
-    assert disagreement(Agreement(0.0, 1.0, {"r1": (45.0, 5.0)}, ())) == {"r1": 1.0}
-    assert disagreement(Agreement(0.0, 1.0, {"r1": (450.0, 50.0)}, ())) == {"r1": 9.0}
 
 
 def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot_named():

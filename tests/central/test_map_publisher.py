@@ -6,33 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central import sent_priors as priors
 from teamslam.central.config import CentralConfig
 from teamslam.central.map_publisher import MapPublisher
-from teamslam.central.sent_priors import EVERY, SentPriors
+from teamslam.central.sent_priors import SentPriors
 from teamslam.central.submap_fold import SubmapFold
-from teamslam.central.unnamed_landmarks import SHOWN, memberships_of
-from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.world.simulator import simulated
 from teamslam.team import translate
-from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.association.landmark_sets import (
-    NO_LANDMARKS,
-    Landmarks,
-    add_landmarks,
-    merge_sets,
-)
-from teamslam.team.estimation.association.member_log import MergeRecord
-from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.marginals import LandmarkBlocks
-from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import ids
-from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
-from tests.central.test_withdrawal import scenario
 from tests.teams import Submaps, of, published, stream
 
 CONFIG = CentralConfig(tick_s=3.0, broadcast_s=6.0)
@@ -233,35 +216,6 @@ def test_a_final_map_whose_covariances_are_too_small_says_so_itself():
     assert "noise_underestimated" in {each.cause for each in tight.diagnosis}
 
 
-def landmarks(submaps: int) -> Landmarks:
-    """Two landmarks that one robot sees in every submap, as one set each."""
-    ids = (UNNAMED + np.arange(2)).astype(np.uint32)
-    local = LocalMap(ids, np.zeros(7), np.eye(7))
-    found = NO_LANDMARKS
-    for k in range(submaps):
-        each = Contribution("r1", 1, k, k, local)
-        found, numbers = add_landmarks(found, [each])
-        if not k:
-            first = numbers[each.key]
-            continue
-        pairs = zip(numbers[each.key], first, strict=True)
-        found, _ = merge_sets(
-            found, [(own, MergeRecord("track", into, 5.0, k, 0.1, k)) for own, into in pairs]
-        )
-    return found
-
-
-def test_what_a_running_map_names_does_not_grow_with_the_run():
-    for submaps in (100, 1000):
-        (few,) = memberships_of(landmarks(submaps), every=False)
-        (every,) = memberships_of(landmarks(submaps))
-        assert len(ids(few.sequences, "sequences")) == 2 * SHOWN
-        assert len(ids(every.sequences, "sequences")) == 2 * submaps
-        sequences = np.unique(ids(few.sequences, "sequences")).tolist()
-        assert sequences == [0, *range(submaps - SHOWN + 1, submaps)]
-        assert len(few.figures) == 3 * 8 * len(few.steps)
-
-
 HERE = np.zeros(3)
 ROBOT = ("r1", 1)
 
@@ -275,37 +229,8 @@ def blocks(shift=0.0, variance=0.01, count=40, sigmas=0.0):
     return LandmarkBlocks(ids, means, np.tile(variance * np.eye(2), (count, 1, 1)))
 
 
-def test_the_first_prior_is_sent_and_then_one_of_every_so_many():
-    sent_priors = SentPriors(30)
-    said = [sent_priors.is_worth(ROBOT, HERE, blocks()) for _ in range(2 * EVERY + 1)]
-    assert [k for k, sent in enumerate(said) if sent] == [0, EVERY, 2 * EVERY]
-    assert sent_priors.is_worth(("r1", 2), HERE, blocks()), "another incarnation was told nothing"
-
-
 def test_a_robot_that_comes_to_landmarks_that_it_was_not_told_is_told():
     sent_priors = SentPriors(30)
     sent_priors.is_worth(ROBOT, HERE, blocks())
     assert not sent_priors.is_worth(ROBOT, np.array([20.0, 0.0, 0.0]), blocks())
     assert sent_priors.is_worth(ROBOT, np.array([30.0, 0.0, 0.0]), blocks())
-
-
-def test_of_inter_robot_measurements_the_robots_are_told_that_they_are_of(monkeypatch):
-    monkeypatch.setattr(priors, "NEEDED", 0)
-    monkeypatch.setattr(priors, "EVERY", 1_000_000)
-    of = scenario()
-    met: dict[str, set[int]] = {each.id: set() for each in of.robots}
-    told: dict[str, list[int]] = {each.id: [] for each in of.robots}
-    for sample in run_team(of, simulated(of.world, of.robots, of.seed)):
-        channel, robot, message = opened(sample)
-        if channel is ch.SIGHTING_FACTOR:
-            met[message.robot].add(message.stamp_ns)
-            met[message.teammate].add(message.stamp_ns)
-        elif channel is ch.PRIOR:
-            told[robot].append(message.stamp_ns)
-    until = max(max(each) for each in told.values())
-    newest = {}
-    for robot, stamps in told.items():
-        newest[robot] = [max(each for each in met[robot] if each <= stamp) for stamp in stamps]
-        assert len(set(newest[robot])) == len(stamps), "told again without a new measurement"
-        assert newest[robot][-1] == max(each for each in met[robot] if each <= until)
-    assert len(told["r1"]) > 3 > len(told["r3"])

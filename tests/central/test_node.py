@@ -11,7 +11,6 @@ from teamslam.central.node import make_centre
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import WireError, decoded, encoded
-from teamslam.team.wire.digest import digest_of
 from tests import build
 from tests.teams import Submaps, of, published, stream
 
@@ -74,13 +73,6 @@ def joined(*, robots=("r1", "r2"), config=CONFIG):
     centre = Centre(config)
     centre.hears(*(STARTS[r] for r in robots), *(alive(r) for r in robots))
     return centre
-
-
-def test_it_announces_the_configuration_that_its_maps_hang_on():
-    (one,) = of(Centre().said, ch.CENTRAL_CONFIG)
-    (other,) = of(Centre(CentralConfig(tick_s=4.0)).said, ch.CENTRAL_CONFIG)
-    assert one.digest == digest_of(one.configuration.encode())
-    assert one.digest != other.digest
 
 
 def test_a_tick_closes_when_every_live_robot_has_passed_it():
@@ -173,12 +165,6 @@ def test_the_final_map_comes_once_when_everybody_is_done_and_everything_is_here(
         assert centre.final.members == build.version(r1=3, r2=3)
 
 
-def test_a_robot_that_was_never_there_is_waited_for():
-    centre = joined(robots=("r1",))
-    centre.hears(*SUBMAPS["r1"], done("r1"), END)
-    assert not centre.node.finished
-
-
 def given_up(robot):
     return build.given_up(node=f"robot/{robot}", reason="it fell into the water")
 
@@ -203,12 +189,6 @@ def test_a_robot_that_is_lost_and_comes_back_is_not_lost_and_the_map_is_that_of_
     assert (away.final.lost, away.final.provisional) == ((), False)
 
 
-def test_a_robot_that_is_given_up_and_brings_all_before_the_end_is_not_lost():
-    centre = joined()
-    centre.hears(given_up("r2"), *SUBMAPS["r2"], done("r2"), *SUBMAPS["r1"], done("r1"), END)
-    assert (centre.final.lost, centre.final.provisional) == ((), False)
-
-
 def test_a_robot_that_was_withdrawn_and_has_left_is_not_waited_for_and_not_lost():
     centre = joined()
     centre.hears(
@@ -221,13 +201,6 @@ def test_a_robot_that_was_withdrawn_and_has_left_is_not_waited_for_and_not_lost(
     centre.hears(alive("r2", here=False))
     assert (centre.final.withdrawn, centre.final.lost) == (("r2",), ())
     assert not centre.final.provisional
-
-
-def test_a_centre_that_finds_its_own_final_map_has_finished():
-    first, again = joined(), joined()
-    first.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), done("r2"), END)
-    out = again.hears(first.final)
-    assert (out, again.node.finished, again.node.final) == ([], True, first.final)
 
 
 def test_a_robot_that_died_after_its_last_word_with_a_submap_lost_is_waited_for_too():
@@ -286,16 +259,6 @@ def test_the_submaps_of_a_robot_are_given_to_its_next_life():
         centre.node.answer_submaps(b"\x93nonsense")
 
 
-def test_what_is_not_of_the_team_changes_nothing():
-    centre = joined()
-    assert (
-        centre.hears(
-            progress("r9", 3, 1), done("r9"), m.Liveliness(stamp_ns=0, node="recorder", alive=True)
-        )
-        == []
-    )
-
-
 def test_what_a_robot_has_sent_by_its_word_and_is_not_here_is_wanted():
     centre = joined()
     centre.hears(SUBMAPS["r1"][0], progress("r1", 9.0, 3), progress("r2", 3.0, 0))
@@ -306,15 +269,6 @@ def test_what_a_robot_has_sent_by_its_word_and_is_not_here_is_wanted():
     centre.hears(done("r2", 4))
     (wanted,) = centre.node.lacking()
     assert (wanted.robot, wanted.incarnation, wanted.first) == ("r2", 1, 0)
-
-
-def test_submaps_without_their_start_are_wanted_with_it():
-    centre = Centre()
-    centre.hears(alive("r1"), *SUBMAPS["r1"], progress("r1", 12.0, 4))
-    (wanted,) = centre.node.lacking()
-    assert (wanted.robot, wanted.first) == ("r1", 0)
-    centre.hears(STARTS["r1"])
-    assert centre.node.lacking() == []
 
 
 ROBOTS = [f"r{k}" for k in range(6)]
@@ -423,14 +377,5 @@ def test_under_feedback_a_robot_that_is_given_up_or_ends_early_is_waited_for_no_
     centre.hears(news)
     assert exchanges(centre) == [1]
     centre.hears(estimate("r1", 2), END, done("r1", 0))
-    assert exchanges(centre) == [1, 2]
-    assert centre.final.exchange == 2
-
-
-def test_under_feedback_all_open_rounds_are_fused_before_the_end():
-    centre = joined(config=FEEDBACK)
-    centre.hears(estimate("r1", 1), estimate("r1", 2), END, done("r1", 0))
-    assert exchanges(centre) == []
-    centre.hears(done("r2", 0))
     assert exchanges(centre) == [1, 2]
     assert centre.final.exchange == 2

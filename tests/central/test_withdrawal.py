@@ -1,7 +1,6 @@
 """After a withdrawal the map equals, bit for bit, that of a team without the robot."""
 
 import math
-from collections.abc import Collection
 from dataclasses import replace
 from functools import cache
 
@@ -360,18 +359,6 @@ def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | 
     return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
 
 
-def test_where_two_robots_contradict_themselves_the_team_is_not_folded_without_each():
-    """Each fold without one robot has a contradiction left: the team states its noise too small."""
-    asked = []
-
-    def without(robots: Collection[str]) -> Agreement:
-        asked.append(frozenset(robots))
-        return agreement(**dict.fromkeys({"a", "b", "c"} - {*robots}, 5.0))
-
-    assert hold_trial(without(()), 4.0, without).robot is None
-    assert {len(robots) for robots in asked[1:]} == {2}
-
-
 def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():
     bad, good = agreement(a=9.0).submaps[:7], agreement(a=1.0).submaps[:5]
     of_last_four = [0.92, 0.96, 1.0, 1.04]
@@ -382,28 +369,6 @@ def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():
     assert np.isclose(disagreement(Agreement(0.0, 1.0, {}, bad[:3]))["a"], 9.0 * 0.8)
     assert disagreement(Agreement(0.0, 1.0, {}, (bad[0], *good[:2])))["a"] <= 1.0
     assert disagreement(Agreement(0.0, 1.0, {}, bad[:1])) == {}
-
-
-def test_a_team_of_one_that_is_withdrawn_has_an_empty_map():
-    rule = MapPublisher(SubmapFold(CentralConfig(), bytes(8)))
-    samples = team_run()
-    for message in (*messages(samples, m.InitialPose), *messages(samples, m.Submap)):
-        if message.robot == "r1":
-            take = (
-                rule.store.add_start
-                if isinstance(message, m.InitialPose)
-                else rule.store.add_submap
-            )
-            take(
-                msgspec.structs.replace(message, sightings=0)
-                if isinstance(message, m.Submap)
-                else message
-            )
-    rule.withdraw(
-        m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="it fell into the pool")
-    )
-    fused = rule.publish_final(0)[-1].message
-    assert (fused.ids, fused.members, fused.withdrawn) == (b"", (), ("r1",))
 
 
 def test_a_withdrawn_robots_pose_is_taken_back_and_all_of_it_is_recomputed(tmp_path):

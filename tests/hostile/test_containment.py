@@ -155,55 +155,6 @@ def test_running_maps_that_raise_take_nothing_from_the_final_one(monkeypatch):
     assert (final.means, final.covariance) == (whole.means, whole.covariance)
 
 
-class Brittle:
-    """A node that raises wherever it is asked."""
-
-    finished = False
-
-    def begin(self) -> list[Outgoing]:
-        return []
-
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        raise KeyError(message.stamp_ns)
-
-    def status(self) -> m.Status:
-        raise RuntimeError("no word")
-
-
-@pytest.fixture
-def heard():
-    network = MemoryNetwork()
-    sink = MemoryBus(network)
-    for channel in (ch.FAULT, ch.STATUS):
-        sink.subscribe(channel)
-    return Shell(MemoryBus(network), Brittle(), "central", threading.Event()), sink
-
-
-def sampled(message: m.Message, key: str, counter: int = 0) -> Sample:
-    return Sample(key, encoded(message), message.stamp_ns, 0, counter)
-
-
-def test_a_message_that_raised_is_not_handled_again_when_it_comes_again(heard):
-    shell, sink = heard
-    one, two = (sampled(submap(k), "robot/alpha/submap", k) for k in range(2))
-    shell.take([one, two, one, two])
-    assert [f.count for f in faults(sink.receive())] == [0, 1]
-    assert shell.boundary.faults == 2
-    with pytest.raises(FaultyRunError, match=r"2 set aside after a fault, the last: submap/1"):
-        shell.end(None)
-
-
-def test_a_status_that_raises_is_a_fault_and_the_status_says_that(heard):
-    shell, sink = heard
-    shell.report(last=True)
-    fault, status = (opened(s)[2] for s in sink.receive())
-    assert isinstance(fault, m.Fault)
-    assert (fault.origin, fault.text) == ("status", "no word")
-    assert isinstance(status, m.Status)
-    assert status.figures["faults"] == 1.0
-    assert "status: RuntimeError at teamslam.team.shell:Shell.contain:" in status.warnings[-1]
-
-
 def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_anew():
     network = MemoryNetwork()
     centre, viewer = MemoryBus(network), MemoryBus(network)
@@ -237,20 +188,6 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(t
         loop = RecordLoop(MemoryBus(network), recorder, [])
         loop.take([token])
         assert loop.written == 0, "the key is of no channel"
-
-
-def test_an_answer_that_raises_is_told_to_the_asker_and_ends_nobody():
-    network = MemoryNetwork()
-    shell = Shell(MemoryBus(network), CentralNode(CENTRE, ["r1"]), "central", threading.Event())
-
-    def answer(request: bytes) -> list[bytes]:
-        raise IndexError("beyond")
-
-    shell.answer(ch.SUBMAPS, "", answer)
-    asker = MemoryBus(network)
-    with pytest.raises(RuntimeError, match="the answer failed: IndexError"):
-        asker.ask(ch.SUBMAPS, "", build.submaps_request(), 1.0)
-    assert shell.boundary.faults == 1
 
 
 def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(monkeypatch):

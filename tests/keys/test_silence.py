@@ -116,19 +116,6 @@ def test_only_an_answer_about_certificates_refuses_a_link(keys, answer, waits_fo
     assert bool(found.refused) == bool(refused)
 
 
-def test_a_pair_of_which_one_half_is_copied_yet_is_waited_for(keys):
-    """A certificate is renewed while its process runs."""
-    own = credentials_of(keys.own, "robot-r1", TEAM)
-    half = credentials_of(keys.strange, "robot-r1", TEAM)
-    mixed = type(own)(
-        own.node, own.name, own.team, own.authority, half.certificate, own.key, own.ends
-    )
-    with answering(None) as endpoint:
-        found = examine(endpoint, mixed, 0.3)
-    assert found.refused is None
-    assert "can not be read" in found.waits_for
-
-
 @pytest.mark.parametrize("with_keys", [True, False], ids=["keys", "no keys"])
 def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
     keys, with_keys, monkeypatch, caplog

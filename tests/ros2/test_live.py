@@ -5,13 +5,11 @@ import time
 from decimal import Decimal
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import zenoh
 import zenoh.ext
 
-from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.driver.journal import Journal
 from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.driver.node import SourceNode
@@ -19,7 +17,6 @@ from teamslam.team.ros2.arrivals import MOST_PUBLISHERS, Lost, number_of
 from teamslam.team.ros2.topics import RobotTopics, TopicsError, load_topics
 from teamslam.team.ros2.translator import Measured
 from teamslam.team.ros2_driver import BEHIND_S, SILENT_S, Ros2Driver
-from teamslam.team.wire.digest import announce_configuration
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys, ForeignSample
 from tests.ros2 import messages as ros
 from tests.support import wait_until
@@ -119,17 +116,6 @@ def test_topics_on_zenoh_become_a_driver_s_calls(network, key):
     assert driver.dropped == {"/r1/odom: damaged": 1, "/r1/odom: refused": 1}
 
 
-def test_messages_before_their_type_is_told_are_kept():
-    robot = Robot()
-    driver = Ros2Driver(robot, TOPICS)
-    driver.take(ForeignSample("r1/tags", tags(1)))
-    assert robot.calls == []
-    assert "no bridge has told its type" in str(driver.dropped)
-    key = "@/beef/@ros2_lv/MP/r1§tags/vision_msgs§msg§Detection3DArray/:::"
-    driver.take(ForeignSample(key, b"", token=True))
-    assert [call[0] for call in robot.calls] == ["points", "sight"]
-
-
 def test_hostile_payloads_are_counted_and_nothing_more():
     robot = Robot()
     driver = Ros2Driver(robot, TOPICS)
@@ -195,18 +181,6 @@ def test_what_was_published_once_before_the_driver_began_is_received(network, to
     robot.sensor_mount = 0.0, 0.0, 0.0
     (warning,) = driver.warnings()
     assert "at (0.2, 0, 3.142) on the base by its frames, and the scenario has it at (0," in warning
-
-
-def test_a_driver_hears_where_its_robot_s_process_has_the_sensor(tmp_path):
-    node = SourceNode(Journal(tmp_path / "r1.stream", "r1"))
-    mounted = RobotConfig("r1", sensor=Sensor(mount=(0.2, 0.0, 1.0)))
-    node.handle(announce_configuration("robot/r2", 0, 0, RobotConfig("r2")), 0)
-    assert node.models is None
-    told = announce_configuration("robot/r1", 0, 0, mounted)
-    node.handle(told, 0)
-    assert node.models == mounted
-    node.handle(msgspec.structs.replace(told, configuration='{"sensor": 7}'), 0)
-    assert node.models is None
 
 
 def test_a_sensor_whose_place_comes_late_is_there_from_then_on():

@@ -164,33 +164,6 @@ def test_merged_shards_are_the_whole_byte_for_byte(tmp_path):
     assert json.loads(whole["xu-4.4.json"])["values"] == [k / 8 for k in range(3, 10)]
 
 
-def test_shards_that_are_not_all_or_not_of_one_study_are_refused(tmp_path):
-    def shard(k: int, seeds: int) -> Path:
-        folder = tmp_path / f"{k}-{seeds}"
-        experiment("xu-4.4", "--seeds", seeds, "--jobs", 1, "--shard", f"{k}/2", "-o", folder)
-        return folder
-
-    first, other = shard(1, 2), shard(2, 3)
-    for folders, said in (
-        ([first], "shard 2 of 2 is not among the folders"),
-        ([first, other], "they differ in seeds"),
-        ([tmp_path], "is no finished shard"),
-    ):
-        words = [*map(str, folders), "-o", str(tmp_path / "out")]
-        refused = RUN.invoke(app, ["experiment", "merge", *words])
-        assert refused.exit_code == 2
-        assert said in " ".join(refused.output.split())
-    file = first / "shard.json"
-    file.write_text(file.read_text().replace('"json:loads": "', '"json:loads": "0'))
-    second = shard(2, 2)
-    file = second / "shard.json"
-    file.write_text(file.read_text().replace('"json:loads": "', '"json:loads": "0'))
-    words = [str(first), str(second), "-o", str(tmp_path / "out")]
-    refused = RUN.invoke(app, ["experiment", "merge", *words])
-    assert refused.exit_code == 2
-    assert "another version of the program" in refused.output
-
-
 @pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "1/0"])
 def test_a_shard_is_a_number_of_a_number(text):
     refused = RUN.invoke(app, ["experiment", "xu-4.4", "--shard", text])

@@ -179,14 +179,6 @@ def test_a_robots_last_own_map_is_held_against_the_truth():
     assert figures["r2"]["own_map_nees_per_dof"] is None
 
 
-def test_a_measurement_that_is_in_the_log_twice_is_counted_once():
-    log = world_log(scenario())
-    again = [s for s in log if s.key == ch.ODOMETRY.key("r1")]
-    once, twice = evaluate(log).robots["r1"], evaluate(log + again).robots["r1"]
-    assert once.consumption.steps == twice.consumption.steps == 20
-    assert once.consumption.published == twice.consumption.published == 41
-
-
 @pytest.mark.parametrize(
     ("first", "counted", "once"),
     [(21, 41, True), (20, 41, False), (21, 42, False)],

@@ -58,22 +58,6 @@ def test_a_measurement_in_two_submaps_is_named(samples, tmp_path):
     assert offender == f"measurement {counter} of r1, incarnation 1 is in two submaps: 0 and 1"
 
 
-def test_a_measurement_that_no_submap_took_is_named(samples, tmp_path):
-    second = messages(samples, ch.SUBMAP, "r1")[1]
-    skipped = submap_changed(samples, 1, first_measurement=second.first_measurement + 1)
-    offenders = ledger_of(skipped, tmp_path).offenders
-    name = f"measurement {second.first_measurement} of r1, incarnation 1"
-    assert offenders[0] == f"{name} is behind its submaps and in none of them"
-    assert "r1, incarnation 1 reports" in offenders[1]
-
-
-def test_a_submap_of_measurements_that_are_not_there_is_named(samples, tmp_path):
-    last = messages(samples, ch.SUBMAP, "r1")[-1]
-    beyond = submap_changed(samples, last.sequence, last_measurement=last.last_measurement + 2**40)
-    (offender,) = ledger_of(beyond, tmp_path).offenders
-    assert offender.startswith(f"submap {last.sequence} of r1, incarnation 1 uses measurement")
-
-
 def test_a_robots_false_word_is_named(samples, tmp_path):
     def lie(done: m.Message) -> m.Message:
         ledger = tuple(

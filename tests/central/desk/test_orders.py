@@ -10,7 +10,6 @@ from typer.testing import CliRunner, Result
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk import orders
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.evaluation.verdicts import contradicting
 from teamslam.central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.central.node import CentralNode
@@ -177,23 +176,6 @@ def test_a_verdict_against_an_earlier_one_on_the_pair_says_which_of_them_holds(m
     in_vain = said(monkeypatch, "same", *names, rests_on=both)
     assert in_vain.exit_code == 1
     assert "have an earlier verdict, different, which is what holds" in in_vain.stderr
-
-
-def test_verdicts_that_contradict_each_other_over_a_third_landmark_are_named(monkeypatch):
-    a, b, c, d = (local_landmark(f"r3/1/{k}/0") for k in range(4))
-    one = m.Judgement(first=a, second=b, same=True), m.Judgement(first=c, second=b, same=True)
-    two = m.Judgement(first=a, second=c, same=False)
-    aside = m.Judgement(first=c, second=d, same=True)
-    every = (*one, two, aside)
-    assert contradicting(two, every) == one
-    assert contradicting(one[0], every) == (one[1], two)
-    assert contradicting(aside, every) == contradicting(two, (one[0], two)) == ()
-    last = said(monkeypatch, "same", "r3/1/1/0", "r3/1/2/0", rests_on=every)
-    assert last.exit_code == 1
-    for words in ("r3/1/0/0 and r3/1/1/0 are one", "r3/1/1/0 and r3/1/2/0 are one"):
-        assert words in last.stderr
-    assert "r3/1/0/0 and r3/1/2/0 are two landmarks, which is what holds" in last.stderr
-    assert said(monkeypatch, "same", "r3/1/2/0", "r3/1/3/0", rests_on=every).exit_code == 0
 
 
 def test_a_report_names_the_verdicts_and_which_of_them_the_map_rests_on():

@@ -12,7 +12,6 @@ from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
-from teamslam.central.desk.verification.differences import first_difference
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import WorldStreams
@@ -20,12 +19,9 @@ from teamslam.team.containment import Boundary
 from teamslam.team.shell import FaultyRunError, judge
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
-from tests import build
 from tests.central.test_withdrawal import run, scenario
-from tests.support import packed, spd
 
 
 @pytest.fixture(scope="module")
@@ -124,24 +120,3 @@ def test_a_process_whose_final_map_is_without_a_withdrawn_robot_ends_with_1(samp
     final = next(s for s in reversed(samples) if s.key == ch.FINAL_MAP.key())
     with pytest.raises(FaultyRunError, match="the final map is without r3: withdrawn"):
         judge(Boundary("robot/r1"), decoded(final.payload, m.FusedMap))
-
-
-def prior(value: float) -> m.Prior:
-    bias = m.BiasEstimate(robot="r1", incarnation=0, bias="bearing", value=value, sigma=0.1)
-    return build.prior(
-        incarnation=0,
-        ids=b"",
-        mean=from_floats([0.0] * 3),
-        covariance=packed(spd(3)),
-        biases=(bias,),
-    )
-
-
-def test_a_bias_that_rounding_has_moved_differs_only_where_bits_are_promised():
-    there, here = prior(0.25), prior(0.25 * (1.0 + 1e-15))
-    assert first_difference(there, here, exact=False) is None
-    exact = first_difference(there, here, exact=True)
-    assert exact.field == "biases"
-    assert first_difference(there, prior(0.26), exact=False) is not None
-    fewer = msgspec.structs.replace(there, biases=())
-    assert first_difference(there, fewer, exact=False) is not None

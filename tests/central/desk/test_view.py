@@ -17,7 +17,7 @@ from teamslam.central.desk.view.drawn import (
     place_points,
 )
 from teamslam.central.desk.view.export import export_views, with_views
-from teamslam.central.desk.view.node import LAG_NS, MOST_PERIODS, PERIOD_NS, ViewerNode
+from teamslam.central.desk.view.node import LAG_NS, PERIOD_NS, ViewerNode
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -133,16 +133,6 @@ def test_a_view_comes_once_a_second_and_has_every_robot_where_it_was(read, sampl
                 assert any(np.allclose([place.x, place.y], p) for p in said[robot, at])
 
 
-def test_figures_hold_errors_within_their_bounds_and_the_monitors_cost(read):
-    _, robot = read["view/robot/r1"][-1]
-    assert abs(robot["error_x_m"]) < robot["three_sigma_x_m"] + 1.0
-    assert robot["nees_per_dof"] > 0.0
-    _, team = read["view/team"][-1]
-    assert team["landmarks"] > 10
-    assert 0.0 < team["map_rmse_m"] < 5.0
-    assert 0.1 < team["landmark_nees_per_dof"] < 10.0
-
-
 def test_views_of_the_same_log_are_the_same_bytes(samples):
     assert list(with_views(samples)) == list(with_views(samples))
 
@@ -235,12 +225,6 @@ def test_a_robot_that_has_stopped_holds_the_view_for_a_while_only():
     ahead = LAG_NS // S + 5
     out = shown(node, *[(ch.OWN_POSE, pose(t, t)) for t in range(1, ahead + 1)])
     assert robots_at(out) == [1, 2, 3, 4, 5]
-
-
-def test_a_stamp_from_far_ahead_does_not_make_views_without_end():
-    node = ViewerNode()
-    out = shown(node, (ch.OWN_POSE, pose(0, 0)), (ch.OWN_POSE, pose(1e9, 0)))
-    assert len(robots_at(out)) <= MOST_PERIODS + 2
 
 
 def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():

@@ -1,7 +1,6 @@
 """Association inside a window, in simulated windows of known landmarks."""
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -142,17 +141,6 @@ def test_a_slip_among_as_many_new_landmarks_as_mapped_ones_is_found():
     assert len(result.counts) == 6, "three before the slip, and three beside them since"
 
 
-def test_names_of_detections_are_kept_beside_detections_without_a_name():
-    scans, labels = window(4)
-    tags = np.where(labels % 3 == 0, labels + 7, UNASSIGNED)
-    result = associate_window(replace(scans, names=tags), SETTINGS)
-    assert (result.names[result.landmark_of[tags != UNASSIGNED]] == tags[tags != UNASSIGNED]).all()
-    assert pairs(result.landmark_of, labels) == (1.0, 1.0)
-    named = result.names[result.names != UNASSIGNED]
-    assert (np.diff(named) > 0).all()
-    assert (result.names[len(named) :] == UNASSIGNED).all()
-
-
 def test_points_carry_the_covariance_of_range_and_bearing():
     ranges, bearings = np.array([3.0]), np.array([0.7])
     variances = np.array([[0.04, 0.001, 0.0009]])
@@ -183,14 +171,3 @@ def test_the_smoothed_window_is_consistent_and_one_with_a_quarter_of_the_covaria
         ratios.append(squared / dof)
     assert 0.9 < ratios[0] < 1.1
     assert ratios[1] > 2.0
-
-
-def test_landmarks_that_one_scan_saw_together_are_never_merged():
-    scans, labels = window(6, spacing=1.0)
-    result = associate_window(scans, AssociationSettings(slack_m=5.0, certain=0.0))
-    by_scan = [labels[scans.keyframes == k] for k in range(len(scans.motions))]
-    together = {pair for seen in by_scan for pair in combinations(sorted(seen), 2)}
-    members = [set(labels[result.landmark_of == i]) for i in range(len(result.counts))]
-    merged = {pair for labelled in members for pair in combinations(sorted(labelled), 2)}
-    assert merged, "with so much slack what was never seen together is merged"
-    assert not merged & together

@@ -211,32 +211,3 @@ def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly):
     agreeing = window.judged("agreeing", sensor=sensor)
     assert agreeing.any()
     np.testing.assert_array_equal(window.judged(sensor=sensor), agreeing)
-
-
-def long_drive(seed: int) -> Drive:
-    """Eighteen steps of 10 m whose odometry turns by 3° at random; landmarks within 20 m are seen
-    with 0.2 m and 2°, most of them two or three times.
-    """
-    rng = np.random.default_rng(seed)
-    motion = MotionModel(forward=MotionNoise(0.05), turn=MotionNoise(0.05))
-    places = rng.uniform(-40.0, 60.0, (30, 2))
-    motions, rows, pose = [], [], np.zeros(3)
-    for k in range(18):
-        turn = rng.uniform(-0.6, 0.9)
-        pose = compose(pose, increment_of(motion, 1.0, 10.0, turn).mean)
-        odometry = (10.0 + 0.05 * rng.normal(), turn + 0.05 * rng.normal())
-        motions.append(increment_of(motion, 1.0, *odometry))
-        for i, place in enumerate(places):
-            r, b = predicted(pose, place)
-            if 3.0 < r < 20.0:
-                rows.append((k, i + 1, r + 0.2 * rng.normal(), b + 0.035 * rng.normal()))
-    table = np.array(rows)
-    return Drive(
-        motions, table[:, 0].astype(np.int64), table[:, 1].astype(np.uint32), table[:, 2:].copy()
-    )
-
-
-def test_good_measurements_far_from_the_odometry_of_a_long_window_are_kept() -> None:
-    sensor = Sensor(range_sigma=0.2, bearing_sigma=0.035)
-    taken = [long_drive(seed).judged(outlier_share=0.01, sensor=sensor) for seed in range(120)]
-    assert np.concatenate(taken).mean() > 0.999

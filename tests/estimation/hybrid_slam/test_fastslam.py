@@ -174,36 +174,6 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
     assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])
 
 
-def test_a_keyframe_of_first_sights_and_one_without_measurements_leave_the_weights():
-    _, keyframes = simulated(4)
-    particles, _, _ = filtered([MOTION], keyframes[1:2], 50, "fastslam2")
-    np.testing.assert_allclose(particles.log_weights, -np.log(50.0), atol=1e-12)
-    after = fastslam.propagated(particles, MOTION, np.random.default_rng(0))
-    np.testing.assert_array_equal(after.means, particles.means)
-    np.testing.assert_array_equal(after.log_weights, particles.log_weights)
-    assert np.ptp(after.poses, axis=0).min() > 0.0
-
-
-def test_two_measurements_of_one_landmark_in_one_keyframe_count_as_two_keyframes_without_motion():
-    _, keyframes = simulated(5, steps=2)
-    first, second = [(0, keyframes[0][0][1])], [(0, keyframes[1][0][1])]
-    together = filtered([STANDING], [first + second], 4, "fastslam2")
-    apart = filtered([STANDING, STANDING], [first, second], 4, "fastslam2")
-    np.testing.assert_array_equal(together[0].means, apart[0].means)
-    np.testing.assert_array_equal(together[0].covariances, apart[0].covariances)
-    np.testing.assert_allclose(together[1], apart[1])
-
-
-def test_resampling_happens_before_the_motion_and_never_after_the_measurements():
-    motions, keyframes = simulated(6)
-    particles, _, infos = filtered(motions, keyframes, 200, "fastslam1")
-    thin = [info.effective_sample_size < 100 for info in infos]
-    parents = [info.parents is not None for info in infos]
-    assert any(thin)
-    assert parents == [False, *thin[:-1]]
-    assert thin[-1] == (np.ptp(particles.log_weights) > 0.0)
-
-
 weights = st.lists(st.floats(-30.0, 0.0), min_size=1, max_size=12).map(
     lambda values: fastslam.normalise(np.array(values))[0]
 )

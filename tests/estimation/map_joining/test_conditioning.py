@@ -10,7 +10,6 @@ from teamslam.team.estimation.gaussian import PoseGaussian, curved
 from teamslam.team.estimation.map_joining import conditioning
 from teamslam.team.estimation.map_joining.conditioning import (
     TRUSTING,
-    RobotPrior,
     SubmapCorrection,
     compose_pose,
     join_pending,
@@ -161,28 +160,6 @@ def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(s
     assert not any(
         join_pending(prior.whole, [e.local for e in after[:n]]).disputed for n in range(4)
     )
-
-
-def test_before_the_first_map_the_pose_is_composed_from_the_exact_start():
-    world = team(6, submaps=1)
-    submap = world.submaps[0]
-    nothing = np.zeros(0, np.uint32)
-    prior = RobotPrior(world.starts[0].pose, nothing, np.zeros((0, 2)), np.zeros((3, 3)))
-    pose, covariance = team_pose(prior, [], submap.local)
-    path = trajectory(joined([submap], world.starts), "r0", 0)
-    np.testing.assert_allclose(pose, path.poses[0], atol=1e-12)
-    np.testing.assert_allclose(covariance, path.covariances[0], atol=1e-12)
-
-
-def test_a_landmark_that_only_the_later_submaps_see_does_no_harm_and_ties_them():
-    prior = RobotPrior(np.zeros(3), np.zeros(0, np.uint32), np.zeros((0, 2)), 1e-4 * np.eye(3))
-    spread = np.diag([1.0, 1.0, 1e-6, 1e-4, 1e-4])
-    ids = np.array([7], np.uint32)
-    first = LocalMap(ids, np.array([1.0, 0.0, 0.0, 3.0, 1.0]), spread)
-    second = LocalMap(ids, np.array([1.5, 0.0, 0.0, 1.0, 1.0]), spread)
-    pose, covariance = team_pose(prior, [first, second], None)
-    assert pose[0] == pytest.approx(2.0 + 1.5, abs=1e-2)
-    assert covariance[0, 0] == pytest.approx(1.0, rel=1e-2)
 
 
 def misread(local, place, shift):

@@ -12,11 +12,6 @@ from teamslam.team import core
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
 from teamslam.team.estimation.map_joining.joining import (
-    GapError,
-    LateStartError,
-    NotCanonicalError,
-    add_start,
-    fold_submaps,
     solve_fold,
 )
 from teamslam.team.estimation.map_joining.marginals import (
@@ -131,27 +126,6 @@ def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     np.testing.assert_allclose(
         landmark_map(one_by_one).means, landmark_map(at_once).means, atol=1e-8
     )
-
-
-def test_a_missing_submap_is_an_error_that_names_it():
-    world = team(4, robots=1)
-    with pytest.raises(GapError, match=r"r0 \(incarnation 0\): submap 3 came, 2 is next"):
-        joined([*world.submaps[:2], world.submaps[3]], world.starts)
-
-
-def test_a_submap_out_of_the_canonical_order_is_an_error():
-    world = team(4)
-    with pytest.raises(NotCanonicalError, match="out of order"):
-        joined([world.submaps[1], world.submaps[0]], world.starts)
-    fold = joined(world.submaps[:4], world.starts)
-    with pytest.raises(NotCanonicalError):
-        fold_submaps(fold, world.submaps[3:4], EXACTLY)
-
-
-def test_a_start_after_the_first_submap_is_an_error():
-    world = team(4)
-    with pytest.raises(LateStartError, match=r"r1 \(incarnation 0\)"):
-        add_start(joined(world.submaps[:2], world.starts), world.starts[1])
 
 
 # --- the mathematics of one factor ---

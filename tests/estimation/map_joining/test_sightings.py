@@ -53,27 +53,6 @@ def test_the_jacobian_of_a_sighting_is_what_central_differences_say(a, b, distan
         np.testing.assert_allclose(jacobian[:, k], difference, rtol=1e-4, atol=1e-4)
 
 
-def test_the_gradient_with_sightings_is_the_slope_of_the_cost_that_is_minimised():
-    world = meeting(3, robots=3, submaps=2)
-    island = joined_with(world.submaps, world.starts, world.sightings, JoinSettings()).main
-    assert len(island.graph.sightings) == len(world.sightings) == 12
-    gradient = island.estimate.gradient
-    for k in range(0, len(island.state), 4):
-        shift = 1e-6 * np.eye(len(island.state))[k]
-        up, down = (replace(island, state=island.state + s * shift).cost for s in (1, -1))
-        expected = (
-            0.0
-            if island.graph.fixed[np.searchsorted(island.graph.offset, k, "right") - 1]
-            else (up - down) / 4e-6
-        )
-        assert gradient[k] == pytest.approx(expected, rel=1e-3, abs=1e-3)
-        if expected:
-            # The parabola that an iteration lowers touches the robust cost here.
-            others = (replace(island, state=island.state + s * shift) for s in (1, -1))
-            up, down = (island.estimate.cost_of(each.estimate) for each in others)
-            assert (up - down) / 4e-6 == pytest.approx(expected, rel=1e-3, abs=1e-3)
-
-
 # --- redundancy ---
 
 

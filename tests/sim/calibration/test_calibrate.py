@@ -20,7 +20,7 @@ from teamslam.sim.calibration.figures import (
 )
 from teamslam.sim.calibration.join import joined_team
 from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
-from teamslam.sim.calibration.motion import creep, fit_motion
+from teamslam.sim.calibration.motion import fit_motion
 from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
@@ -131,18 +131,6 @@ def test_the_odometrys_figures_come_out_of_measurements_within_their_uncertainty
     assert found["turn.per_rad"].value == pytest.approx(0.08, rel=0.15)
 
 
-def test_the_scale_of_slow_speeds_is_learnt_where_robots_creep():
-    creeping = [driven(seed, speeds=(0.0, 0.01, 0.08)) for seed in range(1, 6)]
-    assert creep(creeping, 0.015)
-    assert not creep([driven(1)], 0.015)
-    found = by_name(jackknife(lambda part: fit_motion(part, None, 0.015), creeping, MOTION_UNITS))
-    for name, value in {"forward_scale": 1.05, "turn_drag": 0.1, "slow_scale": 2.4}.items():
-        assert abs(found[name].value - value) < 4.0 * found[name].sigma + 1e-3, found[name]
-    assert found["slow_scale"].sigma < 0.1
-    unaware = fit_motion(creeping, None)
-    assert unaware["forward.per_m"] > 1.5 * found["forward.per_m"].value
-
-
 def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty():
     data = [seeing(seed) for seed in range(1, 6)]
     found = by_name(jackknife(fit_sensor, data, SENSOR_UNITS))
@@ -155,35 +143,6 @@ def test_the_sensors_figures_come_out_of_measurements_within_their_uncertainty()
     assert found["bearing_sigma"].value == pytest.approx(0.01, rel=0.05)
     assert found["bearing_white"].value > 0.9
     assert found["bearing_outliers"].value == pytest.approx(0.03, abs=0.01)
-
-
-def spinning(seed: int, *, turns_first: bool) -> Reference:
-    """A base that turns up to 2 rad in a step of 1 s and drives 1.05 times what it logs."""
-    rng = np.random.default_rng(seed)
-    v, w = rng.uniform(0.2, 0.5, 300), rng.uniform(-2.0, 2.0, 300)
-    ahead = 1.05 * v + 0.01 * rng.standard_normal(300)
-    turn = 0.95 * w + 0.01 * rng.standard_normal(300)
-    heading = np.append(0.0, np.cumsum(turn))
-    toward = heading[1:] if turns_first else heading[1:] - 0.5 * turn
-    chord = ahead if turns_first else ahead * 2.0 * np.sin(0.5 * turn) / turn
-    x, y = (np.append(0.0, np.cumsum(chord * f(toward))) for f in (np.cos, np.sin))
-    stamps = np.arange(301, dtype=np.int64) * SECOND
-    path = Path(stamps, np.stack([x, y, on_circle(heading)], axis=1))
-    intervals = Intervals(stamps[1:], np.diff(stamps), v, w)
-    name = f"r{seed}"
-    return reference(name, intervals=intervals, path=path, turns_first=turns_first)
-
-
-@pytest.mark.parametrize("turns_first", [True, False])
-def test_two_robots_that_turn_as_far_as_they_like_are_calibrated(turns_first):
-    data = [spinning(seed, turns_first=turns_first) for seed in (1, 2)]
-    found = by_name(jackknife(lambda part: fit_motion(part, None), data, MOTION_UNITS))
-    assert found["forward_scale"].value == pytest.approx(1.05, abs=0.01)
-    assert found["yaw_scale"].value == pytest.approx(0.95, abs=0.005)
-    assert found["turn_drag"].value < 0.005
-    confused = [replace(each, turns_first=not turns_first) for each in data]
-    wrong = fit_motion(confused, None)
-    assert abs(wrong["forward_scale"] - 1.05) + wrong["turn_drag"] > 0.05
 
 
 def test_too_little_motion_or_too_few_measurements_are_said(bases):

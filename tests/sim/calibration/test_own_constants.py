@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
-from teamslam.sim.calibration.calibrate import _other_model
 from teamslam.sim.calibration.data import Reference
 from teamslam.sim.calibration.own import marker_spread, own_constants
-from teamslam.sim.calibration.sensor import fit_sensor
 from teamslam.sim.world.streams import Intervals, grouped
 from tests.sim.calibration.test_calibrate import reference
 
@@ -94,15 +92,6 @@ def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world()
     own = found["bias_sigma.range_scale"]
     together = np.sqrt((2.0 * own**2 + 2.0 * 0.02**2) / 3.0 * 1.5)
     assert found["common_bias_sigma.range_scale"] == pytest.approx(together, rel=0.1)
-
-
-@pytest.mark.parametrize("depth", [True, False])
-def test_the_wrong_model_of_the_range_is_told(depth):
-    data = team(CAMERAS, depth=depth)
-    assert fit_sensor(data, depth=depth)["range_sigma_per_m"] == pytest.approx(0.01, rel=0.1)
-    assert _other_model(data, depth) == ()
-    (told,) = _other_model(data, not depth)
-    assert f"set range_is_depth = {str(depth).lower()}" in told
 
 
 def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike():

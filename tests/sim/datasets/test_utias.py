@@ -15,7 +15,7 @@ from teamslam.sim.calibration.source import measurements_of, own_scenario
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets import errata
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.utias import start_pose, utias
+from teamslam.sim.datasets.utias import utias
 from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
@@ -164,36 +164,6 @@ def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(name, tmp_path
         assert np.allclose(before.start.pose, after.start.pose, atol=1e-8)
         assert np.allclose(before.intervals.forward, after.intervals.forward, atol=1e-8)
         assert len(before.landmark_detections.ids) == len(after.landmark_detections.ids)
-
-
-def test_the_start_pose_is_the_truth_with_the_given_sigmas(folder):
-    start = read(folder, start_sigma_m=0.05, start_sigma_rad=0.03).streams[0].start
-    assert np.allclose(start.covariance, np.diag([0.0025, 0.0025, 0.0009]))
-
-
-def test_a_start_heading_survives_the_fault_of_resampled_truth_at_the_wrap():
-    stamps = 20_000_000 * np.arange(21)
-    heading = np.full(21, 3.1415)
-    heading[10:] = -3.1414
-    heading[8:12] = [2.0, 0.7, -0.6, -1.9]  # what linear resampling makes of the step at ±π
-    truth = np.column_stack([0.1 * np.arange(21), np.zeros(21), heading])
-    pose = start_pose(stamps, truth, 205_000_000)
-    assert pose[0] == pytest.approx(1.025)
-    assert abs(np.angle(np.exp(1j * (pose[2] - np.pi)))) < 1e-3
-    assert -np.pi < pose[2] <= np.pi
-    assert start_pose(stamps, truth, 10**9) is None
-
-
-def test_a_cut_ends_the_whole_team_at_one_time(folder, simulated):
-    for given, cut in zip(simulated.streams, read(folder, duration_s=60.0).streams, strict=True):
-        assert cut.stamps_ns[-1] == 60 * 10**9
-        assert np.count_nonzero(cut.kinds == ODOMETRY) == 60
-        assert np.array_equal(cut.intervals.forward, read_forward(given)[:60])
-        assert cut.truth_ns[-1] == 60 * 10**9
-
-
-def read_forward(stream: RobotStream) -> np.ndarray:
-    return np.array([float(f"{value:.9f}") for value in stream.intervals.forward])
 
 
 def test_measurements_that_mean_nothing_are_dropped_and_counted(folder):

@@ -2,8 +2,6 @@
 
 from io import StringIO
 
-import msgspec
-import pytest
 from rich.console import Console
 
 from teamslam.sim.launch import live, progress
@@ -92,16 +90,6 @@ def told(robots: int) -> Watch:
     return watch
 
 
-def impatient(monkeypatch: pytest.MonkeyPatch) -> tuple[live._Lines, StringIO]:
-    """Lines that come with every look, and where they go."""
-    for name in ("LINE_S", "SETTLED_S"):
-        monkeypatch.setattr(live, name, 0.0)
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
-    out = StringIO()
-    lines = live._Lines(Console(file=out, width=200))
-    return lines, out
-
-
 def printed(watch: Watch, width: int) -> list[str]:
     out = StringIO()
     Console(file=out, width=width).print(live._view("thesis, seed 1", watch, width))
@@ -129,35 +117,6 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
     assert "robot/r1: no measurements of this team yet" in progress.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
-
-
-def test_who_joins_whom_is_one_line_and_who_waits_no_warning(monkeypatch):
-    lines, out = impatient(monkeypatch)
-    watch = told(3)
-    joined = "r3 (incarnation 1) joined r1 (incarnation 1) at 9.0 s: {} landmarks that both show"
-
-    def shown(waits: str, why: str, *words: str, final: bool = False) -> list[str]:
-        begin = len(out.getvalue())
-        reasons = (f"{waits} (incarnation 1) not joined: with r1 (incarnation 1) {why}",)
-        assert watch.fused is not None
-        watch.fused = msgspec.structs.replace(
-            watch.fused, reasons=reasons, joined=words, final=final
-        )
-        watch.statuses["central"] = status("central", "joining", *reasons)
-        lines.show(watch)
-        return [line[11:] for line in out.getvalue()[begin:].splitlines()]
-
-    (before,) = shown("r2", "pairs 7 < 8")
-    assert "landmarks in the team's map; not joined yet: r2" in before
-    assert shown("r2", "pairs 6 < 8") == []
-    assert shown("r2", "share .4 < .5", joined.format(9))[0] == (
-        "r3 joined r1 at 9.0 s: 9 landmarks that both show"
-    )
-    assert shown("r2", "evidence 9 < 15", joined.format(10)) == []
-    assert shown("r2", "evidence 9 < 15", joined.format(11), final=True) == []
-    lines.end()
-    assert "warning" not in out.getvalue()
-    assert any("not joined yet: r2: with r1 evidence 9" in line for line in printed(watch, 100))
 
 
 def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such():

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.paths import Limits, driven, followed, moved, wrapped
+from teamslam.sim.world.paths import followed, moved, wrapped
 from teamslam.sim.world.simulator import simulated
 from teamslam.sim.world.streams import (
     OBSERVATIONS,
@@ -21,8 +21,6 @@ from teamslam.sim.world.streams import (
     WorldStreams,
 )
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-
-angles = st.floats(-np.pi, np.pi)
 
 
 def world_of(scenario: Scenario, seed: int = 1) -> WorldStreams:
@@ -218,29 +216,6 @@ def test_a_followed_path_is_driven_by_its_own_steps(path, steps):
         pose = moved(pose, tuple(drive.steps[k].tolist()), "turn-then-drive")
         assert np.allclose(pose[:2], drive.poses[k + 1, :2], atol=1e-9)
     assert np.allclose(drive.poses[-1, :2], path[-1])
-
-
-@settings(deadline=None, max_examples=100)
-@given(st.floats(0.0, 3.0), st.floats(-3.0, 3.0), angles)
-def test_an_arc_is_the_limit_of_many_small_turns_and_drives(distance, turn, heading):
-    parts = 2000
-    direction = heading + turn * (np.arange(parts) + 0.5) / parts
-    x, y, end = moved((1.0, 2.0, heading), (distance, turn), "velocity")
-    assert x == pytest.approx(1.0 + distance * np.cos(direction).mean(), abs=1e-5)
-    assert y == pytest.approx(2.0 + distance * np.sin(direction).mean(), abs=1e-5)
-    assert np.exp(1j * end) == pytest.approx(np.exp(1j * (heading + turn)))
-
-
-@pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
-def test_a_driven_robot_reaches_its_way_points_within_its_limits_and_then_stands(kind):
-    points = [(20.0, 0.0), (20.0, 20.0), (19.0, 20.0), (0.0, 0.0)]
-    limits = Limits(distance=1.0, turn=0.5, tolerance=0.7)
-    drive = driven((0.0, 0.0, np.pi), iter(points), limits, kind, 150, lambda k, step: (0.0, 0.0))
-    for point in points:
-        assert np.hypot(*(drive.poses[:, :2] - point).T).min() <= 0.7
-    assert np.abs(drive.steps[:, 1]).max() <= 0.5
-    assert drive.steps[:, 0].max() <= 1.0
-    assert np.all(drive.steps[-10:] == 0.0)
 
 
 def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from teamslam.sim.studies.rules.map_fusion import (
     covariance_intersection,
     kalman,
-    kalman_per_axis,
 )
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from tests.estimation.submap_world import correlated
@@ -76,18 +75,3 @@ def test_the_intersection_holds_for_inputs_that_share_their_error(seed):
     weights = np.array([fused_mean(unit).means.ravel() for unit in np.eye(2 * n)]).T
     true = weights @ joint @ weights.T
     assert np.linalg.eigvalsh(claimed - true)[0] > -1e-8
-
-
-def test_the_per_axis_rule_drops_every_correlation():
-    fused = kalman_per_axis([random_map([1, 2], 5), random_map([2, 3], 6)])
-    np.testing.assert_array_equal(fused.covariance, np.diag(np.diag(fused.covariance)))
-
-
-def test_a_fused_map_absorbed_and_sent_again_is_counted_again_by_kalman_only():
-    a = random_map([1, 2], 8)
-    counted, intersected = a, a
-    for _ in range(10):
-        counted = kalman([counted, counted])
-        intersected = covariance_intersection([intersected, intersected])
-    np.testing.assert_allclose(counted.covariance, a.covariance / 1024.0, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(intersected.covariance, a.covariance, rtol=1e-6, atol=1e-9)

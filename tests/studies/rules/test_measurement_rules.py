@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -138,23 +137,3 @@ def test_a_robot_at_an_unknown_start_is_left_out_and_named(fusion):
     node, _ = heard(fusion, everything(both))
     assert node.final.frame == "r1/1"
     assert node.final.reasons == ("r2: its start pose is not known",)
-
-
-@pytest.mark.parametrize("fusion", RULES)
-def test_a_stream_that_begins_anew_ends_there(fusion):
-    later = [msgspec.structs.replace(x, incarnation=2) for x in MEASUREMENTS["r2"]]
-    later[0] = build.initial_pose(stamp_ns=later[0].stamp_ns, robot="r2", incarnation=2)
-    whole = {"r1": MEASUREMENTS["r1"], "r2": [*MEASUREMENTS["r2"][:8], *later]}
-    ends = m.End(
-        stamp_ns=0,
-        streams=(
-            m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS["r1"])),
-            m.StreamEnd(robot="r2", incarnation=2, measurements=len(later)),
-        ),
-    )
-    messages = [x for x in everything(whole) if not isinstance(x, m.End | m.Done)]
-    dones = [LAST_WORDS[0], build.done(robot="r2", incarnation=2, measurements=len(later))]
-    node, _ = heard(fusion, [*messages, *dones, ends])
-    assert node.finished
-    assert node.final.reasons == ("r2: its stream began anew",)
-    assert node.final.members[1].sequence < 8
