@@ -7,7 +7,7 @@ reflection. The covariance scale is judged last, beside all accepted causes.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from statistics import median
 from typing import Final, NamedTuple
 
@@ -238,16 +238,18 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
         robot = joined.contribution.robot
         for id_ in joined.contribution.local.ids.tolist():
             seen_by.setdefault(id_, set()).add(robot)
+    sole: dict[str, set[int]] = {}
+    for id_, robots in seen_by.items():
+        if len(robots) == 1:
+            sole.setdefault(min(robots), set()).add(id_)
     named = [id_ for id_ in known(fold.main) if id_ < UNNAMED and id_ in seen_by]
     points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
     places = dict(zip(named, points, strict=True))
     for robot, chain in sorted({**own, **withdrawn}.items()):
-        alone = {robot}
-        others = {id_: place for id_, place in places.items() if seen_by[id_] != alone}
         gains: list[float] = []
         wrong = 0
         for each in chain:
-            gain = _gain_of_reflection(others, each)
+            gain = _gain_of_reflection(places, each, sole.get(robot, ()))
             if gain is not None:
                 gains.append(gain)
                 wrong += not gain > 0.0
@@ -265,13 +267,15 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
             )
 
 
-def _gain_of_reflection(places: Mapping[int, complex], submap: Contribution) -> float | None:
+def _gain_of_reflection(
+    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
+) -> float | None:
     """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection.
 
-    places: the others' landmarks x + iy [m], by id.
+    places: the map's landmarks x + iy [m], by id. sole: those that the robot alone observes.
     """
     ids = submap.local.ids.tolist()
-    own = [k for k, id_ in enumerate(ids) if id_ in places]
+    own = [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
     if len(own) < LEAST_SHARED:
         return None
     z = _centred([places[ids[k]] for k in own])

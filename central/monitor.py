@@ -17,9 +17,9 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Bias
-from teamslam.team.estimation.consistency import Scale
+from teamslam.team.estimation.consistency import Scale, covariance_scale
 from teamslam.team.estimation.map_joining.condensed_factor import SubmapCost
-from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
+from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, columns_of
 
 SCALE_WARN = math.sqrt(2.0)
 """Bound of the team's covariance scale; its inverse is the lower one."""
@@ -108,10 +108,12 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
     """Compute the covariance scale of the team (the empty name) and of each robot."""
-    costs: dict[str, list[SubmapCost]] = {"": [*submaps]}
-    for each in submaps:
-        costs.setdefault(each.stream[0], []).append(each)
-    found = {who: scale_of(costs[who]) for who in sorted(costs)}
+    rows = columns_of(submaps)
+    places: dict[str, list[int]] = {}
+    for place, each in enumerate(submaps):
+        places.setdefault(each.stream[0], []).append(place)
+    found = {"": covariance_scale(*rows)}
+    found |= {robot: covariance_scale(*rows[:, places[robot]]) for robot in sorted(places)}
     return {
         who: Scale(each.value / normal, each.log_sigma)
         for who, each in found.items()

@@ -171,11 +171,9 @@ def _condense_island(
     rests = find_idle(graph, ~leaving, apart, first)
     eliminated = _mark_eliminated(graph, leaving)
     eliminated[rests] = eliminated[given_up] = True
-    seen = np.array(
-        [eliminated[each.observer] or eliminated[each.teammate] for each in graph.sightings],
-        np.bool_,
-    )
-    prior = np.array([eliminated[[*each.nodes]].any() for each in graph.priors], np.bool_)
+    out = eliminated.tolist()
+    seen = np.array([out[each.observer] or out[each.teammate] for each in graph.sightings], bool)
+    prior = np.array([any(out[node] for node in each.nodes) for each in graph.priors], bool)
     factors = MarkedFactors(leaving, seen, prior)
     union = nodes_of(island, factors, [] if before is None else [before.nodes])
     sizes = np.diff(graph.offset)

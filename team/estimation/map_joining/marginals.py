@@ -386,8 +386,12 @@ def _terms(island: Island) -> Terms:
 
 def scale_of(costs: Sequence[SubmapCost]) -> Scale | None:
     """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
-    rows = [(each.chi2, each.dof, each.median) for each in costs]
-    return covariance_scale(*np.array(rows, np.float64).reshape(-1, 3).T)
+    return covariance_scale(*columns_of(costs))
+
+
+def columns_of(costs: Sequence[SubmapCost]) -> Float[np.ndarray, "3 n"]:
+    """List χ², degrees of freedom, and the median of χ² of some submaps."""
+    return np.array([(each.chi2, each.dof, each.median) for each in costs]).reshape(-1, 3).T.copy()
 
 
 def unbounded_costs(island: Island) -> list[SubmapCost]:

@@ -542,17 +542,17 @@ def remove_nodes(
     The eliminated poses of a stream are its first ones. Condensed factors are left out.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
-    streams, gone = {}, dict(graph.gone)
+    streams, gone, out = {}, dict(graph.gone), eliminated.tolist()
     for stream, nodes in graph.streams.items():
-        first = int(eliminated[list(nodes)].sum())
+        first = sum(out[node] for node in nodes)
         streams[stream] = nodes[first:]
         gone[stream] = graph.first_sequence(stream) + first
     left = replace(
         graph,
         streams=streams,
-        landmarks={id_: node for id_, node in graph.landmarks.items() if not eliminated[node]},
-        poses={at: node for at, node in graph.poses.items() if not eliminated[node]},
-        former={at: node for at, node in graph.former.items() if not eliminated[node]},
+        landmarks={id_: node for id_, node in graph.landmarks.items() if not out[node]},
+        poses={at: node for at, node in graph.poses.items() if not out[node]},
+        former={at: node for at, node in graph.former.items() if not out[node]},
         submaps=tuple(compress(graph.submaps, submaps)),
         sightings=tuple(compress(graph.sightings, sightings)),
         priors=tuple(compress(graph.priors, priors)),
@@ -568,24 +568,22 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
     node_of: new number of each node. stays: origins of the new nodes, ascending. Condensed factors
     keep their numbers.
     """
+    new = node_of.tolist()
     return replace(
         graph,
-        streams={s: tuple(node_of[list(nodes)].tolist()) for s, nodes in graph.streams.items()},
-        landmarks={number: int(node_of[node]) for number, node in graph.landmarks.items()},
-        poses={key: int(node_of[node]) for key, node in graph.poses.items()},
-        former={key: int(node_of[node]) for key, node in graph.former.items()},
-        biases={key: int(node_of[node]) for key, node in graph.biases.items()},
-        common={bias: int(node_of[node]) for bias, node in graph.common.items()},
-        remembered={of: int(node_of[node]) for of, node in graph.remembered.items()},
+        streams={s: tuple(new[node] for node in nodes) for s, nodes in graph.streams.items()},
+        landmarks={number: new[node] for number, node in graph.landmarks.items()},
+        poses={key: new[node] for key, node in graph.poses.items()},
+        former={key: new[node] for key, node in graph.former.items()},
+        biases={key: new[node] for key, node in graph.biases.items()},
+        common={bias: new[node] for bias, node in graph.common.items()},
+        remembered={of: new[node] for of, node in graph.remembered.items()},
         offset=_starts(np.diff(graph.offset)[stays].tolist()),
         fixed=graph.fixed[stays],
         submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
-        sightings=tuple(
-            Encounter(seen, int(node_of[observer]), int(node_of[teammate]))
-            for seen, observer, teammate in graph.sightings
-        ),
+        sightings=tuple(Encounter(seen, new[a], new[b]) for seen, a, b in graph.sightings),
         priors=tuple(
-            each._replace(nodes=tuple(node_of[list(each.nodes)].tolist())) for each in graph.priors
+            each._replace(nodes=tuple(new[node] for node in each.nodes)) for each in graph.priors
         ),
         memory=graph.memory.renumbered(node_of),
     )
