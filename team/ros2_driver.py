@@ -6,14 +6,13 @@ Damaged, refused and lost messages are counted and named; none ends the process.
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from decimal import Decimal
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from teamslam.team.containment import place_of
+from teamslam.team.driver.driver import Driver
 from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.arrivals import MOST_WAITING, Backlog, Lost
@@ -67,38 +66,6 @@ OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
 """Called with (stamp [ns], pose (x, y, θ), odometry frame, base frame)."""
 
 
-@runtime_checkable
-class Robot(Protocol):
-    """The methods of a driver that are used here."""
-
-    @property
-    def sensor_mount(self) -> tuple[float, float, float] | None:
-        """The sensor's pose by the robot's process; None: unknown."""
-
-    @property
-    def antenna(self) -> tuple[float, float] | None:
-        """The GNSS antenna's place by the robot's process; None: unknown."""
-
-    def odometry(self, t: Decimal, forward: float, yaw_rate: float) -> None:
-        """Add speeds since the last call."""
-
-    def odometry_pose(self, t: Decimal, x: float, y: float, theta: float) -> None:
-        """Add the pose in the odometry's frame."""
-
-    def observe_points(
-        self, t: Decimal, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
-    ) -> None:
-        """Add landmarks; covariances: 2 × 2 of each."""
-
-    def sight(
-        self, t: Decimal, teammates: Sequence[str], ranges: ArrayLike, bearings: ArrayLike
-    ) -> None:
-        """Add teammates."""
-
-    def fix(self, t: Decimal, x: float, y: float, covariance: ArrayLike | None) -> None:
-        """Add a position of the antenna."""
-
-
 class Ros2Driver:
     """Passes the publications on a robot's topics to its driver.
 
@@ -111,7 +78,7 @@ class Ros2Driver:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: Driver,
         topics: RobotTopics,
         domain: int = 0,
         *,

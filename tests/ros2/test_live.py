@@ -10,6 +10,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
+from teamslam.team.driver.driver import Driver
 from teamslam.team.driver.journal import Journal
 from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.driver.node import SourceNode
@@ -30,8 +31,8 @@ TOPICS = RobotTopics(
 )
 
 
-class Robot:
-    """Takes what a driver would, and refuses time that goes back, as it does."""
+class Robot(Driver):
+    """A driver that stores its calls, and refuses time that goes back."""
 
     sensor_mount: tuple[float, float, float] | None = None
     antenna: tuple[float, float] | None = None
