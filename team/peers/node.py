@@ -321,13 +321,11 @@ class PeerNode:
         if not self._given.allows(self._now_s):
             self._refuse(f"requests for more than {GIVEN_BYTES} bytes a second")
             return []
-        batches = [encoded(batch) for batch in self._answer_request(query)]
+        sign = None if self.proofs is None else self.proofs.of
+        answer = make_answer(self.replica, query, self.node, sign)
+        batches = [encoded(batch) for batch in answer]
         self._given.note(sum(map(len, batches)))
         return batches
-
-    def _answer_request(self, request: m.MembersRequest) -> list[m.Members]:
-        sign = None if self.proofs is None else self.proofs.of
-        return make_answer(self.replica, request, self.node, sign)
 
     @property
     def agrees(self) -> dict[str, bool]:

@@ -115,7 +115,6 @@ class Replica:
         self.streams: dict[Stream, StreamShare] = {}
         self.statements: dict[str, dict[tuple[str, int], Member]] = {r: {} for r in self.robots}
         self.replacements = 0
-        self._holdings: dict[Stream, m.Holding] = {}
         self._statements: dict[str, m.Statements] = {}
         self._announced: _Announced | None = None
 
@@ -133,7 +132,6 @@ class Replica:
         if isinstance(message, m.Submap | m.SightingFactor | m.InitialPose):
             stream = robot, message.incarnation
             outcome = self._add_streamed(member, stream)
-            self._holdings.pop(stream, None)
             self.replacements += outcome == "replaced"
         else:
             outcome = self._add_stated(member, robot)
@@ -268,12 +266,6 @@ class Replica:
             newest_ns=share.newest_ns,
         )
 
-    def _holding_of(self, stream: Stream) -> m.Holding | None:
-        holding = self._holdings.get(stream) or self.holding(stream)
-        if holding is not None:
-            self._holdings[stream] = holding
-        return holding
-
     def _statements_of(self, robot: str) -> m.Statements:
         found = self.statements[robot]
         if robot not in self._statements:
@@ -310,7 +302,7 @@ class Replica:
     @property
     def _announcement(self) -> "_Announced":
         if self._announced is None:
-            found = ((stream, self._holding_of(stream)) for stream in sorted(self.streams))
+            found = ((stream, self.holding(stream)) for stream in sorted(self.streams))
             holdings = {stream: each for stream, each in found if each is not None}
             statements = {
                 robot: self._statements_of(robot)
