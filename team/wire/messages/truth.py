@@ -16,8 +16,8 @@ class Truth(Message, frozen=True, kw_only=True, tag="truth/1"):
         check_finite(self.poses, "poses", 3 * len(stamps(self.stamps, "stamps")))
 
 
-class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"):
-    """True landmark positions, for the evaluation only: L ids and L × 2 floats."""
+class LandmarkPositions(Message, frozen=True, kw_only=True):
+    """Positions of landmarks with identities: L ids, ascending, and L × 2 floats."""
 
     ids: Ids
     positions: Floats
@@ -26,6 +26,10 @@ class TruthLandmarks(Message, frozen=True, kw_only=True, tag="truth_landmarks/1"
         check_ascending(self.ids, "ids")
         check_named(self.ids, "ids")
         check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+
+
+class TruthLandmarks(LandmarkPositions, frozen=True, kw_only=True, tag="truth_landmarks/1"):
+    """True landmark positions, for the evaluation only."""
 
 
 class TruthLabels(Message, frozen=True, kw_only=True, tag="truth_labels/1"):
@@ -63,16 +67,8 @@ class TruthPositions(Message, frozen=True, kw_only=True, tag="truth_positions/1"
         check_finite(self.positions, "positions", 2 * len(stamps(self.stamps, "stamps")))
 
 
-class KnownMap(Message, frozen=True, kw_only=True, tag="known_map/1"):
-    """Prior map for localisation-only robots: L ids, L × 2 floats in the team's frame."""
-
-    ids: Ids
-    positions: Floats
-
-    def check(self) -> None:
-        check_ascending(self.ids, "ids")
-        check_named(self.ids, "ids")
-        check_finite(self.positions, "positions", 2 * len(ids(self.ids, "ids")))
+class KnownMap(LandmarkPositions, frozen=True, kw_only=True, tag="known_map/1"):
+    """Prior map for localisation-only robots, in the team's frame."""
 
 
 class RadioPlan(Message, frozen=True, kw_only=True, tag="radio/1"):
