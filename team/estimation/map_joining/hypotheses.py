@@ -269,13 +269,16 @@ def change_of(sights: Sights) -> _Two | None:
     return _Two(np.arange(n) >= least + best, one - two[best])
 
 
-def clusters_of(sights: Sights, scale: float) -> _Two | None:
-    """Find two places among a landmark's observations, whatever their order.
+def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
+    """Find two places among a landmark's observations, whatever their order; None where none has
+    enough evidence.
 
     scale: the covariance scale, by which the χ² that free assignments remove by chance is larger.
     """
     n = len(sights.places)
-    one = _chi2_about(sights, _centre(sights, np.ones(n, np.bool_)))
+    one = _chi2_about(sights, median(sights.points))
+    if float(one.sum()) <= enough + scale * _price(np.arange(n) < LEAST_SIDE):
+        return None
     gains = [
         np.maximum(one - _chi2_about(sights, sights.points[k : k + AT_ONCE, None]), 0.0).sum(axis=1)
         for k in range(0, n, AT_ONCE)
@@ -354,7 +357,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     for id_, own in sights.items():
         if len(own.places) < 2 * LEAST_SIDE:
             continue
-        moved, shared = change_of(own), clusters_of(own, base.scale)
+        moved, shared = change_of(own), clusters_of(own, base.scale, enough)
         if moved is not None and moved.evidence > enough:
             proposals.append((moved.evidence, id_, MOVED, moved.second))
         if shared is None or shared.evidence <= enough:
