@@ -76,14 +76,6 @@ def test_running_maps_and_priors_have_the_same_landmarks():
     assert all(ids(each.ids, "ids").tolist() == shown for each in priors)
 
 
-def test_the_rest_of_the_map_is_what_it_was():
-    """Landmarks that are not shown stay in the solution: no pose and no other landmark changes."""
-    whole, less = (final(rule({("r1", 3)}, landmark_submaps=least)) for least in (1, 2))
-    kept = [k for k, id_ in enumerate(ids(whole.ids, "ids").tolist()) if id_ != FALSE]
-    means = (np.frombuffer(each.means).reshape(-1, 2) for each in (whole, less))
-    np.testing.assert_array_equal(next(means)[kept], next(means))
-
-
 def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one():
     found = MapPublisher(SubmapFold(CentralConfig(tick_s=3.0, broadcast_s=3.0), b"settings"))
     found.store.add_start(published(STREAMS["r1"])[0])

@@ -19,7 +19,6 @@ from teamslam.central.desk.evaluation.errors import (
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.report.tables import team_rows
-from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.team.translate import joint_bytes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -149,34 +148,6 @@ def test_covariances_are_not_called_too_large_where_the_errors_are_larger(shift,
         log.append(msgspec.structs.replace(sample, payload=payload))
     run = evaluate(log)
     assert run.map.diagnosis == ((too_large,) if is_shown else ())
-
-
-def own_map(shift: float, of: Scenario) -> Outgoing:
-    world = streams(of)
-    n = len(world.landmark_ids)
-    estimate = build.map_estimate(
-        stamp_ns=9,
-        sequence=7,
-        ids=from_ids(world.landmark_ids),
-        means=from_floats(world.landmarks + shift),
-        covariance=joint_bytes(0.01 * np.eye(2 * n)),
-    )
-    return Outgoing(ch.OWN_MAP, "r1", estimate)
-
-
-def test_a_robots_last_own_map_is_held_against_the_truth():
-    of = scenario(robots=2)
-    nothing = final_map([], np.empty((0, 2)), np.empty((0, 0)))
-    said = [own_map(5.0, of), own_map(0.3, of), nothing]
-    run = evaluate([*world_log(of), *samples(said)])
-    own = run.robots["r1"].own_map
-    assert own.rmse_m == pytest.approx(0.3 * np.sqrt(2.0))
-    assert own.aligned_rmse_m == pytest.approx(0.0, abs=1e-9)
-    assert own.nees_per_dof == pytest.approx(0.09 / 0.01)
-    assert run.robots["r2"].own_map is None
-    figures = to_json(run)["robots"]
-    assert figures["r1"]["own_map_rmse_m"] == own.rmse_m
-    assert figures["r2"]["own_map_nees_per_dof"] is None
 
 
 @pytest.mark.parametrize(

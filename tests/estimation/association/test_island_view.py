@@ -24,10 +24,6 @@ from teamslam.team.estimation.association.landmark_sets import (
     merge_sets,
 )
 from teamslam.team.estimation.association.member_log import MergeRecord
-from teamslam.team.estimation.association.visibility import (
-    mark_visible,
-    pad_views,
-)
 from teamslam.team.estimation.association.voting import PointSet, apply_motion, propose_alignments
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.fold_association import view_island
@@ -149,24 +145,6 @@ def test_a_group_that_fits_at_two_places_is_not_swept(shift, merged):
     view = view_of_a_group_shifted_by(shift)
     view.sweep()
     assert len(view.ties) == merged
-
-
-def test_a_point_in_the_polygon_that_one_keyframe_saw_is_covered_and_one_outside_is_not():
-    rng = np.random.default_rng(3)
-    own = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0], [2.0, 1.0], [9.0, 9.0]])
-    views = pad_views([np.array([0, 1, 2, 3, 4]), np.array([2, 5, 4])])
-    points = rng.uniform(-1.0, 6.0, (400, 2))
-    inside = ((points > 0.0) & (points < [4.0, 3.0])).all(axis=1)
-    triangle = own[[2, 5, 4]]
-    sides = [_left(triangle[k], triangle[(k + 1) % 3], points) for k in range(3)]
-    inside |= np.all(sides, axis=0) | ~np.any(sides, axis=0)
-    assert mark_visible(points, own, views).tolist() == inside.tolist()
-    assert 50 < inside.sum() < 350
-
-
-def _left(one: np.ndarray, two: np.ndarray, points: np.ndarray) -> np.ndarray:
-    along, to = two - one, points - one
-    return along[0] * to[:, 1] - along[1] * to[:, 0] > 0.0
 
 
 def _points(mean: np.ndarray) -> PointSet:

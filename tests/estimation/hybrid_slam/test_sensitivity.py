@@ -336,33 +336,3 @@ def test_biases_stay_when_islands_merge():
 # --- a simulated team with a biased camera ---
 
 BEARING, RANGE = 0.01, 0.01
-
-
-def test_the_prior_of_a_sensor_that_was_changed_hardly_counts_and_its_slope_is_its_costs():
-    world, submaps, _ = biased_team(1)
-    options = JoinSettings(bias_sigma=SIGMA)
-    island = fold_of(world, submaps, options).main
-    k = next(k for k, prior in enumerate(island.graph.priors) if len(prior.mean) == 1)
-    prior = island.graph.priors[k]
-    at, sigma = island.graph.offset[prior.nodes[0]], prior.information[0, 0] ** -0.5
-
-    def shifted(by):
-        state = island.state.copy()
-        state[at] = prior.mean[0] + by
-        return replace(island, state=state)
-
-    assert shifted(10.0 * sigma).estimate.prior_weights[k] == pytest.approx(2.0 / 101.0)
-    plain = replace(shifted(10.0 * sigma), settings=replace(options, robust=False))
-    assert plain.estimate.prior_weights[k] == pytest.approx(2.0 / 101.0)
-    graph, h = island.graph, 1e-4 * sigma
-    counts = len(graph.submaps), len(graph.sightings), len(graph.priors)
-    marks = [np.full(count, k == 2) for k, count in enumerate(counts)]
-    nodes = np.unique([each.nodes[0] for each in graph.priors])
-
-    def prior_cost(by):
-        return shifted(by).estimate.quadratic(nodes, *marks)[2]
-
-    for by in (0.5 * sigma, 10.0 * sigma):
-        slope = (prior_cost(by + h) - prior_cost(by - h)) / (2.0 * h)
-        weighted = shifted(by).estimate.prior_weights[k] * prior.information[0, 0] * by
-        assert slope == pytest.approx(2.0 * weighted, rel=1e-5)

@@ -11,13 +11,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from teamslam.team.core import POSE_JITTER, moments, on_group, sample_factor
+from teamslam.team.core import POSE_JITTER, moments, sample_factor
 from teamslam.team.estimation.consistency import nees, state_error
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.models import Increment, increment_of
 from teamslam.team.estimation.randomness import random_numbers
-from teamslam.team.estimation.se2 import compose
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(
@@ -248,23 +247,6 @@ def test_a_pose_after_an_uncertain_turn_is_that_of_the_odometry_and_no_mean_of_c
     assert abs(local.mean[0] - 10.0) < 1e-3
     assert local.covariance[0, 0] < 1e-3
     np.testing.assert_allclose(local.covariance[1:3, 1:3], alone.covariance[1:, 1:], rtol=0.1)
-
-
-def test_the_mean_on_se2_moves_with_its_poses_and_their_deviations_stay():
-    rng = np.random.default_rng(4)
-    poses, weights = (
-        rng.normal([3.0, 1.0, 2.9], [2.0, 0.5, 0.8], (50, 3)),
-        rng.dirichlet([1.0] * 50),
-    )
-    by = np.array([-4.0, 7.0, 1.2])
-    mean, off = on_group(poses, weights)
-    moved, turned = on_group(np.array([compose(by, pose) for pose in poses]), weights)
-    np.testing.assert_allclose(moved, compose(by, mean), atol=1e-12)
-    ahead = np.array([1.0, 1j])
-    np.testing.assert_allclose(
-        turned[:, :2] @ ahead, np.exp(1.2j) * (off[:, :2] @ ahead), atol=1e-12
-    )
-    np.testing.assert_allclose(turned[:, 2], off[:, 2], atol=1e-12)
 
 
 @pytest.mark.parametrize(

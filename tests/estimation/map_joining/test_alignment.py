@@ -127,19 +127,6 @@ def test_without_any_start_the_smallest_stream_is_the_gauge_whoever_came_first()
     assert island.graph.fixed.sum() == 1
 
 
-def test_a_free_stream_before_any_with_a_start_joins_the_frame_of_the_start():
-    world = team(6, robots=2, submaps=8)
-    late = [
-        replace(each, end_ns=each.end_ns + (2500 if each.robot == "r1" else 0))
-        for each in world.submaps
-    ]
-    fold = joined(sorted(late, key=lambda each: each.key), world.starts[1:])
-    found = landmark_map(solve_fold(fold, OPTIONS))
-    assert len(fold.islands) == 1
-    assert fold.frame == ("r1", 0), "the stream whose known start fixes the frame names it"
-    assert np.abs(found.means - world.landmarks[found.ids]).max() < 1.5
-
-
 # --- islands among themselves ---
 
 

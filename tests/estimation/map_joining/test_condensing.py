@@ -5,27 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.map_joining import (
     marginals,
 )
-from teamslam.team.estimation.map_joining.auditing import fold_tick
-from teamslam.team.estimation.map_joining.condensed_factor import places
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     JoinSettings,
-    Tick,
     add_start,
     fold_submaps,
 )
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
-from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
-from tests.estimation.association.unnamed_worlds import (
-    circle,
-    drive,
-    ring,
-)
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import team
 
@@ -118,42 +108,3 @@ def test_an_inter_robot_measurement_that_was_left_out_is_not_restored():
     raw = restore_submaps(fold, world.submaps, world.sightings)
     assert raw.condensed_count == 0
     assert len(raw.main.graph.sightings) == len(others)
-
-
-SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
-LAPS = 5
-
-
-@pytest.fixture(scope="module")
-def laps():
-    """Laps of one robot on a ring: the full fold and the bounded one, submap after submap."""
-    rng = np.random.default_rng(5)
-    path = circle((0.0, 0.0), 20.0, 24 * LAPS, LAPS)
-    submaps, truth = drive("r1", path, ring(rng, 60), rng)
-    full = bounded = EMPTY_FOLD
-    for submap in submaps:
-        full = fold_tick(full, Tick([submap]), SETTINGS)
-        before = condense_submaps(bounded, Limits(30, lag=4))
-        bounded = fold_tick(before, Tick([submap]), SETTINGS)
-    return submaps, truth, full, bounded
-
-
-def test_landmarks_that_become_one_do_so_in_what_is_condensed_exactly(laps):
-    """The same point costs the same as one node and as two that are equal."""
-    *_, bounded = laps
-    island = bounded.main
-    before = island.graph
-    one, two = sorted(before.landmarks, key=before.landmarks.__getitem__)[5:7]
-    after, state = tie_landmarks(before, island.state, {two: one})
-    assert len(after.condensed.nodes) == len(before.condensed.nodes) - 1
-    state = state + 0.1 * np.random.default_rng(1).normal(size=len(state))
-    node_of = np.cumsum(np.arange(len(before.fixed)) != before.landmarks[two]) - 1
-    node_of[before.landmarks[two]] = after.landmarks[one]
-    equal = state[places(after.offset, node_of)]
-    cost = _cost_of(before.condensed, equal[before.boundary])
-    assert _cost_of(after.condensed, state[after.boundary]) == pytest.approx(cost, rel=1e-9)
-
-
-def _cost_of(condensed, values):
-    d = condensed.moved(values, np.arange(len(values)))
-    return condensed.cost + 2.0 * condensed.slope @ d + d @ condensed.information @ d

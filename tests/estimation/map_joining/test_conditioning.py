@@ -9,7 +9,6 @@ from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.gaussian import PoseGaussian, curved
 from teamslam.team.estimation.map_joining import conditioning
 from teamslam.team.estimation.map_joining.conditioning import (
-    TRUSTING,
     SubmapCorrection,
     compose_pose,
     join_pending,
@@ -18,7 +17,6 @@ from teamslam.team.estimation.map_joining.conditioning import (
 from teamslam.team.estimation.map_joining.gauss_newton import (
     JoinSettings,
     joint_marginal,
-    solve_island,
 )
 from teamslam.team.estimation.map_joining.marginals import prior_for, trajectory
 from teamslam.team.estimation.se2 import compose, exponential, tangent
@@ -62,34 +60,6 @@ def test_conditioning_equals_the_full_join_in_the_linear_case(seed, known):
         path.covariances[-1] / np.outer(sigma, sigma),
         atol=1e-3,
     )
-
-
-def test_a_chain_is_solved_as_the_teams_own_graph_of_prior_and_submaps_is():
-    """The chain has the graph's iterations, dense and in one call; the answers differ by rounding.
-
-    Large errors of the first guess, so that steps are shortened.
-    """
-    away = 0.0
-    for seed in range(4):
-        world = team(seed, submaps=8, landmarks=10, size=60.0, reach=20.0, sigmas=(0.3, 0.5, 2.0))
-        before, after = later(world, "r0", 3)
-        prior = prior_for(joined(before, world.starts), "r0", 0)
-        pending = [each.local for each in after]
-        found = conditioning._solve_chain(prior.whole, pending)
-        island, _, _ = solve_island(conditioning._make_island(prior.whole, pending, TRUSTING))
-        graph = island.graph
-        nodes = [graph.streams[conditioning.SELF][-1]]
-        nodes += [graph.landmarks[id_] for id_ in found.map.ids.tolist()]
-        mean, covariance = joint_marginal(island, nodes)
-        sigma = np.sqrt(np.diag(covariance))
-        away = max(away, np.abs((found.map.mean - mean) / sigma).max())
-        off = (found.map.covariance - covariance) / np.outer(sigma, sigma)
-        away = max(away, np.abs(off).max())
-        assert found.cost == pytest.approx(island.estimate.chi2.sum(), rel=1e-9)
-        assert found.dof == int(graph.dimensions.sum()) - graph.unknowns
-        beyond = np.concatenate(conditioning._beyond_gate(island))
-        np.testing.assert_array_equal(found.landmark_chi2 > conditioning.GATE, beyond)
-    assert away < 1e-9
 
 
 def test_an_open_window_is_one_more_submap():

@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.inter_robot import InterRobotFactor
@@ -15,11 +14,9 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     ages,
     final_cost,
     iterate_tick,
-    take_step,
 )
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import (
-    joint_cost,
     landmark_blocks,
     landmark_map,
     prior_for,
@@ -132,33 +129,6 @@ def test_a_discounted_landmark_counts_as_if_its_own_error_were_larger():
         np.testing.assert_allclose(found @ P, np.eye(len(P)), atol=1e-8)
 
 
-def test_a_factor_on_all_covariances_is_the_same_as_covariances_that_are_so_much_larger():
-    """Gates, weights, cost and redundancy agree; the mutant's gate ignores the factor."""
-    world = team(4, robots=2, submaps=12, landmarks=10, sigmas=(0.1, 0.03, 0.15))
-    submaps = mistaken(world, 4)
-    larger = [
-        replace(each, local=replace(each.local, covariance=6.0 * each.local.covariance))
-        for each in submaps
-    ]
-    exactly = replace(ROBUST, step_tolerance=1e-11)
-    told = fold_of(world, submaps, replace(exactly, covariance_factor=6.0))
-    meant = fold_of(world, larger, exactly)
-    weight = meant.main.estimate.landmark_weights
-    assert (weight < 0.5).any()
-    np.testing.assert_allclose(told.main.estimate.landmark_weights, weight, rtol=1e-6)
-    unscaled = replace(told.main, settings=exactly).estimate.landmark_weights
-    assert (unscaled[weight < 0.5] < 0.3 * weight[weight < 0.5]).all(), "the factor matters"
-    np.testing.assert_allclose(told.main.state, meant.main.state, atol=1e-6)
-    for name in ("dimensions", "chi2", "whole_chi2", "counted_chi2", "weights", "cost"):
-        one, other = (getattr(each.main.estimate, name) for each in (told, meant))
-        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-9, err_msg=name)
-    found, expected = landmark_map(told), landmark_map(meant)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-5, atol=1e-9)
-    one, other = joint_cost(told), joint_cost(meant)
-    assert one.dof == pytest.approx(other.dof, rel=1e-6)
-    assert one.chi2 == pytest.approx(other.chi2, rel=1e-5)
-
-
 ANNEALED = JoinSettings()
 AT_ONCE = replace(ANNEALED, robust_start=1.0)
 """The mutant: a factor is judged at its final scale from the first iteration on."""
@@ -207,36 +177,6 @@ def test_a_true_sighting_bends_the_chain_tick_by_tick_and_one_that_is_judged_at_
     assert annealed.estimate.sighting_weights.min() > 0.5
     assert off_m(mutant) > 2.0
     assert final_cost(annealed) < final_cost(mutant)
-
-
-def dense(pattern, values):
-    """The symmetric matrix whose blocks of the lower triangle these are."""
-    matrix = np.zeros((pattern.offset[-1], pattern.offset[-1]))
-    for entry, (row, column) in enumerate(zip(pattern.rows, pattern.columns, strict=True)):
-        block = values[pattern.value_start[entry] : pattern.value_start[entry + 1]]
-        block = block.reshape(pattern.sizes[row], pattern.sizes[column])
-        rows, columns = (slice(pattern.offset[k], pattern.offset[k + 1]) for k in (row, column))
-        matrix[rows, columns], matrix[columns, rows] = block, block.T
-    return matrix
-
-
-@pytest.mark.parametrize("damping", [1e-4, 0.3, 20.0])
-def test_a_damped_step_solves_the_equations_with_so_much_more_of_their_diagonal(damping):
-    world = team(4, robots=2, submaps=4)
-    island = joined_with(world.submaps, world.starts, (), JoinSettings(), 1000).main
-    free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
-    away = np.random.default_rng(1).uniform(-0.01, 0.01, len(free))
-    island = replace(island, state=np.where(free, island.state + away, island.state))
-    values, gradient = island.estimate.normal_equations
-    hessian = dense(island.graph.pattern, values)
-    damped = hessian + damping * np.diag(np.diag(hessian))
-    expected = -np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-    moved, eased, largest = take_step(island, damping)
-    np.testing.assert_allclose((moved.state - island.state)[free], expected, rtol=1e-6, atol=1e-10)
-    np.testing.assert_array_equal(moved.state[~free], island.state[~free])
-    assert largest == pytest.approx(np.abs(expected).max())
-    assert eased == pytest.approx(0.0 if damping == 1e-4 else damping / 10.0)
-    assert island.estimate.cost_of(moved.estimate) < island.estimate.cost_of(island.estimate)
 
 
 def test_the_map_has_the_landmarks_own_sigma_and_the_robots_priors_have_not():

@@ -117,19 +117,3 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
     assert "robot/r1: no measurements of this team yet" in progress.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
-
-
-def test_a_world_that_is_far_ahead_of_the_map_is_named_as_such():
-    watch = Watch()
-    watch.statuses["world"] = world = build.status(
-        stamp_ns=310 * 10**9,
-        node="world",
-        state="ended",
-        figures={"team_time_s": 300.0},
-        warnings=(),
-    )
-    assert progress.times(watch, world) == "team time 0 s (the world is 300 s ahead of the map)"
-    watch.fused = fused_map(stamp_ns=130 * 10**9)
-    assert progress.times(watch, world) == "team time 120 s (the world is 180 s ahead of the map)"
-    watch.fused = fused_map(stamp_ns=305 * 10**9)
-    assert progress.times(watch, world) == "team time 300 s"
