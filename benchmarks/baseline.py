@@ -1,8 +1,7 @@
 """Compare the figures of a benchmark with its committed baseline.
 
-`benchmarks/NAME.json` has the `command`, where it was `measured`, and for each of its `figures` the
-`value`, the direction that is `better` ("less" or "more"), and the `tolerance`: the share by which
-it may be worse. Ratios within one run hold on any machine.
+`benchmarks/NAME.json`: `command`, place of measurement, and for each of its `figures` the `value`,
+the `better` direction ("less" or "more") and `tolerance`, the share by which it may be worse.
 """
 
 import json
@@ -35,7 +34,7 @@ def baselines() -> dict[str, dict[str, Any]]:
     return {name: told for name, told in read.items() if "figures" in told}
 
 
-def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held]:
+def compare_figures(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held]:
     rows = []
     for name, of in baseline["figures"].items():
         sign = 1.0 if of["better"] == "less" else -1.0
@@ -44,16 +43,16 @@ def held(figures: Mapping[str, float], baseline: Mapping[str, Any]) -> list[Held
     return rows
 
 
-def worse(figures: Mapping[str, float], name: str) -> list[str]:
+def find_worse(figures: Mapping[str, float], name: str) -> list[str]:
     return [
         f"{row.name} is {row.value:.4g}, it was {row.was:.4g} and may be {row.bound:.4g}"
-        for row in held(figures, baselines()[name])
+        for row in compare_figures(figures, baselines()[name])
         if row.is_worse
     ]
 
 
-def concluded(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
-    """Print the figures, write them to `file` if given, and compare them with the baseline.
+def conclude(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
+    """Print the figures, write them to `file`, and compare them with the baseline.
 
     wrong: further faults. Returns the exit status: 1 for any fault.
     """
@@ -61,6 +60,6 @@ def concluded(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: 
     print(text)
     if file is not None:
         file.write_text(text + "\n")
-    problems = [*wrong, *worse(figures, name)]
+    problems = [*wrong, *find_worse(figures, name)]
     print("\n".join(problems) or "nothing worse", file=sys.stderr)
     return 1 if problems else 0

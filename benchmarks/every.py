@@ -12,10 +12,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.baseline import Held, baselines, held
+from benchmarks.baseline import Held, baselines, compare_figures
 
 
-def found(name: str, command: str, output: Path) -> dict[str, float]:
+def run_benchmark(name: str, command: str, output: Path) -> dict[str, float]:
     """Run a benchmark; status 1 means that some figures are worse."""
     page = output / f"{name}.json"
     page.unlink(missing_ok=True)
@@ -52,7 +52,7 @@ def main() -> int:
         command = known[name]["command"]
         print(f"{name}: {command}", file=sys.stderr)
         try:
-            rows = held(found(name, command, told.output), known[name])
+            rows = compare_figures(run_benchmark(name, command, told.output), known[name])
         except (OSError, ValueError, KeyError) as error:
             lines.append(f"{name:10} failed: {error}")
             is_worse = True

@@ -1,10 +1,9 @@
 """Measure the latency from a submap's arrival to the maps and priors that contain it.
 
-`python -m benchmarks.fresh [LOG…] [--json FILE]`, of logs of `launch` at any pace, or of a run of
-its own at ten times real time. Wall time from each submap but those of the last second to the first
-map (a centre's or a peer's) and the first prior of another robot that contain it. It must be within
-three times the round trip (median from a submap to the centre's credit) plus the reported solution
-time.
+`python -m benchmarks.fresh [LOG…] [--json FILE]`, of logs of `launch`, or of a run of its own at
+ten times real time. Wall time from each submap, without the last second's, to the first map and the
+first prior of another robot. Limit: three times the round trip (median from a submap to the
+centre's credit) plus the reported solution time.
 """
 
 import argparse
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import find_worse
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -27,7 +26,7 @@ CHANNELS = (ch.SUBMAP, ch.FUSED_MAP, ch.PRIOR, ch.CENTRAL_PROGRESS, ch.STATUS)
 Submap = tuple[str, int, int]
 
 
-def measured(log: Path) -> dict[str, Any]:
+def measure_latency(log: Path) -> dict[str, Any]:
     """Seconds until the map and until a teammate's prior; the round trip and the solution time."""
     arrived: dict[Submap, float] = {}
     mapped: dict[Submap, float] = {}
@@ -87,7 +86,7 @@ def _first(
             sequence -= 1
 
 
-def launched(folder: Path) -> Path:
+def launch_run(folder: Path) -> Path:
     words = ["launch", "waypoints", "--speed", "10", "--no-report", "--no-views"]
     subprocess.run(
         [sys.executable, "-P", "-m", "teamslam", *words, "--output", str(folder)],
@@ -105,12 +104,12 @@ def main() -> int:
     options = parser.parse_args()
     problems: list[str] = []
     if options.logs:
-        found: dict[str, Any] = {str(log): measured(log) for log in options.logs}
+        found: dict[str, Any] = {str(log): measure_latency(log) for log in options.logs}
     else:
         with tempfile.TemporaryDirectory() as made:
-            figures = measured(launched(Path(made) / "run"))
+            figures = measure_latency(launch_run(Path(made) / "run"))
         found = {"ratio": figures["ratio"], "within": figures["within"]}
-        problems = worse(found, "fresh")
+        problems = find_worse(found, "fresh")
     sys.stdout.write(json.dumps(found, indent=1) + "\n")
     if options.json is not None:
         options.json.write_text(json.dumps(found, indent=1) + "\n")

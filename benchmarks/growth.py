@@ -1,14 +1,13 @@
 """Measure how the centre's time, memory and bytes per broadcast grow with a run's length.
 
     python -m benchmarks.growth [--robots 5] [--landmarks 50] [--at 250,500,1000,2500] [--json FILE]
-                                [--identities hidden]
+                              [--identities hidden]
 
-Synthetic submaps about a known truth go through the rule `join` without a network: in each tick all
-robots end a window, then comes a broadcast. At each size: CPU per tick (median of the last WINDOW),
-resident memory, bytes of the map and of all priors, and the map's error. `ratio_*` compare the ends
-of one run, so they hold on any machine. Exit status 1 if a figure is worse than growth.json allows.
-Without identities each submap renumbers its landmarks, the error is to the nearest true landmark,
-and `window_ms` is a robot's cost to associate one window of WINDOW scans.
+Synthetic submaps go through the rule `join` without a network: in each tick all robots end a
+window, then comes a broadcast. Each size reports CPU per tick (median of the last WINDOW), resident
+memory, bytes of the map and of all priors, and map error. `ratio_*` compare the ends of one run.
+Without identities the error is to the nearest true landmark, and `window_ms` is a robot's cost to
+associate one window of WINDOW scans. Exit status 1 if a figure is worse than growth.json allows.
 """
 
 import argparse
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import find_worse
 from teamslam.central.config import CentralConfig
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
@@ -148,7 +147,7 @@ def window_ms(world: World) -> float:
     return float(np.median(spent))
 
 
-def measured(
+def measure_growth(
     robots: int, landmarks: int, at: list[int], hidden: bool = False
 ) -> list[dict[str, float]]:
     world = World(robots, landmarks, hidden=hidden)
@@ -180,7 +179,7 @@ def measured(
                 "rmse_m": _rmse(out, world),
             }
             if hidden:
-                row |= {"landmarks": float(_shown(out)), "window_ms": window_ms(world)}
+                row |= {"landmarks": float(_count_landmarks(out)), "window_ms": window_ms(world)}
             rows.append(row)
             print("  ".join(f"{key} {value:.5g}" for key, value in row.items()), flush=True)
     return rows
@@ -203,15 +202,12 @@ def _rmse(out: list[Outgoing], world: World) -> float:
     return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
-def _shown(out: list[Outgoing]) -> int:
+def _count_landmarks(out: list[Outgoing]) -> int:
     return max(len(ids(o.message.ids, "ids")) for o in out if isinstance(o.message, m.FusedMap))
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Figures of the baseline: the largest size, and its ratio to 500 submaps or the least.
-
-    kb_per_submap: between the last two sizes.
-    """
+    """Figures of the baseline: the largest size, and its ratio to 500 submaps or the least."""
     last = rows[-1]
     base = next((row for row in rows if row["submaps"] >= 500), rows[0])
     before = rows[-2] if len(rows) > 1 else rows[0]
@@ -233,13 +229,13 @@ def main() -> int:
     parser.add_argument("--identities", choices=["hidden"])
     told = parser.parse_args()
     at = sorted(int(each) for each in told.at.split(","))
-    rows = measured(told.robots, told.landmarks, at, told.identities == "hidden")
+    rows = measure_growth(told.robots, told.landmarks, at, told.identities == "hidden")
     found: dict[str, Any] = {"rows": rows, "figures": figures(rows)}
     print(json.dumps(found["figures"], indent=1))
     if told.json:
         told.json.write_text(json.dumps(found, indent=1) + "\n")
     case = told.robots, told.landmarks, at[-1], told.identities
-    problems = worse(found["figures"], BASELINES[case]) if case in BASELINES else []
+    problems = find_worse(found["figures"], BASELINES[case]) if case in BASELINES else []
     print("\n".join(problems), file=sys.stderr)
     return 1 if problems else 0
 

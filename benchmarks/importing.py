@@ -2,9 +2,9 @@
 
     python -m benchmarks.importing [--messages 40000] [--damaged 1000000] [--json FILE]
 
-A bag of odometry and detections is written as .mcap and .db3, read plainly (deserialised by
-rosbags), and imported. Damaged payloads must be refused or sound. Exit status 1 if another error
-was raised or a figure is worse than benchmarks/importing.json allows.
+A bag is written as .mcap and .db3, deserialised by rosbags, and imported. Damaged payloads must be
+refused or sound. Exit status 1 for another error or a figure worse than benchmarks/importing.json
+allows.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rosbags.highlevel import AnyReader
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import find_worse
 from teamslam.sim.importing.bag import import_bag
 from teamslam.team.ros2.decoding import READERS, DamagedError, decode
 from teamslam.team.ros2.definitions import types
@@ -102,7 +102,7 @@ def main() -> int:
     print(json.dumps(figures, indent=1))
     if asked.json:
         asked.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = worse(figures, "importing")
+    problems = find_worse(figures, "importing")
     print("\n".join(problems))
     return int(bool(problems))
 

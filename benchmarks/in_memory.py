@@ -2,10 +2,9 @@
 
     python -m benchmarks.in_memory [--robots 50,400] [--steps 24] [--json FILE]
 
-`random-50` at constant density, so each robot detects equally many landmarks. Each size runs in its
-own process. cpu_ms: of one robot, with the world's simulation. verify_ms: to compute all of it
-again. equal: share of messages recomputed to the last bit. growth_*: the largest size over the
-smallest, so they hold on any machine. Exit status 1 if one is worse than in_memory.json allows.
+`random-50` at constant density, each size in its own process. cpu_ms: of one robot, with the
+world's simulation. verify_ms: to compute all of it again. equal: share of equal messages. growth_*:
+largest size over smallest. Exit status 1 if one is worse than in_memory.json allows.
 """
 
 import argparse
@@ -21,7 +20,7 @@ from typing import Any
 
 import msgspec
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import find_worse
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -107,7 +106,7 @@ def main() -> int:
     print(json.dumps(found["figures"], indent=1))
     if told.json is not None:
         told.json.write_text(json.dumps(found, indent=1) + "\n")
-    problems = worse(found["figures"], "in_memory") if told.robots == MEASURED else []
+    problems = find_worse(found["figures"], "in_memory") if told.robots == MEASURED else []
     print("\n".join(problems), file=sys.stderr)
     return int(bool(problems) or found["figures"]["equal"] < 1.0)
 

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.peers [--json FILE] [--picture FILE]`: peers without estimators, each of which
 closes a submap of 1.2 kB every 10 s for 300 s of team time and exchanges messages every second. The
-star is a centre's traffic per robot. A run is compared with `benchmarks/peers.json`.
+star is a centre's traffic per robot.
 """
 
 import argparse
@@ -175,7 +175,7 @@ class Team:
         return len({node.replica.digest for node in self.nodes.values()}) == 1
 
 
-def measured(topology: str, robots: int) -> dict[str, float]:
+def measure_spreading(topology: str, robots: int) -> dict[str, float]:
     team = Team(topology, robots)
     team.begin()
     healed_s = CUT_S[1] if topology == "partition" else DRIVE_S
@@ -196,7 +196,7 @@ def measured(topology: str, robots: int) -> dict[str, float]:
     }
 
 
-def drawn(found: dict[str, dict[str, float]], path: Path) -> None:
+def draw_spreading(found: dict[str, dict[str, float]], path: Path) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -241,7 +241,7 @@ def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
     for topology in chosen.topologies:
         for robots in chosen.teams:
             name = f"{topology}/{robots}"
-            found[name] = figures = measured(topology, robots)
+            found[name] = figures = measure_spreading(topology, robots)
             numbers = " | ".join(f"{value:.0f}" for value in figures.values())
             show(f"| {topology} | {robots} | {numbers} |\n")
             for figure, value in figures.items():
@@ -252,7 +252,7 @@ def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
         there = json.loads(chosen.json.read_text()) if chosen.json.exists() else {}
         chosen.json.write_text(json.dumps(there | found, indent=1) + "\n")
     if chosen.picture is not None:
-        drawn(before | found, chosen.picture)
+        draw_spreading(before | found, chosen.picture)
     show("".join(f"worse: {each}\n" for each in worse))
     return 1 if worse else 0
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.baseline import concluded
+from benchmarks.baseline import conclude
 from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
@@ -51,7 +51,7 @@ def _cpu_s(part: Callable[[], None]) -> float:
     return time.process_time() - began
 
 
-def composed_at_once() -> None:
+def compose_directly() -> None:
     motion = Increment.identity()
     for _ in range(INTERVALS):
         motion = motion.then(increment_of(MOTION, INTERVAL_NS * 1e-9, 0.3, 0.1))
@@ -139,10 +139,10 @@ def driving(
     return taken
 
 
-def measured(rounds: int) -> dict[str, float]:
+def measure_ratios(rounds: int) -> dict[str, float]:
     at_70_hz = FrontEnd(particles=PARTICLES, keyframe_s=0.5, window_s=10.0)
     (node,) = least([driving(at_70_hz, DRIVEN, INTERVAL_NS, SCANNED, [3.0, 4.0])], rounds)
-    at_once, in_a_run = least([composed_at_once, composed_in_a_run], rounds)
+    at_once, in_a_run = least([compose_directly, composed_in_a_run], rounds)
     by_steps = driving(FrontEnd(particles=PARTICLES), STEPPED, 10**9, 1, [3.0, 4.0, 5.0, 6.0])
     plain, improved, judged, stepped = least([*steps(), by_steps], rounds)
     return {
@@ -159,8 +159,8 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
-    figures = measured(told.rounds)
-    return concluded(figures, "ratios", told.json)
+    figures = measure_ratios(told.rounds)
+    return conclude(figures, "ratios", told.json)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,8 @@
 
     python -m benchmarks.recorder [--robots 10] [--hz 100] [--seconds 60] [--json FILE]
 
-Real processes in real time: a router, `teamslam record`, and publishers of odometry and
-observations. Per key, published = recorded, and the log is sound. Exit status 1 if a message was
-lost or a figure is worse than benchmarks/recorder.json allows.
+A router, `teamslam record`, and publishers of odometry and observations in real time. Exit status 1
+if a message was lost or a figure is worse than benchmarks/recorder.json allows.
 """
 
 import argparse
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import concluded
+from benchmarks.baseline import conclude
 from teamslam.sim.scenarios.scenario import dumps, load, with_options
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
@@ -92,7 +91,7 @@ def peak_mib(pid: int) -> float:
     return int(line.split()[1]) / 1024.0
 
 
-def measured(robots: int, hz: float, seconds: float, folder: Path) -> dict[str, Any]:
+def measure_recorder(robots: int, hz: float, seconds: float, folder: Path) -> dict[str, Any]:
     scenario = with_options(load("thesis"), robots=robots)
     told = folder / "scenario.json"
     told.write_text(dumps(scenario))
@@ -168,7 +167,6 @@ def _figures(log: Path, said: list[dict[str, Any]], cpu: float, memory: float) -
 
 
 def _wait_for_recorder(bus: ZenohBus) -> None:
-    """Wait for the recorder's status."""
     bus.subscribe(ch.STATUS)
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
@@ -212,9 +210,9 @@ def main() -> int:
         publish(endpoint, team, robots, told.hz, told.seconds)
         return 0
     with tempfile.TemporaryDirectory() as folder:
-        figures = measured(told.robots, told.hz, told.seconds, Path(folder))
+        figures = measure_recorder(told.robots, told.hz, told.seconds, Path(folder))
     lost = (f"{k}: {v}" for k, v in figures["lost"].items())
-    return concluded(figures, "recorder", told.json, *figures["findings"], *lost)
+    return conclude(figures, "recorder", told.json, *figures["findings"], *lost)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     python -m benchmarks.rerun_rate LOG … [--json FILE]
 
-For each log: measurements per second and multiple of real time, and the rate at which the mcap
-library alone reads the messages (one core each, file in the cache). Exit status 1 if a result
-differs or five robots are slower than 35 × real time.
+Reports measurements per second, the multiple of real time, and the rate at which the mcap library
+alone reads (one core each). Exit status 1 if a result differs or five robots are slower than 35 ×
+real time.
 """
 
 import argparse
@@ -23,7 +23,7 @@ LEAST = 35.0
 """× real time for a team of five."""
 
 
-def plain(path: Path) -> tuple[int, float]:
+def read_plainly(path: Path) -> tuple[int, float]:
     began = time.process_time()
     with path.open("rb") as file:
         count = sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
@@ -33,7 +33,7 @@ def plain(path: Path) -> tuple[int, float]:
 def figures(path: Path) -> dict[str, Any]:
     """Figures of one log; CPU time of this process, which is that of one core."""
     log = open_log(path)
-    messages, measurement_s = plain(log.path)
+    messages, measurement_s = read_plainly(log.path)
     began = time.process_time()
     result = verify(log)
     rerun_s = time.process_time() - began

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import worse
+from benchmarks.baseline import find_worse
 from teamslam.team.containment import Boundary
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
@@ -57,7 +57,7 @@ def observations(i: int) -> m.Observations:
     )
 
 
-def entered(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
+def enter_team(endpoint: str, folder: Path | None, node: str) -> ZenohBus:
     return ZenohBus(TEAM, endpoint, 20.0, folder and credentials_of(folder, node, TEAM))
 
 
@@ -70,7 +70,7 @@ def serve(folder: Path | None) -> None:
 
 def take(endpoint: str, folder: Path | None, count: int) -> None:
     """The receiver's process: answers each progress by one, counts observations."""
-    with entered(endpoint, folder, "robot-r1") as bus:
+    with enter_team(endpoint, folder, "robot-r1") as bus:
         bus.subscribe(ch.OBSERVATIONS, "r1")
         bus.subscribe(ch.END)
         print("there", flush=True)
@@ -108,7 +108,7 @@ def link(folder: Path | None, count: int) -> tuple[float, float]:
         )  # fmt: skip
         assert receiver.stdout is not None
         receiver.stdout.readline()
-        with entered(endpoint, folder, "world") as bus:
+        with enter_team(endpoint, folder, "world") as bus:
             bus.subscribe(ch.ROBOT_PROGRESS, "r1")
             took = [ping(bus, i) for i in range(PINGS + 50)][50:]
             for i in range(count):
@@ -141,11 +141,8 @@ class Sink:
         return []
 
 
-def handling(count: int) -> tuple[float, float]:
-    """CPU seconds per message, decoded and handled by a node: without, and with the boundary.
-
-    The least of alternating turns excludes the machine's other load.
-    """
+def measure_boundary(count: int) -> tuple[float, float]:
+    """CPU seconds per message of a node: without, and with the boundary; the least of turns."""
     samples = [
         Sample(ch.OBSERVATIONS.key("r1"), encoded(observations(i)), i, 0, i) for i in range(count)
     ]
@@ -170,15 +167,15 @@ def handling(count: int) -> tuple[float, float]:
     return float(bare_s), float(within_s)
 
 
-def measured(count: int, rounds: int) -> dict[str, Any]:
-    """Each round has all halves; figures are medians over rounds, ratios those of the medians."""
+def measure_security(count: int, rounds: int) -> dict[str, Any]:
+    """Medians over rounds of all halves, and ratios of these medians."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         keys = Path(folder)
         make_keys(keys, TEAM, nodes_of(["r1"]))
         for _ in range(rounds):
             free, locked = link(None, count), link(keys, count)
-            rows.append((*free, *locked, *handling(count)))
+            rows.append((*free, *locked, *measure_boundary(count)))
     open_rate, open_s, keys_rate, keys_s, bare_s, within_s = (
         float(value) for value in np.median(np.array(rows), axis=0)
     )
@@ -207,11 +204,11 @@ def main() -> int:
     if told.take:
         take(told.take, told.keys, told.messages)
         return 0
-    figures = measured(told.messages, told.rounds)
+    figures = measure_security(told.messages, told.rounds)
     print(json.dumps(figures, indent=1))
     if told.json:
         told.json.write_text(json.dumps(figures, indent=1))
-    found = worse(figures, "security")
+    found = find_worse(figures, "security")
     print("\n".join(found) or f"within the baseline; load {os.getloadavg()[0]:.1f}")
     return 1 if found else 0
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from benchmarks.baseline import concluded
+from benchmarks.baseline import conclude
 from teamslam.sim.launch.launch import Plan, launch
 from teamslam.sim.launch.processes import PROGRAM, Starter
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -28,7 +28,7 @@ from teamslam.team.recording.reader import open_log
 from teamslam.team.wire.channels import SENSORS
 
 
-def launched(scenario: Scenario, folder: Path) -> dict[str, Any]:
+def launch_team(scenario: Scenario, folder: Path) -> dict[str, Any]:
     """Figures of one launch."""
     folder.mkdir()
     plan = Plan(
@@ -61,7 +61,7 @@ def command_first_s(words: list[str], folder: Path) -> float:
     return 1e-9 * (first_ns(folder / "log.mcap") - began_ns)
 
 
-def alone(folder: Path) -> dict[str, dict[str, float]]:
+def measure_idle(folder: Path) -> dict[str, dict[str, float]]:
     """Resources of a router, a recorder and a robot, ready and idle."""
     folder.mkdir()
     log = str(folder / "log.mcap")
@@ -80,21 +80,21 @@ def alone(folder: Path) -> dict[str, dict[str, float]]:
                 stderr=subprocess.STDOUT,
                 text=True,
             )
-            line = said(running[name], "listening at" if name == "router" else "connected")
+            line = await_line(running[name], "listening at" if name == "router" else "connected")
             connect = connect or ["--connect", line.split()[-1]]
-        return {name: settled(process.pid) for name, process in running.items()}
+        return {name: measure_at_rest(process.pid) for name, process in running.items()}
     finally:
         for process in running.values():
             process.terminate()
             process.communicate()
 
 
-def said(process: "subprocess.Popen[str]", words: str) -> str:
+def await_line(process: "subprocess.Popen[str]", words: str) -> str:
     assert process.stdout is not None
     return next(line for line in process.stdout if words in line)
 
 
-def settled(pid: int) -> dict[str, float]:
+def measure_at_rest(pid: int) -> dict[str, float]:
     """Memory and CPU of a process at rest: at most a tenth of a core for a second."""
     ticks = [-100]
     while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
@@ -118,11 +118,11 @@ def bare_cpu_s() -> float:
     return min(took)
 
 
-def measured(scenario: Scenario, words: list[str]) -> dict[str, Any]:
+def measure_start(scenario: Scenario, words: list[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
-        team = launched(scenario, Path(folder) / "team")
+        team = launch_team(scenario, Path(folder) / "team")
         first_s = min(command_first_s(words, Path(folder) / f"command-{k}") for k in range(3))
-        by_hand = alone(Path(folder) / "alone")
+        by_hand = measure_idle(Path(folder) / "alone")
     bare = bare_cpu_s()
     return {
         "robots": len(scenario.robots),
@@ -141,8 +141,8 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     words = [told.scenario, *([] if told.robots is None else ["--robots", str(told.robots)])]
-    figures = measured(with_options(load(told.scenario), robots=told.robots), words)
-    return concluded(figures, "start", told.json)
+    figures = measure_start(with_options(load(told.scenario), robots=told.robots), words)
+    return conclude(figures, "start", told.json)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.ledger import ledger
-from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.recorded import index_log
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.robot.ledger import IN_SIGHTING
@@ -102,7 +102,7 @@ def test_a_run_with_sightings_is_computed_again_to_the_last_bit(samples, tmp_pat
 
 
 def test_each_measurement_of_a_run_with_sightings_has_one_disposition(samples, tmp_path):
-    found = ledger(recorded(written(tmp_path / "log.mcap", samples)))
+    found = ledger(index_log(written(tmp_path / "log.mcap", samples)))
     assert found.offenders == ()
     used = {
         (x.robot, n)

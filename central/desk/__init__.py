@@ -1,1 +1,1 @@
-"""The operator's desk: reports, pictures, pages and checks of a running or recorded team."""
+"""The operator's desk: reports, pictures, pages and checks of a team."""

@@ -1,7 +1,4 @@
-"""Final map of a team without a centre: the map on which all peers agree.
-
-If peers differ, the team has no final map, and the differing peers are named.
-"""
+"""The final map on which all peers of a team agree."""
 
 import hashlib
 from collections import Counter
@@ -18,10 +15,9 @@ _NAMES = frozenset(channel.name for channel in LISTENS)
 
 
 class Agreement:
-    """Final map of each peer, as announced by that peer.
+    """Announced final map of each peer.
 
-    robots: the peers; None: all that announced a fold of their own. A robot that was given up or
-    withdrawn need not agree.
+    robots: the peers; None: all that announced a fold. Robots given up or withdrawn need not agree.
     """
 
     def __init__(self, robots: Collection[str] | None = None) -> None:
@@ -63,20 +59,20 @@ class Agreement:
         return sorted(set(known if self.robots is None else self.robots) - self._excused)
 
     def of(self, robot: str) -> bytes | None:
-        """SHA-256 of a robot's final map: from its conclusion, else of the map itself."""
+        """SHA-256 of a robot's final map."""
         if robot in self._concluded:
             return self._concluded[robot].sha256
         return self._finals[robot][0] if robot in self._finals else None
 
     @property
     def agreed(self) -> Sample | None:
-        """Final map on which all peers agree, as published by one of them."""
+        """Final map on which all peers agree."""
         found = {self.of(robot) for robot in self.needed}
         return self._final_with(*found) if len(found) == 1 else None
 
     @property
     def largest(self) -> Sample | None:
-        """Final map of most robots; among equal counts, the one with the smaller hash."""
+        """Final map of most robots; among equal counts, the smaller hash."""
         votes = Counter(sha for robot in self.needed if (sha := self.of(robot)) is not None)
         for sha, _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
             if (found := self._final_with(sha)) is not None:

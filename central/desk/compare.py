@@ -1,4 +1,4 @@
-"""Compare runs: one row per figure, one cell per run, and pictures."""
+"""Compare runs: tables and pictures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,10 +29,7 @@ MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
 
 
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
-    """Rows (figure, one cell per run), "–" for a missing figure.
-
-    A run in an arbitrary frame has aligned errors only.
-    """
+    """Rows (figure, one cell per run), "–" for a missing figure."""
     every = list(runs.values())
     columns = [_team_cells(run) for run in every]
     rows = [(name, tuple(of[name] for of in columns)) for name in (columns[0] if columns else ())]
@@ -49,7 +46,6 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
 
 
 def _team_cells(run: Evaluation) -> dict[str, str]:
-    """Cells of one run by figure."""
     fused, scenario = run.map, run.scenario
     shown = {c.heading: cells(run, [c])[0] for c in _MAP}
     if run.arbitrary_frame:
@@ -74,13 +70,13 @@ def _robot_cells(run: Evaluation, robot: RobotResult | None) -> list[str]:
 
 
 def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
-    """Figures of `compare_rows` by run and name, for JSON."""
+    """Figures of `compare_rows` by run and name."""
     rows = compare_rows(runs)
     return {name: {row[0]: row[1][k] for row in rows} for k, name in enumerate(runs)}
 
 
 def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw map error, map NEES and path errors of every run; False if none has truth."""
+    """Draw the errors of every run; False without truth."""
     errors = [None if run.map is None else run.map.errors for run in runs.values()]
     paths = [_aligned_m(each) for run in runs.values() for each in run.robots.values()]
     if not any(errors) and np.isnan(paths).all():
@@ -122,7 +118,7 @@ def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
 
 
 def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
-    """Largest distance between a landmark's two positions; None without a common landmark."""
+    """Largest distance [m] between a landmark's two positions; None without a common one."""
     if recorded.map is None or changed.map is None:
         return None
     _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)
@@ -131,7 +127,7 @@ def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
 
 
 def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw two final maps with 95 % ellipses over the truth; False if there is no map."""
+    """Draw two final maps with 95 % ellipses over the truth; False without a map."""
     if all(run.map is None for run in runs.values()):
         return False
     figure, ((axis,),) = new_figure(9.0, 9.0, 1, 1)

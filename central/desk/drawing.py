@@ -1,4 +1,4 @@
-"""Palette, robot colours and covariance ellipses of the pictures, the page and Foxglove."""
+"""Palette, robot colours and covariance ellipses of all views."""
 
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
@@ -14,34 +14,34 @@ if TYPE_CHECKING:
 BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 )  # fmt: skip
-"""Okabe and Ito's colour-blind-safe colours, for methods and event kinds."""
+"""Okabe and Ito's colour-blind-safe colours."""
 RED, BLACK, GREY = "#C00000", "#111111", "#7a7a7a"
 MAP_COLOUR, TRUTH_COLOUR, TRUE_LANDMARK_COLOUR = BLACK, GREY, RED
 ROBOT_COLOURS = (
     "#3b9dff", "#ff7a33", "#19c37d", "#e667b3", "#f2c230", "#9a7bff", "#33c7d9", "#ff5d6c",
     "#a3c644", "#c79a6b",
 )  # fmt: skip
-"""Robot colours in order of name, distinguishable on dark and light ground."""
+"""Robot colours in order of name, for dark and light ground."""
 ELLIPSE_SCALE = float(np.sqrt(5.991))
 """Mahalanobis distance that contains 95 % of a planar Gaussian."""
 BENT_RAD = 0.09
-"""Heading difference above which a path segment is drawn as a curve."""
+"""Heading difference [rad] above which a path segment is drawn as a curve."""
 
 
 def colour_of(number: int) -> str:
-    """Colour of a robot number as #rrggbb; repeats after the palette's end."""
+    """Colour of a robot number as #rrggbb; the palette repeats."""
     return ROBOT_COLOURS[number % len(ROBOT_COLOURS)]
 
 
 def robot_colours(names: Iterable[str]) -> dict[str, str]:
-    """Colour of each robot, the same in every view of the team."""
+    """Colour of each robot."""
     return {name: colour_of(number) for number, name in enumerate(in_order(names))}
 
 
 def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict[str, str]:
     """Legend entry of each robot; one common entry for more than `most` robots.
 
-    Matplotlib omits labels that begin with an underscore.
+    An entry with an underscore is omitted by Matplotlib.
     """
     ordered = in_order(names)
     if len(ordered) <= most:
@@ -54,8 +54,7 @@ def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict
 def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
     """Sample a curve through poses (x [m], y [m], theta [rad]) that follows their headings.
 
-    Between poses with different headings it is the cubic closest to an arc; where the headings
-    oppose along the chord, as in a turn on the spot, it is the chord. Reverse driving is supported.
+    It is the cubic closest to an arc, or the chord where the headings oppose along it.
     """
     if len(poses) < 2:
         return poses[:, :2].copy()
@@ -78,9 +77,9 @@ def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
 def ellipses(
     blocks: Float[np.ndarray, "L 3"],
 ) -> tuple[Float[np.ndarray, " L"], Float[np.ndarray, " L"], Float[np.ndarray, " L"]]:
-    """Compute the 95 % ellipses of covariances (xx, xy, yy) [m²].
+    """Half axes [m] and direction of the major axis [rad] of 95 % ellipses.
 
-    Returns major and minor half axes [m] and the direction of the major axis [rad].
+    blocks: covariances (xx, xy, yy) [m²].
     """
     xx, xy, yy = blocks.T
     middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)

@@ -1,8 +1,7 @@
 """Ledger of a log: the disposition of every measurement (law 1), and the maps of every submap.
 
-A submap names its interval of measurements, a map its version vector. Rejections and their reasons
-are recomputed by the robot's node from the recorded measurements. Measurements after the last
-submap are open if consumed, else lost.
+The robot's node recomputes rejections. Measurements after the last submap are open if consumed,
+else lost.
 """
 
 from collections import Counter
@@ -22,13 +21,13 @@ IN_SUBMAP = "in a submap"
 OPEN = "open"
 LOST = "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
-"""Limits on listed missing measurements: an absolute number, or a multiple of the existing ones."""
+"""Limits on listed missing measurements: a number, or a multiple of the existing ones."""
 SubmapName = tuple[str, int, int]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Disposition of one measurement; `submap`: sequence of the submap that contains it."""
+    """Disposition of one measurement, and sequence of its submap."""
 
     disposition: str
     submap: int | None
@@ -36,10 +35,9 @@ class Entry:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Every measurement's entry by stream and counter, every submap's maps, and violations.
+    """Entries by stream and counter, maps by submap, and violations.
 
-    maps: digests of the maps that used a submap, in log order. withdrawn: robots that the last map
-    leaves out; their measurements are in no map.
+    maps: digests in log order. withdrawn: robots that the last map leaves out.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
@@ -63,7 +61,7 @@ class Ledger:
         return dict(sorted(counts.items()))
 
     def statement(self) -> str:
-        """Result in one sentence."""
+        """Describe the result in one sentence."""
         parts = ", ".join(f"{count:,} {name}" for name, count in self.totals().items())
         sentence = (
             f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
@@ -75,7 +73,7 @@ class Ledger:
         return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
-        """Totals, violations, and measurement count and maps of each submap."""
+        """Totals, violations, and measurements and maps of each submap."""
         counts = Counter(
             (*stream, entry.submap)
             for stream, entries in self.entries.items()
@@ -103,10 +101,7 @@ class Ledger:
 
 
 def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> Ledger:
-    """Compute the ledger of a log. Raises RerunError without a robot's configuration.
-
-    progress: receives each robot's name before its measurements are replayed.
-    """
+    """Compute the ledger of a log; raises RerunError without a robot's configuration."""
     offenders = [
         f"{_named(r)} is in the log twice with different contents" for r in log.contradicted
     ]
@@ -134,7 +129,6 @@ def _named(measurement: m.Measurement) -> str:
 
 
 def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
-    """Submaps of a stream by sequence, and contradicting ones."""
     robot, incarnation = stream
     found: dict[int, m.Submap] = {}
     wrong = []
@@ -150,7 +144,7 @@ def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """Entry of every existing or expected measurement, and violations."""
+    """Entry of every existing or announced measurement, and violations."""
     robot, incarnation = stream
     measurements: Mapping[int, m.Measurement] = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
@@ -215,7 +209,6 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
 
 
 def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
-    """Maps that used each submap, and maps that use a missing submap or one twice."""
     users: dict[SubmapName, list[str]] = {
         (s.robot, s.incarnation, s.sequence): []
         for s in log.of(ch.SUBMAP)

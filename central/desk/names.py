@@ -1,4 +1,4 @@
-"""Robot names for display: order, and robots outside the team's map."""
+"""Robot names for display."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -17,20 +17,20 @@ PACKED = (".zip", ".mcap", ".db3")
 
 
 def data_set_name(path: str | PurePath) -> str:
-    """Name of a data set's folder, or of its file without suffix; empty if the path has none."""
+    """Name of a data set's folder or file, without suffix."""
     place = PurePath(path)
     return place.stem if place.suffix in PACKED else place.name
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Natural order: r2 before r10."""
+    """Sort naturally: r2 before r10."""
     return sorted(
         names, key=lambda name: [int(p) if p.isdigit() else p for p in _DIGITS.split(name)]
     )
 
 
 def not_joined(reasons: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Unjoined robots in a map's reasons, as `r2, r3`, with the reason."""
+    """Unjoined robots in a map's reasons, as `r2, r3`, and the reason."""
     for reason in reasons:
         who, apart, why = reason.partition(_NOT_JOINED)
         if apart:

@@ -1,6 +1,4 @@
-"""Operator orders to a running team: withdraw or give up a robot, end the team, and verdicts on
-unnamed landmarks.
-"""
+"""Operator orders to a running team."""
 
 import re
 import time
@@ -24,7 +22,7 @@ _LANDMARK = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")
 
 
 class WithdrawError(RuntimeError):
-    """The order was not given or not followed; the text has reason and remedy."""
+    """The order was not given or not followed."""
 
 
 class NoRobotError(WithdrawError):
@@ -32,7 +30,7 @@ class NoRobotError(WithdrawError):
 
 
 class RunningTeam:
-    """Running team on a bus: robots with messages, and whether a centre or peer folds."""
+    """Robots of a running team, and its folding nodes."""
 
     def __init__(self, bus: Bus, *channels: ch.Channel) -> None:
         self.bus = bus
@@ -44,11 +42,11 @@ class RunningTeam:
 
     @property
     def folds(self) -> bool:
-        """Whether a centre is alive, a peer announced its own fold, or a map arrived."""
+        """Whether a centre or peer of the team folds."""
         return self._has_peer or self._has_map or self.bus.is_alive("central")
 
     def messages(self, patience_s: float) -> Iterator[tuple[ch.Channel, m.Message]]:
-        """Valid messages that arrive within a time."""
+        """Receive valid messages for a time [s]."""
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
             for channel, name, message in open_valid(self.bus.receive(LOOK_S)):
@@ -62,7 +60,7 @@ class RunningTeam:
                 yield channel, message
 
     def maps(self, patience_s: float) -> Iterator[m.FusedMap]:
-        """Maps, of a centre or of peers, that arrive within a time."""
+        """Receive maps for a time [s]."""
         for _, message in self.messages(patience_s):
             if isinstance(message, m.FusedMap):
                 yield message
@@ -70,7 +68,7 @@ class RunningTeam:
     def await_robot(self, robot: str | None = None) -> None:
         """Wait for a centre or peer, and for a message of the robot.
 
-        Raises WithdrawError without either within CENTRE_S, NoRobotError without such a robot.
+        Raises WithdrawError or NoRobotError after CENTRE_S.
         """
         until = time.monotonic() + CENTRE_S
         while time.monotonic() < until:
@@ -87,7 +85,7 @@ class RunningTeam:
 
 
 def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
-    """Publish an order, followed by its signature if there are keys, since peers relay it."""
+    """Publish an order, with its signature for peers if there are keys."""
     bus.publish(order)
     if signer is not None:
         member = Member(order.key, encoded(order.message), order.message)
@@ -101,8 +99,7 @@ def withdraw(
 ) -> m.FusedMap:
     """Order a robot's withdrawal and return the first map without it.
 
-    signer: the operator's. Raises WithdrawError without centre or peer, without such a robot, under
-    a rule that cannot withdraw, or on timeout.
+    Raises WithdrawError if nobody can withdraw it, or on timeout.
     """
     team = RunningTeam(bus)
     team.await_robot(robot)
@@ -121,10 +118,9 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
 ) -> None:
-    """Order the team to continue without a lost robot; returns on confirmation.
+    """Order the team to continue without a lost robot; return on confirmation.
 
-    signer: the operator's. Raises WithdrawError without centre or peer, without such a robot, or on
-    timeout.
+    Raises WithdrawError if nobody confirms.
     """
     team = RunningTeam(bus, ch.STATUS)
     team.await_robot(robot)
@@ -143,9 +139,9 @@ def give_up(
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
-    """Order a live team to end; returns when the centre repeats the order or a peer follows.
+    """Order a live team to end; return when the centre repeats the order or a peer follows.
 
-    Raises WithdrawError without centre or peer, for a team with a world, or on timeout.
+    Raises WithdrawError for a team with a world, or if nobody confirms.
     """
     team = RunningTeam(bus, ch.TEAM_END)
     team.await_robot()
@@ -156,7 +152,7 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
         )
     order = m.TeamEnd(stamp_ns=0, by="operator", reason=reason)
     bus.publish(Outgoing(ch.END_ORDER, "", order))
-    # Without a centre each robot's own map is its end.
+    # Without a centre a robot's own final map confirms the order.
     last = ch.FINAL_MAP if bus.is_alive("central") else ch.TEAM_FINAL
     for channel, _ in team.messages(patience_s):
         if channel in (ch.TEAM_END, last):
@@ -165,7 +161,7 @@ def end_team(bus: Bus, reason: str, patience_s: float) -> None:
 
 
 def local_landmark(text: str) -> m.LocalLandmark:
-    """Parse `r1/1/12/7`: robot, incarnation, submap sequence, local landmark; raises ValueError."""
+    """Parse robot/incarnation/submap/landmark, such as `r1/1/12/7`. Raises ValueError."""
     found = _LANDMARK.fullmatch(text)
     if found is None:
         raise ValueError(f"{text!r} is no local landmark: robot/incarnation/submap/landmark")
@@ -183,10 +179,10 @@ def judge(
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:
-    """Publish a verdict on two unnamed landmarks; returns the first map that includes it.
+    """Publish a verdict on two unnamed landmarks; return the first map that includes it.
 
-    withdrawn: withdraw the verdict, and return a map without it. signer: the operator's. Raises
-    NoRobotError for an unknown robot, WithdrawError without centre or peer, or on timeout.
+    withdrawn: withdraw the verdict. Raises NoRobotError for an unknown robot, WithdrawError if
+    nobody confirms.
     """
     team = RunningTeam(bus)
     robot = judgement.first.robot

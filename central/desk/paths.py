@@ -1,7 +1,6 @@
-"""Compute smoothed paths at keyframe rate from a log's final map and measurements.
+"""Smoothed paths at keyframe rate from a log's final map and measurements.
 
-The final map has poses at submap ends. The windows between them are recomputed from the recorded
-measurements, and each window path is fitted between its ends
+Windows are recomputed and fitted between the map's poses at submap ends
 (`teamslam.team.estimation.hybrid_slam.window_path`).
 """
 
@@ -38,7 +37,7 @@ class SmoothedPath:
 def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
-    """Path of every robot in the final map; `progress` receives each robot's name."""
+    """Compute the path of every robot in the final map; progress receives each name."""
     last: dict[tuple[str, int, int], m.Trajectory] = {}
     for message in found.of(ch.TRAJECTORY):
         if isinstance(message, m.Trajectory):
@@ -49,11 +48,10 @@ def smoothed_paths(
         progress(robot)
         windows = _windows(found, robot, incarnation) if message.crosses else {}
         by_robot.setdefault(robot, []).append(_between_ends(found, message, windows))
-    return {robot: _joined(parts) for robot, parts in by_robot.items()}
+    return {robot: _join_parts(parts) for robot, parts in by_robot.items()}
 
 
 def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
-    """Windows of an incarnation by end stamp, as far as its measurements reach."""
     windows: dict[int, ClosedWindow] = {}
 
     def keep(closed: ClosedWindow) -> None:
@@ -68,7 +66,6 @@ def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, Clos
 def _between_ends(
     found: Recorded, message: m.Trajectory, windows: Mapping[int, ClosedWindow]
 ) -> SmoothedPath:
-    """Path of one incarnation: each submap's keyframes, then its end."""
     stamps, poses = translate.trajectory_of(message)
     covariances = floats(message.covariances, "covariances").reshape(-1, 3, 3)
     if not windows:
@@ -93,7 +90,7 @@ def _between_ends(
     return SmoothedPath(stamps, poses, covariances, at_keyframes=True)
 
 
-def _joined(parts: list[SmoothedPath]) -> SmoothedPath:
+def _join_parts(parts: list[SmoothedPath]) -> SmoothedPath:
     arrays = zip(*((part.stamps_ns, part.poses, part.covariances) for part in parts), strict=True)
     stamps, poses, covariances = map(np.concatenate, arrays)
     dense = all(part.at_keyframes for part in parts)

@@ -1,8 +1,7 @@
 """Present peers' map messages as a centre's, for a team without a centre.
 
-Running maps come from the first peer that publishes one; the final map is the one on which all
-peers agree; priors and smoothed paths come from their robot. A centre's own messages take
-precedence while it is present. Map messages of robots that are not peers are ignored.
+Running maps come from the first peer that publishes one, the final map is the one on which all
+peers agree. A present centre takes precedence.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -34,14 +33,13 @@ LISTENS = (
 )  # fmt: skip
 _FOLD = "fold."
 _LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
-"""Used unless a centre has published them; a late centre may not replace them."""
+"""Used unless a centre has published them."""
 
 
 class PeersAsCentre:
     """Map peers' samples to a centre's keys.
 
-    robots: the peers, empty for a team with a centre only. None: as `world/config` names them;
-    before that, robots that announce their own fold.
+    robots: the peers, empty for a team with a centre only; None: as `world/config` names them.
     """
 
     def __init__(self, robots: Collection[str] | None = None) -> None:
@@ -77,7 +75,6 @@ class PeersAsCentre:
         return self._renamed(sample, channel, name)
 
     def _renamed(self, sample: Sample, channel: ch.Channel, name: str) -> Sample | None:
-        """Running message of a peer's fold under the centre's key."""
         as_channel = _AS.get(channel.name)
         if as_channel is None:
             return None
@@ -92,7 +89,6 @@ class PeersAsCentre:
         return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
 
     def _learn(self, sample: Sample) -> None:
-        """Read the peers from the scenario."""
         message = _decoded(sample, m.Configuration)
         if message is None:
             return
@@ -115,7 +111,6 @@ class PeersAsCentre:
         return msgspec.structs.replace(sample, payload=encoded(as_centre))
 
     def _status(self, sample: Sample, node: str) -> Sample | None:
-        """Status of the peer's fold as a centre's status."""
         if self._robot is None or node != ch.robot_node(self._robot):
             return None
         status = _decoded(sample, m.Status)
@@ -143,7 +138,7 @@ def _decoded(sample: Sample, kind: type[M]) -> M | None:
 
 
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
-    """Samples, each followed by its counterpart in a centre's name."""
+    """Yield samples, each followed by its counterpart in a centre's name."""
     for sample in samples:
         yield sample
         counterpart = centre.of(sample)

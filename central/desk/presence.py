@@ -1,4 +1,4 @@
-"""Observe a running team: nodes, progress, rates, clocks, and dependencies between nodes."""
+"""Observe a running team: nodes, progress, rates, clocks, dependencies."""
 
 import time
 from dataclasses import dataclass, field
@@ -12,19 +12,18 @@ from teamslam.team.wire.message_order import later_head
 
 LOOK_S = 0.1
 APART_S = 1.0
-"""Clock difference [s] from which it is reported; longer than any transmission delay."""
+"""Reported clock difference [s]; longer than any transmission delay."""
 PAST_S = 3600.0
 """Stamps further than this [s] from the machine's clock are recorded data."""
 DRIFT = 0.1
-"""Relative drift above which an offset is a changing lag, not a clock."""
+"""Relative drift of an offset that is a lag, not a clock."""
 
 
 @dataclass
 class Member:
-    """One node: liveliness, last status, and counts over time.
+    """One node.
 
-    clock_s: team time less the machine's wall clock; None without team time. drift: its change per
-    second.
+    clock_s: team time less the machine's wall clock; drift: its change per second.
     """
 
     alive: bool = False
@@ -36,7 +35,7 @@ class Member:
     _last: tuple[float, float] | None = field(default=None, repr=False)
 
     def take(self, status: m.Status, wall_ns: int) -> None:
-        """Process a status published at this wall time of the node."""
+        """Process a status published at the node's wall time."""
         self.status = status
         count = status.figures.get("measurements", status.figures.get("submaps", 0.0))
         self._last = 1e-9 * wall_ns, count
@@ -68,7 +67,7 @@ class Presence:
         return self.members.setdefault(node, Member())
 
     def take(self, bus: Bus, for_s: float) -> None:
-        """Observe the team for this time."""
+        """Observe the team for a time [s]."""
         for channel in (ch.STATUS, ch.HEAD, ch.ROBOT_HEAD, ch.TEAM_END, ch.FINAL_MAP):
             bus.subscribe(channel)
         bus.watch_alive()
@@ -114,7 +113,7 @@ class Presence:
         return {node: clock_s - middle for node, clock_s in found.items()}
 
     def advice(self) -> list[str]:
-        """Nodes that wait for others, with the remedy."""
+        """Describe nodes that wait for others, with the remedy."""
         advice = []
         if self.has_ended:
             advice.append("the final map is out: the team has ended")
@@ -156,10 +155,6 @@ class Presence:
 
 
 def _remedy(member: Member, *, behind: bool) -> str:
-    """Remedy for a driver whose stamps deviate.
-
-    Recorded data and a changing lag need no clock setting.
-    """
     if abs(member.clock_s or 0.0) > PAST_S:
         if not behind:
             return "recorded data, of which the others began later or go slower; the map waits"

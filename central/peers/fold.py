@@ -1,10 +1,8 @@
-"""A peer's own fold: a centre's node that receives the peer's set instead of the network's
-messages.
+"""A peer's own fold: a centre's node that receives the peer's set instead of messages.
 
-Its maps are the centre's, byte for byte, wherever the set is the same. The fold restarts where a
-folded member changes (a robot contradicts itself), or where the set grows after the final map; for
-a changed member only when there is time, or once the set is complete, so that a robot that keeps
-contradicting itself does not block its peers.
+The same set gives a centre's maps, byte for byte. The fold restarts when a folded member changes or
+the set grows after the final map; for a changed member only when there is time or the set is
+complete.
 """
 
 import hashlib
@@ -21,14 +19,13 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 
 FoldWhen = Literal["always", "request", "end"]
-"""When a peer folds: as the set grows; on request and once the set is complete; or only then."""
+"""Fold as the set grows; on request and once it is complete; or only then."""
 
 
 class PeerFold:
-    """Folds the set of a `PeerNode`.
+    """Fold of the set of a `PeerNode`.
 
-    centre: the node that folds. restarts: number of restarts. final: the newest final map; finals:
-    number of final maps.
+    final: the newest of `finals` final maps.
     """
 
     def __init__(
@@ -53,7 +50,7 @@ class PeerFold:
                 self._give(m.Liveliness(stamp_ns=0, node=node, alive=alive))
 
     def note(self, message: m.Message) -> list[Outgoing]:
-        """Process a message that is no member: progress, liveliness, the end of the streams."""
+        """Process progress, liveliness or the end of the streams."""
         if isinstance(message, m.Liveliness) and ch.robot_of(message.node) not in self._robots:
             return []
         out: list[Outgoing] = []
@@ -62,9 +59,7 @@ class PeerFold:
         return [*out, *self._give(message), *self.grow()]
 
     def _end_by_others(self) -> list[Outgoing]:
-        """Infer the end of all streams from other peers' conclusions, where the message was
-        missed.
-        """
+        """Infer the end of all streams from other peers' conclusions."""
         stated = self._peer.replica.statements
         gone = {("given_up", 0), ("withdrawal", 0)}
         here = [robot for robot in self._robots if not gone & stated[robot].keys()]
@@ -100,7 +95,6 @@ class PeerFold:
         return out
 
     def _restart(self) -> list[Outgoing]:
-        """Fold the whole set again; `Done` is given last, so that the final map has all of it."""
         self._peer.restart_fold()
         self.centre.restart()
         self.restarts += 1
@@ -110,7 +104,7 @@ class PeerFold:
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold the present set, without waiting; return the messages to publish."""
+        """Fold the present set without waiting; return the messages to publish."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False
@@ -151,7 +145,7 @@ class PeerFold:
         return True
 
     def conclusion(self, robot: str) -> m.Concluded | None:
-        """Make the `Concluded` message of a robot's peer about its final map."""
+        """Make the `Concluded` message for this peer's final map."""
         final = self.final
         if final is None:
             return None

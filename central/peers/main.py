@@ -1,4 +1,4 @@
-"""The processes of peers: a robot that is its own centre, and a centre among peers."""
+"""Processes of peers: a robot that is its own centre, and a centre among peers."""
 
 import logging
 import threading
@@ -24,11 +24,9 @@ from teamslam.team.wire.bus import Bus, Outgoing, Tap
 
 
 class PeerCentre(Peer):
-    """The centre's peer: call `begin`, then `handle_sample` and `tick`, until `finished`.
+    """The centre's peer: `begin`, then `handle_sample` and `tick`, until `finished`.
 
-    It has no estimator, and keeps and folds the team's set as the others do. It may join, leave and
-    return at any time: no robot waits for it, and it requests missing members from any peer. It
-    publishes a centre's maps, which peers do not need.
+    It folds the set without an estimator. No robot waits for it; it may join and leave at any time.
     """
 
     def __init__(
@@ -38,15 +36,14 @@ class PeerCentre(Peer):
         super().__init__(CENTRE, central, robots, proofs=proofs)
 
     def begin(self) -> list[Outgoing]:
-        """Make the first messages: the configuration, and the maps of earlier days."""
+        """Make the first messages: configuration and saved maps."""
         return [*self.fold.centre.begin(), *self._maps]
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """Select the fold's maps and orders; no robot needs this centre's credit."""
         return [each for each in messages if each.channel is not ch.CENTRAL_PROGRESS]
 
     def status(self) -> m.Status:
-        """A centre's status with the figures of the set."""
+        """Report a centre's status with the figures of the set."""
         own = self.fold.centre.status()
         faults = (*self.boundary.warnings, *self.fold.boundary.warnings)
         figures = {**own.figures, **self.set_figures()}
@@ -54,29 +51,25 @@ class PeerCentre(Peer):
 
 
 LINGER_S = 5.0
-"""Time [s] for which a robot stays once all have concluded, so that others receive its
-conclusion.
-"""
+"""Time [s] for which a robot stays once all have concluded."""
 FRESH_SHARE = 0.2
-"""Share of the time for maps that are not due: a robot has more to do than a centre."""
+"""Share of the time for maps that are not due."""
 WORLD_GONE_S = 1.0
-"""Delay [s] after the world's end before a peer leaves: a crashed world is restarted sooner."""
+"""Delay [s] after the world's end before a peer leaves, longer than a restart."""
 _ENDS = (ch.CONCLUDED,)
-"""Channels that end a team of peers: each robot announces its own final map."""
+"""Channels that end a team of peers."""
 _ORDERS = m.KeptRequest(stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS))
 _LOG = logging.getLogger("teamslam")
 
 
 class Alone:
-    """Measures how long a peer has been alone; a peer that returns after all others have left
-    leaves, too.
-    """
+    """Timer of a peer that leaves once all others have left."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def since(self, now: float, *, alone: bool) -> bool:
-        """Whether it has been alone for LINGER_S."""
+        """Whether the peer has been alone for LINGER_S."""
         self._since = (self._since or now) if alone else None
         left = self._since is not None and now - self._since >= LINGER_S
         if left:
@@ -85,10 +78,9 @@ class Alone:
 
 
 class PeerShell(RobotShell):
-    """A robot's process without a centre: subscribe, continue from the stored set, run, stay for
-    others.
+    """Process of a robot without a centre.
 
-    store: the file of its set; None: it is not stored.
+    store: file of its set; None: not stored.
     """
 
     def __init__(
@@ -138,7 +130,6 @@ class PeerShell(RobotShell):
         self.shell.answer(ch.FOLD, self._peer.robot, self._peer.answer_fold)
 
     def _resume(self) -> bool:
-        """Restore the stored set; return whether the robot's own stream continues after it."""
         stored = self._keeper.members
         if not stored:
             return False
@@ -167,9 +158,7 @@ class PeerShell(RobotShell):
         self._peer.finished = self._may_leave(now)
 
     def _log_carried(self) -> None:
-        """Log forwarded members under their first publisher's name: the log proves the robot's
-        maps, and logs of a team can be merged.
-        """
+        """Log forwarded members under their first publisher's key, for merging logs."""
         members, self._peer.carried = self._peer.carried, []
         self._log(members)
 
@@ -195,10 +184,7 @@ class PeerShell(RobotShell):
 
 
 class CentreShell:
-    """The process of a centre among peers: continue from the stored set, run, leave when all agree.
-
-    Raises BusError when the bus is lost.
-    """
+    """Process of a centre among peers. Raises BusError when the bus is lost."""
 
     def __init__(
         self,
@@ -222,7 +208,7 @@ class CentreShell:
         self._alone = Alone()
 
     def run(self) -> None:
-        """Run until every peer has the same final map."""
+        """Run until all peers have the same final map."""
         for channel in self._peer.overhears:
             self._bus.subscribe(channel)
         self._bus.watch_alive()

@@ -1,8 +1,4 @@
-"""The common part of a robot without a centre and a centre among peers: the set and its fold.
-
-A peer accepts members from any publisher, folds new ones, and publishes the fold's messages under
-its own name. A subclass adds the rest, such as an estimator.
-"""
+"""Set and fold of a peer."""
 
 from collections.abc import Iterable, Sequence
 
@@ -18,19 +14,18 @@ from teamslam.team.wire.bus import Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import decoded, encoded
 
 SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
-"""Channels of the set for its traffic figures, requests included."""
+"""Channels of the set's traffic figures."""
 CENTRE = "central"
 """The node name of a centre."""
 
 
 class Peer:
-    """Keeps the team's set as the node `name` and folds it.
+    """The team's set at the node `name`, and its fold.
 
-    finished: whether it may leave; set by its shell. carried: members that others have forwarded,
-    until the shell logs them. uplink, downlink: bytes of the set's channels that were published,
-    each message once, and received. world_alive: None before any message of a world. ended: the
-    robots whose end the router stores. others: the other robots and the centre that are present.
-    unpublished: messages of a requested fold; newest: its last map.
+    carried: forwarded members until they are logged. uplink, downlink: bytes of the set's channels.
+    world_alive: None before any message of a world. ended: robots whose end the router stores.
+    others: robots and centre that are present. unpublished: messages of a requested fold; newest:
+    its last map.
     """
 
     def __init__(
@@ -57,19 +52,19 @@ class Peer:
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels to subscribe to under every name: members, summaries, progress."""
+        """Channels to subscribe to under every name."""
         signed = () if self.peer.proofs is None else (ch.SIGNATURE, ch.ORDER_SIGNATURE)
         others = (ch.ROBOT_PROGRESS, ch.HEAD, ch.END, ch.END_ORDER, *signed)
         return tuple(dict.fromkeys((*PeerNode.listens, *others)))
 
     @property
     def final(self) -> m.FusedMap | None:
-        """The newest final map of its own fold."""
+        """Newest final map of its own fold."""
         return self.fold.final
 
     @property
     def all_concluded(self) -> bool:
-        """Whether every robot that is not given up has this node's final map."""
+        """Whether every robot that is not given up has this final map."""
         if self.final is None:
             return False
         lost = {*self.final.lost, *self.final.withdrawn}
@@ -80,7 +75,7 @@ class Peer:
         )
 
     def load_maps(self, maps: Sequence[m.SavedMap]) -> None:
-        """Add saved maps of earlier days to the set, before `begin`."""
+        """Add saved maps to the set, before `begin`."""
         self._maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in maps]
         for each in self._maps:
             self.peer.take(member_in(each), self.name)
@@ -91,16 +86,16 @@ class Peer:
             self.peer.take(member, self.name)
 
     def news_of_set(self) -> list[Member]:
-        """Return the members that are new since the last call."""
+        """Remove and return the members that are not stored yet."""
         members, self.peer.unsaved = self.peer.unsaved, []
         return members
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Process a message without its key, as `handle_sample` of a reply."""
+        """Process a message without a key, such as a reply."""
         return self.handle_sample(message, reply_sample(m.tag_of(type(message)), encoded(message)))
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """Process one message of a robot, a peer, the world or an operator."""
+        """Process a message of a robot, a peer, the world or an operator."""
         found = ch.channel_of(sample.key)
         channel, name = (None, "") if found is None else found
         if channel in SET_CHANNELS and channel.publisher(name) != self.name:
@@ -109,9 +104,6 @@ class Peer:
         return self._take(message, sample, channel, name) if answered is None else answered
 
     def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Process a message about the set or the team's progress; return None for any other
-        message.
-        """
         match message:
             case m.Members():
                 self.carried += self.peer.take_carried(message)
@@ -138,7 +130,6 @@ class Peer:
                 return None
 
     def _meet(self, token: m.Liveliness) -> None:
-        """Note a node's arrival, with members it may lack, or departure."""
         if token.node == self.name or token.node not in self.peer.known:
             return
         (self.others.add if token.alive else self.others.discard)(token.node)
@@ -147,10 +138,8 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the team has ended, and no present node has the missing members.
-
-        The team has ended where every other robot has announced its own end, except those given up
-        or withdrawn by an operator.
+        """Whether every other robot has announced its end or is given up or withdrawn, and no
+        present node has the missing members.
         """
         stated = self.peer.replica.statements
         others = {
@@ -176,7 +165,7 @@ class Peer:
         return self.grown()
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """Make the messages that are due, by any monotonic clock."""
+        """Make the messages that are due at the monotonic time now_s [s]."""
         unpublished, self.unpublished = self.unpublished, []
         return [*unpublished, *self.counted(self.peer.tick(now_s))]
 
@@ -198,7 +187,7 @@ class Peer:
         return list(messages)
 
     def refresh(self) -> list[Outgoing]:
-        """Make a map of the members since the last map, when there is time."""
+        """Make a map of the members since the last map."""
         return self._from_fold(self.fold.refresh())
 
     def answer(self, request: bytes) -> list[bytes]:
@@ -209,7 +198,7 @@ class Peer:
         return answer
 
     def answer_fold(self, request: bytes) -> list[bytes]:
-        """Answer a `FoldRequest` with the newest map, once all present members are folded."""
+        """Answer a `FoldRequest` with the newest map of all present members."""
         decoded(request, m.FoldRequest)
         self.unpublished += self._from_fold(self.fold.ask())
         maps = [each.message for each in self.unpublished if isinstance(each.message, m.FusedMap)]
@@ -217,9 +206,7 @@ class Peer:
         return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
-        """Figures of the set: size, newest submap by robot, sources, and peers with the same
-        set.
-        """
+        """Figures of the set: size, newest submap by robot, sources, peers with the same set."""
         replica = self.peer.replica
         figures = {
             "set_submaps": float(replica.submaps),

@@ -1,8 +1,6 @@
-"""A robot that needs no centre: its estimator, its copy of the set, and its own fold of it.
+"""A robot that needs no centre: estimator, copy of the set, and fold.
 
-The estimator's submaps enter the set, its members the fold, and the fold's prior returns to the
-estimator for `team/pose`, like a centre's. Law 1 holds as with a centre: no data of the fold
-reaches the robot's messages for fusion.
+Law 1: the fold's prior reaches `team/pose`, and nothing of it the robot's messages for fusion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,16 +25,13 @@ _OF_THE_FOLD = {
     ch.FINAL_MAP: ch.TEAM_FINAL,
     ch.TRAJECTORY: ch.TEAM_TRAJECTORY,
 }
-"""The robot's channels for its own fold's messages, in place of a centre's."""
+"""Channels of the own fold's messages, in place of a centre's."""
 _OF_A_CENTRE = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TEAM_END)
-"""Channels on which a robot receives a centre's messages, and a peer those of its own fold."""
+"""Channels of a centre's messages, or of a peer's own fold."""
 
 
 class PeerRobot(Peer):
-    """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`.
-
-    node: the estimator.
-    """
+    """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`."""
 
     def __init__(
         self,
@@ -57,25 +52,21 @@ class PeerRobot(Peer):
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
-        """The channels of its own stream and of the world, to subscribe to under its name."""
+        """Channels of its own stream and of the world."""
         return tuple(channel for channel in RobotNode.listens if channel not in _OF_A_CENTRE)
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """The channels to subscribe to under every name."""
+        """Channels to subscribe to under every name."""
         return tuple(dict.fromkeys((*super().overhears, *self.node.overhears)))
 
     def begin(self) -> list[Outgoing]:
-        """Make the first messages: its configuration, and that of its fold."""
+        """Make the first messages: configurations and saved maps."""
         announced = msgspec.structs.replace(self.fold.centre.announcement, node=self.name)
         config = Outgoing(ch.TEAM_CONFIG, self.robot, announced)
         return [config, *self._maps, *self._certified(), *self._from_estimator(self.node.begin())]
 
     def _certified(self) -> list[Outgoing]:
-        """With keys, make the certificate of its signatures, and those of its stored members.
-
-        An earlier process has signed them with a key that may have been revoked since.
-        """
         proofs = self.peer.proofs
         if proofs is None:
             return []
@@ -90,7 +81,6 @@ class PeerRobot(Peer):
         return [certificate, *signatures]
 
     def _vouched(self, outgoing: Outgoing) -> list[Outgoing]:
-        """Store a member of its own in the set; with keys its signature is published after it."""
         member = member_in(outgoing)
         self.peer.take(member, self.name)
         proofs = self.peer.proofs
@@ -99,16 +89,14 @@ class PeerRobot(Peer):
         return [Outgoing(ch.SIGNATURE, self.robot, proofs.sign(member))]
 
     def restore(self, members: Iterable[Member]) -> bool:
-        """Restore the stored set of an earlier process, before `begin`; return whether its own
-        stream continues from it.
-        """
+        """Restore the stored set, before `begin`; return whether the own stream continues."""
         self.keep(members)
         stored = self._own_stored()
         if not stored:
             return False
         try:
             self.node.take_over(stored)
-        except Exception:  # the same submaps once more, from the stream
+        except Exception:  # submaps are estimated again from the stream
             self.node = RobotNode(self.config, self._exchange)
             return False
         return True
@@ -125,9 +113,6 @@ class PeerRobot(Peer):
         return found
 
     def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        """Process a message about the set or the team's progress; the estimator gets those of its
-        own stream, too.
-        """
         match message:
             case m.StreamHead() if message.robot == self.robot:
                 return self._to_estimator(message, sample) + self._from_fold(
@@ -152,7 +137,7 @@ class PeerRobot(Peer):
                 out += self._vouched(Outgoing(ch.START, name, message))
             out += self.grown()
         elif isinstance(message, m.InitialPose) and message.robot == self.robot:
-            # a reply of the source: it has no key
+            # a reply of the source has no key
             out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
         if own or isinstance(message, m.Rendezvous):
@@ -163,7 +148,6 @@ class PeerRobot(Peer):
         return self._from_estimator(self.counted(self.boundary.hand(self.node, message, sample)))
 
     def _from_estimator(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """Select the estimator's messages to publish; those for fusion enter the set, too."""
         out = list(messages)
         for each in messages:
             if each.channel in CHANNELS:
@@ -173,9 +157,7 @@ class PeerRobot(Peer):
         return out + self.grown()
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """Convert the fold's messages to this robot's name; the prior goes to the estimator
-        first.
-        """
+        """Rename the fold's messages to this robot's; hand the prior to the estimator first."""
         out: list[Outgoing] = []
         for each in messages:
             channel = _OF_THE_FOLD.get(each.channel)
@@ -204,7 +186,7 @@ class PeerRobot(Peer):
         return out
 
     def status(self) -> m.Status:
-        """Report the estimator's status with the figures of the set, and the fold's findings."""
+        """Report the estimator's status, with figures of set and fold."""
         own, fold = self.node.status(), self.fold.centre.status()
         figures = {f"fold.{name}": value for name, value in fold.figures.items()}
         faults = [*self.boundary.warnings, *self.fold.boundary.warnings]

@@ -1,16 +1,9 @@
 """Calibrate odometry and sensor models from measurements.
 
-With truth, every figure is a maximum-likelihood estimate. Sensor constants are per robot where
-robots differ significantly (`own`).
-
-Without truth the reference is the joined map and its paths, in alternation (expectation and
-maximisation). The join trusts odometry less, so that ranges set the scale. Only odometry scales,
-drag and veer are calibrated, and the clocks of detections against odometry: a team cannot observe
-the scale of its own ranges.
-
-Detections without identities give clutter and miss rates (`detections`). Submap consistency
-(`covariance_factor`, the monitor's `normal_scale`) is calibrated without truth in both cases, from
-maps of single robots (`consistency`).
+With truth every figure is a maximum-likelihood estimate. Without truth the reference is the joined
+map and its paths, in alternation (expectation and maximisation); only odometry scales, drag and
+veer, and the clocks of detections against odometry are calibrated, since a team cannot observe the
+scale of its own ranges. The join trusts odometry less, so that ranges set the scale.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,7 +35,7 @@ from teamslam.sim.calibration.figures import (
     jackknife,
     with_figures,
 )
-from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, joined_team
+from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, join_team
 from teamslam.sim.calibration.own import marker_spread, own_constants
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
@@ -71,8 +64,7 @@ Progress = Callable[[str], None]
 class Calibration:
     """Calibrated figures by part of a robot's configuration, and notes.
 
-    clocks: `clock_offset_s` of every robot with enough measurements, if the two clocks of one
-    differ.
+    clocks: `clock_offset_s` of every robot with enough measurements, if one's clocks differ.
     """
 
     motion: tuple[Figure, ...]
@@ -144,7 +136,7 @@ def _calibrate_by_truth(
     folds = []
     for label, world in worlds:
         progress(f"joined map of {label} with the calibrated models")
-        team = joined_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
+        team = join_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
         folds.append(team.fold)
     marker = marker_spread(data, depth=depth)
     strays = own.strays if marker is None else (*own.strays, marker)
@@ -158,7 +150,6 @@ def _calibrate_by_truth(
 
 
 def _clock_figures(found: Mapping[str, clocks.Clock], scenario: Scenario) -> Mapping[str, Figure]:
-    """`clock_offset_s` of every robot, if the two clocks of one differ."""
     if not any(each.is_off for each in found.values()):
         return {}
     known = {robot.id: robot.clock_offset_s for robot in scenario.robots}
@@ -174,12 +165,12 @@ def _clock_figures(found: Mapping[str, clocks.Clock], scenario: Scenario) -> Map
 def _align_clocks_by_map(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> tuple[Sequence[tuple[str, WorldStreams]], Mapping[str, clocks.Clock]]:
-    """Move each robot's detections to its odometry's clock; returns the worlds and the clocks."""
+    """Move each robot's detections to its odometry's clock; returns worlds and clocks."""
     robots = sorted({stream.robot for _, world in worlds for stream in world.streams})
     moved, total = dict.fromkeys(robots, 0.0), {}
     for turn in range(CLOCK_ROUNDS):
         progress(f"clocks by the joined map, {turn + 1} of at most {CLOCK_ROUNDS}")
-        folds = [joined_team(world, scenario).fold for _, world in worlds]
+        folds = [join_team(world, scenario).fold for _, world in worlds]
         found = {
             robot: clock
             for robot in robots
@@ -210,7 +201,6 @@ def against_truth(
 
 
 def _other_model(data: Sequence[Reference], depth: bool) -> tuple[str, ...]:
-    """Note if the other range model (depth or distance) fits significantly better."""
     taken, other = (
         hypot(found["range_sigma"], TYPICAL_M * found["range_sigma_per_m"])
         for found in (sensor.fit_sensor(data, depth=each) for each in (depth, not depth))
@@ -235,7 +225,7 @@ def _calibrate_by_map(
         for label, world in worlds:
             progress(f"joined map of {label}, {turn + 1} of {ROUNDS}")
             mistrusting = _widen_motion(learnt)
-            team = joined_team(world, mistrusting, lambda robot: progress(f"  {robot} is done"))
+            team = join_team(world, mistrusting, lambda robot: progress(f"  {robot} is done"))
             turning = _find_turning_first(world, scenario)
             given = world, team.paths, team.landmarks, JOINED_GAP_NS, label, turning
             data += references(*given, scenario.robots[0])
@@ -246,7 +236,7 @@ def _calibrate_by_map(
     teams = []
     for label, world in worlds:
         progress(f"joined map of {label} with the calibrated models")
-        teams.append(joined_team(world, learnt))
+        teams.append(join_team(world, learnt))
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
         of_central = _fit_factor_by_cost(teams[0], scenario.central, progress)
@@ -265,9 +255,7 @@ def _calibrate_by_map(
 def _fit_factor_by_cost(
     team: JoinedTeam, central: CentralConfig, progress: Progress
 ) -> tuple[Figure, ...]:
-    """Covariance factor for too few robots to compare, whose unnamed landmarks depend on it through
-    association.
-    """
+    """Covariance factor for too few robots to compare; unnamed landmarks only."""
     if not any(len(each.local.unnamed.counts) for each in team.contributions):
         return ()
     progress("the map under other covariance factors")
@@ -284,7 +272,6 @@ def _find_turning_first(world: WorldStreams, scenario: Scenario) -> frozenset[st
 def _note_left_out(
     label: str, world: WorldStreams, paths: Mapping[str, Path], pathless: str
 ) -> list[str]:
-    """Robots without usable data, with the reason."""
     return [
         f"{label} {stream.robot}: {reason}: nothing is learnt from it"
         for stream in world.streams

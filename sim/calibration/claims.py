@@ -1,9 +1,8 @@
 """Compare measurement covariances and the sensor mount with the truth.
 
-Covariances are calibrated up to a factor: median squared Mahalanobis error over the median of
-chi-square. Odometry errors are taken over time spans, since the reference's own error dominates
-single intervals. Mount heading and `bearing_offset` affect bearings alike, so only their sum is
-observable; mount position is, unless all landmarks lie in one direction.
+A factor is the median squared Mahalanobis error over the median of chi-square. Odometry errors are
+taken over spans, since the reference's own error dominates single intervals. Mount heading and
+`bearing_offset` have the same effect: only their sum is observable.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,7 +58,7 @@ def _spans(data: Reference) -> list[float]:
 
 
 def landmark_factor(data: Sequence[Reference], sensor: Sensor) -> Mapping[str, float]:
-    """`sensor.covariance_factor` of landmark measurements with covariances; empty if too few."""
+    """`sensor.covariance_factor` of landmark measurements; empty if too few."""
     parts = [np.empty(0)]
     for each in data:
         claims = each.seen.covariances
@@ -109,7 +108,7 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
 def measured_and_true(
     data: Reference, sensor: Sensor
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
-    """Mask of detections of known landmarks from known poses, with measured and true points in the
+    """Mask of detections of known landmarks from known poses; measured and true points [m] in the
     sensor frame.
     """
     rows = _rows(data, sensor)
@@ -119,7 +118,7 @@ def measured_and_true(
 
 
 def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
-    """Note on a sensor mount that deviates from the scenario's, by the truth."""
+    """Note on a sensor mount that deviates from the scenario's."""
     rows = [_rows(each, sensor) for each in data]
     points = np.concatenate([np.empty((0, 2)), *(each.points for each in rows)])
     true = np.concatenate([np.empty((0, 2)), *(each.true_points for each in rows)])

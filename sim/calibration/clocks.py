@@ -1,16 +1,9 @@
 """Estimate stamp delays of a robot's detections and odometry against its path.
 
-A detection stamped t was made at t − τ and is compared with the true pose of that time. In straight
-motion τ looks like a mount moved forward by v τ, so mount pose and range offset are estimated
-jointly; turns and speed changes separate them. Odometry is compared with the path's turn, with free
-scale.
-
-Without a path, the centre's estimate of the bias `clock_offset` in the joined map is the measure
-(`clock_of_map`). `teamslam.central.desk.evaluation.clocks` needs neither, but its σ is about three
-times larger than against truth (11 ms against 4 ms over four minutes of two robots).
-
-`RobotConfig.clock_offset_s` moves odometry to the detections' clock: τ of the detections less that
-of the odometry.
+A detection stamped t was made at t − τ. In straight motion τ looks like a mount moved forward by v
+τ, so mount pose and range offset are estimated jointly. Odometry is compared with the path's turn,
+with free scale. Without a path the centre's bias `clock_offset` is the measure (`clock_of_map`).
+`RobotConfig.clock_offset_s` is τ of the detections less that of the odometry.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -58,7 +51,7 @@ class Clock:
         return abs(found.value) > max(LEAST_S, BEYOND_DOUBT * found.sigma)
 
     def later(self, seconds: float) -> "Clock":
-        """Add the time by which the detections were moved before this estimate."""
+        """Add the time [s] by which the detections were moved before this estimate."""
         delay, offset = (
             replace(each, value=each.value + seconds)
             for each in (self.detections, self.clock_offset_s)
@@ -69,7 +62,7 @@ class Clock:
 def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
     """Clocks of each robot with enough measurements on a known path.
 
-    A robot that turns on the spot before driving has no speeds to observe τ from.
+    Excludes robots that turn before driving, whose speeds are unknown.
     """
     found = {}
     for robot, own in sorted(by_robot([each for each in data if not each.turns_first]).items()):
@@ -80,10 +73,7 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
 
 
 def clock_of_map(robot: str, folds: Sequence[Fold]) -> Clock | None:
-    """Clock of a robot by the joined maps of all worlds; None where it is no state of them.
-
-    The odometry defines the time.
-    """
+    """Clock of a robot by the joined maps of all worlds; None where it is no state of them."""
     found = [
         (each.value, each.sigma)
         for fold in folds
@@ -100,7 +90,7 @@ def clock_of_map(robot: str, folds: Sequence[Fold]) -> Clock | None:
 
 
 def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
-    """Offset clocks as text."""
+    """Text on each offset clock."""
     return tuple(
         f"{robot}: its detections are stamped {1e3 * clock.clock_offset_s.value:.0f} ± "
         f"{1e3 * clock.clock_offset_s.sigma:.0f} ms {late} its odometry: clock_offset_s = "
@@ -112,9 +102,7 @@ def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
 
 
 def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
-    """Move odometry and detections to the true path's clock for each robot with an offset, so that
-    teammates' paths stay comparable.
-    """
+    """Move odometry and detections of robots with an offset to the true path's clock."""
     streams = tuple(
         _move_detections(each, clocks[each.robot])
         if each.robot in clocks and clocks[each.robot].is_off
@@ -156,10 +144,9 @@ def _at(data: Reference, late_ns: int) -> Reference:
 
 
 def _settle_time(step_at: Callable[[int], float | None]) -> float | None:
-    """Add steps to a time [s] until one is below SETTLED_S; None if undetermined or beyond
-    LARGEST_S.
+    """Add steps to a time [s] until one is below SETTLED_S; None if beyond LARGEST_S.
 
-    step_at: further time [s] at a time [ns].
+    step_at: further time [s] at a time [ns], or None if undetermined.
     """
     late = 0.0
     for _ in range(ROUNDS):
@@ -204,10 +191,7 @@ def _step(
     rate: Float[np.ndarray, "n 2"],
     sensor: Sensor,
 ) -> float:
-    """Further delay of the detections, with free mount and range offset.
-
-    rate: ∂true/∂τ [m/s] of the true points in the sensor frame.
-    """
+    """Further delay [s] of the detections; rate: ∂true/∂τ [m/s]."""
     ranges = np.maximum(np.hypot(*points.T), 1e-3)
     x, y = points.T
     zero, one = np.zeros(len(x)), np.ones(len(x))
@@ -227,8 +211,6 @@ def _step(
 def _affine(
     gap: Float[np.ndarray, " n"], J: Float[np.ndarray, "n p"]
 ) -> Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " n"]]:
-    """Residual gap + J p as a function of p."""
-
     def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
         return np.asarray(gap + J @ p)
 
@@ -236,8 +218,6 @@ def _affine(
 
 
 def _odometry_late(data: Sequence[Reference]) -> float | None:
-    """Delay of odometry intervals [s] from the path's turns, or None."""
-
     def step_at(late_ns: int) -> float | None:
         parts = [_turns(each, late_ns) for each in data]
         driven, turned, rate = (
@@ -255,8 +235,8 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
 def _turns(
     data: Reference, late_ns: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Logged turn of each interval, the turn of the path moved by late_ns, and its derivative by
-    that time [rad, rad, rad/s].
+    """Logged turn of each interval, turn of the path moved by late_ns, and its derivative
+    [rad, rad, rad/s].
     """
     intervals = data.intervals
 

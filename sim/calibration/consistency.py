@@ -1,13 +1,10 @@
 """Calibrate submap consistency from maps of single robots, without truth.
 
-A robot's own map a and the others' map b share no measurement. If the covariances are right,
-
+A robot's own map a and the others' map b share no measurement. With right covariances
     D = min over rigid motions of (a − b)ᵀ (P_a + P_b − P_ab − P_ba)⁻¹ (a − b)
-
-has mean 2n − 3 for the n common landmarks. `covariance_factor` gives ΣD over all robots and worlds
-its expected value. It covers errors longer than a window, and a robust loss, which down-weights
-inliers. Errors common to all robots show only against the true landmarks (`landmark_sigma`). a and
-b share the states of team-wide biases (`central.common_bias_sigma`), hence P_ab.
+has mean 2n − 3 for n common landmarks; P_ab comes from shared states of team-wide biases.
+`covariance_factor` gives ΣD its expected value. Errors common to all robots show only against true
+landmarks (`landmark_sigma`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,8 +61,8 @@ def central_figures(
     progress: Callable[[str], None],
     true_landmarks: Sequence[Mapping[int, Float[np.ndarray, "2"]]] = (),
 ) -> tuple[Figure, ...]:
-    """Standard deviations of robots' own biases, remaining covariance factor, monitor's normal
-    scale, and landmark sigma from the true landmarks of each world.
+    """Standard deviations of robots' own biases, covariance factor, monitor's normal scale, and
+    landmark sigma from the true landmarks of each world.
     """
     progress("maps of single robots against the rest of their team")
     fields = nest_figures(msgspec.to_builtins(scenario.central), strays, CentralConfig)
@@ -85,9 +82,9 @@ def central_figures(
 
 
 def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """Factor, at least 1, that gives ΣD of single robots' maps its expected value.
+    """Factor, at least 1, that gives ΣD its expected value; σ from the scatter over robots.
 
-    Its standard deviation is the scatter over robots. None below LEAST_ROBOTS.
+    None below LEAST_ROBOTS.
     """
     settings = join_settings(central)
     factor = settings.covariance_factor
@@ -108,10 +105,10 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
 def factor_by_cost(
     refold: Callable[[CentralConfig], Fold], central: CentralConfig
 ) -> Figure | None:
-    """Factor, at least 1, that makes the map's joint cost equal its degrees of freedom.
+    """Factor, at least 1, that makes the joint cost equal its degrees of freedom; σ from χ².
 
-    For too few robots: covers only errors that differ between windows. Landmarks are associated
-    anew under each factor. Standard deviation from χ². None without degrees of freedom.
+    It covers only errors that differ between windows. Landmarks are associated anew under each
+    factor. None without degrees of freedom.
     """
     factor = central.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -128,11 +125,10 @@ def factor_by_cost(
 def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
-    """σ [m] that explains the joined maps' shape errors: Σ χ²(σ) = Σ dof with covariances P + σ² I.
+    """σ [m] that explains the joined maps' shape errors: Σ χ²(σ) = Σ dof with P + σ² I.
 
-    Robots whose maps agree share the remaining error: they measure another point than the surveyed
-    one. teams: fold and true landmarks of each world. Standard deviation: half the range of Σ χ² =
-    Σ dof ± √(2 Σ dof). None without a shape; 0 if P suffices.
+    teams: fold and true landmarks of each world. Standard deviation: half the range of Σ χ² = Σ dof
+    ± √(2 Σ dof). None without a shape; 0 if P suffices.
     """
     settings = replace(join_settings(central), landmark_sigma=0.0)
     maps = []
@@ -166,16 +162,14 @@ def landmark_sigma(
 def _shape_chi2(
     means: Float[np.ndarray, "n 2"], covariance: Float[np.ndarray, "m m"], truth: np.ndarray
 ) -> float:
-    """χ² of a map's shape, 2n − 3 degrees of freedom."""
     shape = map_errors(means, covariance, truth).shape
     return 0.0 if shape is None else 0.5 * (2 * len(means) - 3) * shape.nees_per_landmark
 
 
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """Monitor's covariance scale under these settings for consistent data.
+    """Monitor's covariance scale for consistent data: geometric mean over the worlds.
 
-    Geometric mean over the worlds, standard deviation from their scatter (for one world: the
-    monitor's). None for too few submaps.
+    Standard deviation from their scatter, or the monitor's for one. None for too few submaps.
     """
     settings = join_settings(central)
     scales, sigmas = [], []
@@ -199,26 +193,25 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
-    """D of each main-island robot with at least three landmarks in common with the others."""
+    """D of each main-island robot with at least LEAST_LANDMARKS in common with the others."""
     island = fold.main
     robots = sorted({robot for robot, _ in island.graph.streams})
     found = []
     for robot in robots if len(robots) > 1 else ():
-        graph, solved = _apart(island, robot, fold.starts, settings)
+        graph, solved = _separate_robot(island, robot, fold.starts, settings)
         common = [id_ for id_ in sorted(graph.landmarks) if id_ + APART in graph.landmarks]
         if len(common) >= LEAST_LANDMARKS:
             nodes = [graph.landmarks[id_ + of] for of in (APART, 0) for id_ in common]
-            found.append(_between(*joint_marginal(solved, nodes)))
+            found.append(_compare_maps(*joint_marginal(solved, nodes)))
     return found
 
 
-def _apart(
+def _separate_robot(
     island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
 ) -> tuple[Graph, Island]:
-    """Graph of one robot's map beside the others', from the joined solution, with the robot's
-    landmarks numbered from APART.
+    """Graph of one robot's map beside the others', its landmarks numbered from APART.
 
-    The maps share the states of team-wide biases.
+    It starts from the joined solution and shares the states of team-wide biases.
     """
     submaps = island.graph.submaps
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
@@ -248,7 +241,9 @@ def _apart(
     return graph, solved
 
 
-def _between(mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]) -> Disagreement:
+def _compare_maps(
+    mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]
+) -> Disagreement:
     """D of two maps of n landmarks, from stacked means and joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)

@@ -24,8 +24,7 @@ class Reference:
     """One robot's odometry and landmark measurements, with reference poses and landmarks.
 
     name: world label and robot id. gap_ns: longest interpolated gap of `path`. landmarks: in the
-    path's frame. mount: sensor pose on the base. turns_first: between poses the robot turns, then
-    drives straight (else an arc).
+    path's frame. turns_first: turn, then drive straight between poses, not an arc.
     """
 
     name: str
@@ -53,7 +52,7 @@ class Reference:
 
 
 def by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
-    """References of each robot, robots in the order of their first one."""
+    """References by robot, in the order of their first one."""
     robots: dict[str, list[Reference]] = {}
     for each in data:
         robots.setdefault(each.robot, []).append(each)
@@ -74,7 +73,7 @@ def sensor_poses(
 
 
 class SeenLandmarks(NamedTuple):
-    """Detections of known landmarks from known sensor poses; chosen: which detections they are."""
+    """Detections of known landmarks from known sensor poses; chosen: mask of all detections."""
 
     chosen: Bool[np.ndarray, " N"]
     stamps_ns: Int64[np.ndarray, " n"]
@@ -83,7 +82,7 @@ class SeenLandmarks(NamedTuple):
 
 
 def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None) -> SeenLandmarks:
-    """Known landmarks among the detections; usable: further condition on a detection."""
+    """Known landmarks among the detections; usable: further mask."""
     seen = data.seen
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
     poses, chosen = sensor_poses(data, stamps)
@@ -107,7 +106,7 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
 
 
 def messages_of(stream: RobotStream) -> Iterator[m.Measurement]:
-    """Measurements as a robot receives them, without the initial pose; stamps are team time."""
+    """Measurements as a robot receives them, without the initial pose, stamped in team time."""
     source = Source(replace(stream, clock_offset_ns=0))
     return (source.message(counter) for counter in range(1, len(stream)))
 
@@ -117,12 +116,10 @@ def poses_at(
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
     """Path poses at these times, and a mask of known ones.
 
-    Between two poses the path is their arc; at a share s from (p, θ) the pose is
-
-        (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ).
-
-    With turns_first it is the chord with the final heading. Unknown: outside the path, in a gap
-    longer than gap_ns, or beside a heading jump.
+    At a share s of the arc from (p, θ) to (p', θ + φ) the pose is
+        (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ);
+    with turns_first a chord with the final heading. Unknown: outside the path, in a gap longer than
+    gap_ns, or beside a heading jump.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)
@@ -147,7 +144,7 @@ def poses_at(
 
 
 def sinc(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """sin(angle)/angle, 1 at 0: chord over arc length, by half the turn."""
+    """sin(angle)/angle, 1 at 0."""
     return np.asarray(np.sinc(angle / np.pi))
 
 
@@ -162,8 +159,7 @@ def references(
 ) -> list[Reference]:
     """References of the robots with a path and odometry.
 
-    turning_first: robots that turn, then drive straight. models: robots' models, which convert
-    odometry to motion.
+    turning_first: robots that turn, then drive straight.
     """
     robot = models or RobotConfig("any")
     return [
@@ -203,7 +199,7 @@ LEAST_WAY_M = 0.05
 
 
 def too_short(stretches: int) -> str:
-    """Error for data with this number of moving stretches, and the remedy."""
+    """Error text for data with this number of moving stretches."""
     return (
         f"calibrate needs {LEAST_SPANS} stretches of {SPAN_S:.0f} s with motion, of all robots "
         f"together, and these data have {stretches}: give several data sets at once, record "
@@ -213,10 +209,7 @@ def too_short(stretches: int) -> str:
 
 
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
-    """Number of whole stretches of SPAN_S in which a robot's odometry moves.
-
-    An upper bound: a calibration omits stretches with an unknown reference path.
-    """
+    """Number of whole stretches of SPAN_S in which a robot's odometry moves."""
     return sum(map(_count_moving, streams))
 
 

@@ -1,14 +1,11 @@
 """Calibrate clutter and miss rates from detections without identities.
 
-Each window is associated anew without identities (`teamslam.team.estimation.association`). After a
-landmark's first detection, each scan that covers its place is a trial: of n trials, v detections
-are binomial with detection probability p. A scan covers a place within the range and bearing span
-of the other landmarks it detected; including the landmark itself would bias p upward. Clutter
-recurs by chance with probability g. The clutter share of found landmarks, p and g maximise the
-likelihood (expectation and maximisation). Landmarks seen as rarely as clutter count as clutter.
-
-Claimed covariances are compared with the smoothed windows' cost, whose mean is one per degree of
-freedom if detection and odometry covariances are right.
+Each window is associated anew (`teamslam.team.estimation.association`). After a landmark's first
+detection, each scan that covers its place is a trial: of n trials, v detections are binomial with
+detection probability p; clutter recurs by chance with probability g. The clutter share, p and g
+maximise the likelihood (expectation and maximisation). A scan covers a place within the range and
+bearing span of the other landmarks it detected. Claimed covariances are compared with the smoothed
+windows' cost, whose mean is one per degree of freedom.
 """
 
 from collections.abc import Sequence
@@ -18,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.sim.calibration.data import messages_of
-from teamslam.sim.calibration.figures import Figure, left_out
+from teamslam.sim.calibration.figures import Figure, leave_out_groups
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team import translate
 from teamslam.team.config import AssociationSettings, RobotConfig
@@ -55,7 +52,7 @@ UNITS = {
 class WindowLooks(NamedTuple):
     """Repeated detections in the scans of one window.
 
-    trials, again: for each landmark, scans that cover its place after its first detection, and
+    trials, again: per landmark, scans that cover its place after its first detection, and
     detections among them. area [m²]: view area times scans. cost, dof: of the smoothed window.
     """
 
@@ -191,10 +188,7 @@ def rates(windows: Sequence[WindowLooks]) -> Rates | None:
 def _clutter(
     v: Int64[np.ndarray, " L"], n: Int64[np.ndarray, " L"], p: float, g: float, share: float
 ) -> Float[np.ndarray, " L"]:
-    """Probability that each found landmark is clutter.
-
-    The binomial coefficients of both hypotheses cancel.
-    """
+    """Probability that each found landmark is clutter; the binomial coefficients cancel."""
     real = v * np.log(p) + (n - v) * np.log1p(-p) + np.log1p(-min(share, 1.0 - 1e-9))
     false = v * np.log(g) + (n - v) * np.log1p(-g) + np.log(max(share, 1e-9))
     probability: Float[np.ndarray, " L"] = 1.0 / (1.0 + np.exp(np.clip(real - false, -500, 500)))
@@ -212,7 +206,7 @@ def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
         found = rates(part)
         return {} if found is None else dict(zip(UNITS, found, strict=True))
 
-    return left_out(fit, groups, UNITS)
+    return leave_out_groups(fit, groups, UNITS)
 
 
 def claim_notes(

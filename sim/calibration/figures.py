@@ -68,18 +68,15 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 def jackknife(
     fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """Fit all data, with the uncertainty of `left_out` over robots or time stretches."""
-    return left_out(fit, groups_of(data), units)
+    """Fit all data, with the uncertainty of `leave_out_groups` over robots or time stretches."""
+    return leave_out_groups(fit, groups_of(data), units)
 
 
-def left_out(
+def leave_out_groups(
     fit: Fit[T], groups: Sequence[Sequence[T]], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)²; Efron and Stein
-    1981.
-
-    Errors may be correlated within a group, not between groups. A figure that leaving out a group
-    makes undetermined is omitted.
+    """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)² (Efron and Stein
+    1981). Omits a figure that leaving out a group makes undetermined.
     """
     values = fit([part for group in groups for part in group])
     rest = [
@@ -132,8 +129,7 @@ def nest_figures(
 ) -> dict[str, object]:
     """Overlay a model's fields with figures: `forward.per_m` is a field of `forward`.
 
-    A density replaces all three densities of its noise. A figure that is no field of the model (an
-    outlier share) is omitted.
+    A density replaces all densities of its noise. Omits figures that are no field of the model.
     """
     names = {field.name for field in msgspec.structs.fields(declared)}
     fields = dict(below)

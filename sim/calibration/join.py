@@ -56,12 +56,12 @@ class JoinedTeam:
     contributions: Sequence[Contribution] = ()
 
 
-def joined_team(
+def join_team(
     world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> JoinedTeam:
     """Join every robot's windows under the scenario's models; main island only.
 
-    Between window ends a path is the particle mean, moved to end at the joined pose. progress:
+    Between window ends a path is the particle mean, moved to end at the joined pose. progress
     receives each finished robot. Raises CalibrationError without submaps.
     """
     tracks = {}
@@ -93,7 +93,7 @@ def joined_team(
     for (robot, _), nodes in sorted(graph.streams.items()):
         at = graph.offset[list(nodes)]
         ends = state[at[:, np.newaxis] + np.arange(3)]
-        paths[robot] = _bent(tracks[robot], ends)
+        paths[robot] = _bend_to_ends(tracks[robot], ends)
     return JoinedTeam(landmarks, paths, fold, contributions)
 
 
@@ -121,10 +121,7 @@ def fold_of(
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:
-    """Configuration of the robot, or the first robot's models for an unknown one.
-
-    Without its clock's offset: the stamps of streams are team time.
-    """
+    """Robot's configuration (the first robot's for an unknown one) without clock offset."""
     configs = {each.id: each for each in scenario.robots}
     own = configs.get(robot, scenario.robots[0])
     return msgspec.structs.replace(own, id=robot, clock_offset_s=0.0)
@@ -154,11 +151,8 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
 def _merge(
     stream: RobotStream, longest_ns: int
 ) -> Iterator[m.AnyScan | m.Detections | m.AnyOdometry]:
-    """A stream's scans and odometry, with intervals of one command between scans merged.
-
-    Merged intervals are at most longest_ns. A command logged ten times is one arc, and motion noise
-    is a density: the estimate is unchanged, up to noise correlation within an interval and window
-    closing times.
+    """A stream's scans and odometry, with intervals of one command between scans merged up to
+    longest_ns.
     """
     pending: m.AnyOdometry | None = None
     for message in messages_of(stream):
@@ -179,7 +173,6 @@ def _merge(
 
 
 def _goes_on(one: m.AnyOdometry, then: m.AnyOdometry, longest_ns: int) -> bool:
-    """Whether the second interval continues the first by the same command, both being short."""
     match one, then:
         case m.Odometry(), m.Odometry():
             same = (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
@@ -200,7 +193,7 @@ def _track(closed: ClosedWindow, stamps: Sequence[int], window: Window) -> _Trac
     return _Track(closed, np.append(np.array(stamps, dtype=np.int64), closed.end_ns), ends)
 
 
-def _bent(tracks: Sequence[_Track], ends: Float[np.ndarray, "K 3"]) -> Path:
+def _bend_to_ends(tracks: Sequence[_Track], ends: Float[np.ndarray, "K 3"]) -> Path:
     stamps = [np.array([tracks[0].closed.start_ns])]
     poses = [ends[:1]]
     for track, start, end in zip(tracks, ends[:-1], ends[1:], strict=True):

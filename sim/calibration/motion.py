@@ -140,10 +140,9 @@ def fit_motion(
 ) -> Mapping[str, float]:
     """Fit the model of `increment_of` with the likeliest errors over SPAN_S.
 
-    With slow_below [m/s], the scale below that speed is fitted, too; check `creep` first.
-    Alternates weighted least squares of the scales under Huber's loss with the likelihood of the
-    residuals' densities σ² = per_m² |d| + per_rad² |φ|. Raises CalibrationError for too little
-    motion.
+    slow_below [m/s]: fit the scale below that speed, too. Alternates weighted least squares of the
+    scales under Huber's loss with the likelihood of residual densities σ² = per_m² |d| + per_rad²
+    |φ|. Raises CalibrationError for too little motion.
     """
     spans = _spans(data)
     moving = np.abs(spans.speed).mean(axis=1) * SPAN_S > LEAST_WAY_M

@@ -1,18 +1,11 @@
 """Calibrate single robots' sensor constants and their variation between worlds.
 
 A constant of robot r in world w is v = m + a_r + e_rw. Each robot's value is its mean over worlds,
-shrunk towards the mean of all robots by the spread s of e:
-
+shrunk towards the mean of all robots by the spread s of e (robust, at least that of the fit):
     m + (v̄_r − m) τ²/(τ² + s²/n_r),    τ² = var(v̄_r) − mean(s²/n_r).
-
-Robots are alike unless their constants together differ significantly: with W the joint covariance
-of one world's constants, Σ_r n_r (v̄_r − m)ᵀ W⁻¹ (v̄_r − m)/(p (R − 1)) is compared with the F
-distribution of p (R − 1) and Σ(n_r − 1) degrees of freedom. Constants are correlated: an offset and
-a scale of the range compensate each other. s is a robust estimate, so one moved camera does not
-count, and at least the standard deviation of the fit.
-
-Landmarks, too, have range-proportional errors common to all robots, such as a marker that hangs
-higher or is larger (`marker_spread`).
+Robots are alike unless, with W the joint covariance of one world's constants, Σ_r n_r (v̄_r − m)ᵀ
+W⁻¹ (v̄_r − m)/(p (R − 1)) exceeds the F distribution of p (R − 1) and Σ(n_r − 1) degrees of
+freedom.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,9 +33,8 @@ BIAS_OF = {
 
 
 class Own(NamedTuple):
-    """robots: sensor figures of each robot, empty if alike. strays: per bias, expected deviation of
-    a robot's constant in a further world, √(s² + variance of the figure), and σ of the common range
-    scale.
+    """robots: sensor figures of each robot, empty if alike. strays: σ of each bias in a further
+    world, √(s² + variance of the figure), and σ of the common range scale.
     """
 
     robots: Mapping[str, tuple[Figure, ...]]
@@ -110,10 +102,7 @@ def _spread_in_robot(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
 def _in_common(
     parts: Sequence[Float[np.ndarray, " n"]], worlds: Sequence[Sequence[str]], stray: float
 ) -> Figure:
-    """Standard deviation between worlds of the robots' common range scale.
-
-    parts: each robot's values, in the worlds of these names.
-    """
+    """Standard deviation between worlds of the robots' common range scale."""
     off: dict[str, list[float]] = {}
     for part, names in zip(parts, worlds, strict=True):
         each_world = sorted({*names})
@@ -128,7 +117,7 @@ def _in_common(
 
 
 def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:
-    """Relative standard deviation of single landmarks' range scales.
+    """Relative standard deviation of single landmarks' range scales, as of larger markers.
 
     The share e_rl by which robot r sees landmark l too far, given r's constants, is m_l + ε_rl:
     var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None if not significant (F

@@ -23,12 +23,10 @@ Fields = dict[str, Any]
 def scenario_text(
     calibration: Calibration, start: Scenario, own: str | None, sources: Sequence[str], output: Path
 ) -> str:
-    """Text of `output`: the user's scenario `own` with the calibrated figures; without one, a
-    scenario on a built-in base.
+    """Text of `output`: the user's scenario `own`, or a built-in base, with the calibrated figures.
 
-    Common figures replace all robots' values, except figures of single robots. Other fields stay. A
-    scenario must name all robots or none, so all are named if it names none and a robot has figures
-    of its own.
+    Common figures replace all robots' values, except figures of single robots. All robots are named
+    if one has figures of its own.
     """
     document = _document_of(start, calibration) if own is None else own_document(own)
     world = document.get("world", {})
@@ -69,8 +67,7 @@ def scenario_text(
 def _document_of(scenario: Scenario, calibration: Calibration) -> Fields:
     """Document whose `base` is the built-in scenario's name, or the data set's.
 
-    It names the robots of a live team, robots with figures of their own, and robots whose own
-    sensors in the base the calibration replaces.
+    It names robots of a live team, and robots with figures or sensors of their own.
     """
     world = scenario.world
     otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
@@ -91,7 +88,6 @@ def _round_figure(figure: Figure) -> Figure:
 
 
 def _without(table: Fields, path: Sequence[str], keys: Collection[str]) -> Fields:
-    """Remove keys from the inner table at a path, and the table if empty."""
     if not path:
         return {key: value for key, value in table.items() if key not in keys}
     if path[0] not in table:

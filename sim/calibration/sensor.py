@@ -1,8 +1,7 @@
 """Maximum-likelihood range-bearing model: affine range, noise and correlation time.
 
 For a depth along the optical axis, range = scale · distance · cos(b − axis) + offset with raw
-bearing b. The common noise is fitted with each robot's constants (scale, offset, axis, bearing
-offset); the constants of all together serve unknown robots.
+bearing b. Each robot's constants are fitted, and those of all together for unknown robots.
 """
 
 from collections.abc import Mapping, Sequence
@@ -135,8 +134,7 @@ class Constants(NamedTuple):
 def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
     """Fit the constants of all measurements as one camera.
 
-    Ranges under Huber's loss in units of noise, bearings by the median, since outliers come in
-    bursts. Raises CalibrationError for too few measurements.
+    Ranges under Huber's loss, bearings by the median. Raises CalibrationError for too few.
     """
     return _constants(_enough(_rows(data)), depth)
 
@@ -146,8 +144,8 @@ def joint_constants(
 ) -> tuple[Constants, Float[np.ndarray, "p p"]]:
     """Fit the constants, with their joint covariance in the order of `Constants.figures`.
 
-    The covariance is (JᵀWJ)⁻¹ JᵀW diag(e²) WJ (JᵀWJ)⁻¹ with the residuals e, those of outliers
-    bounded (White 1980, A heteroskedasticity-consistent covariance matrix estimator).
+    The covariance is (JᵀWJ)⁻¹ JᵀW diag(e²) WJ (JᵀWJ)⁻¹ with residuals e, bounded (White 1980, A
+    heteroskedasticity-consistent covariance matrix estimator).
     """
     rows = _enough(_rows(data))
     found = _constants(rows, depth)
@@ -209,7 +207,7 @@ def _constants(rows: _Rows, depth: bool) -> Constants:
 
 
 def _lens(rows: _Rows, offset: float) -> list[float]:
-    """Fit bearing offset and lens: a cubic of the raw bearing under Huber's loss."""
+    """Fit bearing offset and lens, a cubic of the raw bearing, under Huber's loss."""
     error = on_circle(rows.bearing_errors - offset)
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(error)))
     powers = rows.bearings[:, np.newaxis] ** np.arange(4)
@@ -225,10 +223,10 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
 def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
     """Fit the likeliest `Sensor` model.
 
-    Constants are those of all robots together. Noise is that of residuals under each robot's
-    constants: σ² = σ₀² + (σ₁ d)² by likelihood, for bearings the median absolute deviation. Shares
-    are those of ρ(τ) = (1 − white) exp(−τ/T), fitted to one landmark's error correlation. Raises
-    CalibrationError for too few measurements.
+    Constants are those of all robots together; noise is of residuals under each robot's own: σ² =
+    σ₀² + (σ₁ d)² by likelihood, for bearings the median absolute deviation. White shares and times
+    T fit ρ(τ) = (1 − white) exp(−τ/T) to one landmark's error correlation. Raises CalibrationError
+    for too few measurements.
     """
     common = constants(data, depth=depth)
     parts = []
@@ -266,9 +264,9 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
 
 
 def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
-    """Relative excess range of each landmark, given the robot's constants.
+    """Relative excess range of each landmark, given the robot's constants: medians less their mean.
 
-    Medians less their mean, of landmarks with at least LEAST_MEASUREMENTS; empty if too few.
+    Only landmarks with at least LEAST_MEASUREMENTS.
     """
     rows = _rows([data])
     if len(rows.series) < LEAST_MEASUREMENTS:
@@ -306,9 +304,7 @@ def _persistence(
     seconds: Float[np.ndarray, " n"],
     relative: Float[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """(white share, correlation time [s]) of errors in units of σ; (1, 0) if no correlation lasts
-    to the next measurement.
-    """
+    """(white share, correlation time [s]) of errors in units of σ; (1, 0) without correlation."""
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))

@@ -53,25 +53,29 @@ def calibrate(
     from teamslam.sim.calibration.calibrate import calibrate_models
     from teamslam.sim.calibration.figures import CalibrationError
     from teamslam.sim.calibration.scenario import scenario_text
-    from teamslam.sim.calibration.source import measurements_of, own_scenario
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.cli.options import scenario_of, warn_of_holes
+    from teamslam.sim.recorded.streams import measurements_in
     from teamslam.sim.scenarios.scenario import Scenario, builtin_names
+    from teamslam.sim.scenarios.source import open_data_set, scenario_beside
     from teamslam.sim.world.streams import WorldStreams
     from teamslam.team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
     read: list[tuple[str, WorldStreams, Scenario]] = []
-    own = scenario if scenario not in builtin_names() else None
+    own = scenario
     for path in source:
         typer.echo(f"reading {path}", err=True)
         with readable(path) as found_at:
-            if not read and scenario is None:
-                own = own_scenario(found_at)
             if found_at.suffix == ".mcap":
                 warn_of_holes(open_log(found_at))
-            read.append((path.name, *measurements_of(found_at)))
+                read.append((path.name, *measurements_in(found_at)))
+                continue
+            if not read and scenario is None:
+                own = scenario_beside(found_at)
+            read.append((path.name, *open_data_set(found_at)[:2]))
+    own = None if own in builtin_names() else own
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
     with failing(FAILED, CalibrationError):

@@ -54,7 +54,6 @@ def compare(
 
 
 def _check_picture(path: Path) -> None:
-    """Exit unless the path names a picture in an existing folder."""
     forms = [form.value for form in Form]
     if path.suffix.removeprefix(".") not in forms:
         names = ", ".join(f".{form}" for form in forms)

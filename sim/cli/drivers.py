@@ -19,7 +19,7 @@ from teamslam.sim.cli.options import (
     fail,
     failing,
     over_tls,
-    parsed_start,
+    parse_start,
 )
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def driver(
     live = None
     if answers is not Back.NONE:
         live = LiveAnswers(robot, topics.robots[robot], has_tf=answers is Back.ALL)
-    pose = () if start is None else parsed_start(start)[1]
+    pose = () if start is None else parse_start(start)[1]
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     with (
         failing(WRONG_USE, MeasurementError, at="--start"),
@@ -167,7 +167,6 @@ def driver(
 
 
 def _log_totals(translated: "Ros2Driver") -> None:
-    """Log the totals of used and dropped messages, and remaining warnings."""
     for topic, count in translated.taken.items():
         _LOG.info("%s: %d messages", topic, count)
     for reason, count in translated.dropped.items():

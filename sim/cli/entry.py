@@ -1,4 +1,4 @@
-"""Entry of `teamslam`: the command that is asked for, errors with their exit status."""
+"""Entry of `teamslam`: run the command, turn errors into exit statuses."""
 
 import os
 import sys
@@ -49,10 +49,6 @@ def _run(words: list[str]) -> None:
 
 
 def _advice(error: Exception) -> tuple[int, str] | None:
-    """Exit status and text for an expected error, or None.
-
-    Exception modules are imported only if raised there: a router needs no SciPy.
-    """
     from teamslam.sim.datasets.tables import DatasetError
     from teamslam.sim.scenarios.checks import ScenarioError
     from teamslam.team.keys.roster import KeysError

@@ -1,4 +1,4 @@
-"""Help texts as plain sections: commands by task, options by use, and an example each."""
+"""Help texts in plain sections: commands by task, options by use, an example each."""
 
 import re
 from collections.abc import Iterable
@@ -49,7 +49,7 @@ class _Plain:
     """Help of a command or group in plain sections; its epilog is an example."""
 
     def parse_args(self: Any, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words; an unknown option is answered by the closest one."""
+        """Parse the words; name the closest option for an unknown one."""
         try:
             parsed: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
         except typer.TyperException as error:
@@ -105,7 +105,6 @@ class Group(_Plain, TyperGroup):
 
 
 def _write_parameters(parameters: Iterable[Any], ctx: Any, formatter: Any) -> None:
-    """Write the definition lists of arguments and of each section of options."""
     sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], OPTIONS: []}
     for each in parameters:
         record = each.get_help_record(ctx)

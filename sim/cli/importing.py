@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from teamslam.sim.cli.help import Command, output_option
-from teamslam.sim.cli.options import WRONG_USE, count_noun, fail, parsed_start
+from teamslam.sim.cli.options import WRONG_USE, count_noun, fail, parse_start
 
 app = typer.Typer()
 
@@ -76,7 +76,7 @@ def import_(
     request = Request(
         sources=source,
         robot=robot,
-        starts=dict(map(parsed_start, start or [])),
+        starts=dict(map(parse_start, start or [])),
         columns=columns,
         ros2=ros2,
         truth=truth,
@@ -96,8 +96,8 @@ def import_(
     typer.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
 
 
-def imported_into(path: Path, folder: Path) -> Path:
-    """Import a bag or log and print a summary; returns the folder."""
+def import_into(path: Path, folder: Path) -> Path:
+    """Import a bag or log, print a summary, return the folder."""
     from teamslam.sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
@@ -110,7 +110,7 @@ def imported_into(path: Path, folder: Path) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """Import a ROS 2 bag into a temporary data set; other paths are returned unchanged."""
+    """Yield a ROS 2 bag as a temporary data set; other paths unchanged."""
     from tempfile import TemporaryDirectory
 
     from teamslam.sim.importing.source import Request, import_data, is_ros2_bag

@@ -12,7 +12,7 @@ import typer
 
 from teamslam.central.desk.names import data_set_name
 from teamslam.sim.cli.help import Command, network, output_option, rare
-from teamslam.sim.cli.importing import imported_into
+from teamslam.sim.cli.importing import import_into
 from teamslam.sim.cli.options import (
     ANY_PORT,
     ASSUMED_NAME,
@@ -37,7 +37,7 @@ from teamslam.sim.cli.options import (
     check_pieces,
     fail,
     over_tls,
-    parsed_speed,
+    parse_speed,
     refuse_open_door,
     saved_maps,
     scenario_for,
@@ -47,7 +47,7 @@ from teamslam.sim.cli.options import (
 )
 from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.steps import Steps
-from teamslam.sim.cli.view import FoxglovePort, Open, Port, shown_on_page
+from teamslam.sim.cli.view import FoxglovePort, Open, Port, show_on_page
 from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 from teamslam.team.extras import install_command
 
@@ -139,14 +139,14 @@ def launch(
     status 0 only if every process ended well and every robot is in the final map;
     else 1. 2: wrong use; 130: interrupted.
     """
-    pace = parsed_speed(speed)
+    pace = parse_speed(speed)
     refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     if dataset is not None:
         from teamslam.team.ros2.bags import is_bag
 
         if is_bag(dataset):
             output = output or _new_folder(dataset.stem or "bag")
-            dataset = imported_into(dataset, output / (dataset.stem or "bag"))
+            dataset = import_into(dataset, output / (dataset.stem or "bag"))
     name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
     resolved = with_options(
         scenario_of(name),
@@ -202,12 +202,12 @@ def launch(
     for earlier_set in plan.earlier_sets:
         set_aside(earlier_set)
     page = (
-        shown_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
+        show_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
         if view
         else nullcontext()
     )
     with page as at:
-        outcome = _launched(plan)
+        outcome = _launch(plan)
         try:
             _conclude(resolved, outcome, json_file, report=report)
         except KeyboardInterrupt:
@@ -223,14 +223,14 @@ def _name_of(scenario: Scenario) -> str:
     return data_set_name(Path(path).resolve()) if path else ""
 
 
-def _launched(plan: "Plan") -> "Outcome":
+def _launch(plan: "Plan") -> "Outcome":
     from teamslam.sim.launch.launch import LaunchError, launch
-    from teamslam.sim.launch.live import shown
+    from teamslam.sim.launch.live import show_live
     from teamslam.sim.launch.processes import Starter
 
     scenario = plan.scenario
     try:
-        with shown(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
+        with show_live(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
             return launch(plan, Starter(time.time_ns()), show)
     except LaunchError as error:
         fail(str(error), FAILED)
@@ -240,7 +240,6 @@ def _launched(plan: "Plan") -> "Outcome":
 
 
 def _keep_showing(url: str, log: Path) -> None:
-    """Serve the page until the user ends the command."""
     from teamslam.team.shell import process
 
     with process("launch", endless=True) as stop:  # Ctrl-C may follow the line at once
@@ -249,10 +248,7 @@ def _keep_showing(url: str, log: Path) -> None:
 
 
 def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
-    """Scenario with the robots of its data set, a note on the others, and the streams.
-
-    A data set is read before any process starts; a simulated world is not.
-    """
+    """Scenario with the robots of its data set, a note on the others, and the streams."""
     from teamslam.sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
@@ -276,7 +272,6 @@ def _time_warnings(streams: "WorldStreams | None") -> list[str]:
 
 
 def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
-    """Advice on calibrating models for a data set without any."""
     from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 
     found = moving_stretches(streams.streams)
@@ -299,7 +294,6 @@ def _how_to_learn(dataset: Path, streams: "WorldStreams") -> str:
 
 
 def _check_writable(path: Path) -> None:
-    """Check before the run that the result can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         is_new = not path.exists()
@@ -321,7 +315,6 @@ def _new_folder(name: str) -> Path:
 
 
 def _keep_earlier(log: Path) -> None:
-    """Rename an earlier log of the same name."""
     if log.exists() and not log.is_file():
         fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
     if log.exists():
@@ -336,7 +329,7 @@ def _keep_earlier(log: Path) -> None:
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
-    """Write the report and print its files; an error, such as a full disk, fails the run."""
+    """Write the report and print its files; an error fails the run."""
     from teamslam.central.desk.report.page import write_report
 
     try:
@@ -351,7 +344,6 @@ def _write_report(
 def _conclude(
     scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
 ) -> None:
-    """Evaluate the log, print the result and write the report; exits with 1 on failure."""
     from rich.console import Console
 
     from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate

@@ -241,10 +241,9 @@ def _channels(names: str | None) -> "list[Channel] | None":
 
 
 def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
-    """Messages, bytes, rate of one key, first and last time [s after start_ns], by key or channel.
+    """Messages, bytes, rates [Hz] and span [s after start_ns] by key, or by channel.
 
-    A channel's rate is the mean over its keys; a key that begins before start_ns, such as a
-    configuration, has none.
+    A channel's rate is the mean over its keys that begin after start_ns.
     """
     from rich.table import Table
     from rich.text import Text

@@ -81,16 +81,15 @@ def save(
 
 def _map_of_log(log: Path) -> "SavedMap":
     from teamslam.central.desk.verification.centre import recorded_map
-    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.desk.verification.recorded import RerunError, index_log
     from teamslam.central.saved_maps import NothingToSaveError
     from teamslam.team.recording.reader import open_log
 
     with failing(FAILED, RerunError, NothingToSaveError, at=log):
-        return recorded_map(recorded(open_log(log)), "site")
+        return recorded_map(index_log(open_log(log)), "site")
 
 
 def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: float) -> "SavedMap":
-    """Request the map of the running centre's present set."""
     from teamslam.team.wire.bus import BusError
     from teamslam.team.wire.channels import SITE
     from teamslam.team.wire.codec import decoded

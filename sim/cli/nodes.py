@@ -32,7 +32,7 @@ from teamslam.sim.cli.options import (
     failing,
     over_tls,
     own_keys,
-    parsed_speed,
+    parse_speed,
     refuse_existing,
     refuse_open_door,
     saved_maps,
@@ -127,7 +127,7 @@ def world(
     from teamslam.sim.scenarios.source import streams_of
     from teamslam.team.shell import process
 
-    pace = parsed_speed(speed)
+    pace = parse_speed(speed)
     resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
     streams = streams_of(resolved)
     with process("world") as stop, connect_bus(resolved.team, connect, keys, "world", stop) as bus:
@@ -388,7 +388,7 @@ def record(
         )
     if is_over:
         typer.echo(f"{output} was finished by an earlier recorder", err=True)
-        _fail_if_provisional(_joined(output) if join_parts else parts_of(output), ends)
+        _fail_if_provisional(_join_parts(output) if join_parts else parts_of(output), ends)
         return
     expected = [robot_node(r.id) for r in resolved.robots]
     expected += ["central"] if resolved.centre else []
@@ -419,11 +419,11 @@ def record(
             )
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
-            parts = _joined(output) if join_parts else parts_of(output)
+            parts = _join_parts(output) if join_parts else parts_of(output)
     _fail_if_provisional(parts, ends)
 
 
-def _joined(log: Path) -> list[Path]:
+def _join_parts(log: Path) -> list[Path]:
     """Join the parts of a log; name remaining parts, with the remedy."""
     from teamslam.team.recording.parts import join_parts
 
@@ -446,10 +446,7 @@ def _fail_if_provisional(parts: Sequence[Path], ends: "Sequence[Channel]") -> No
 
 
 def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
-    """Describe the robots that the final maps of a log lack.
-
-    ends: channels of final maps. Each author's last map counts: the others are not its final one.
-    """
+    """Describe the robots that the final maps of a log lack, by each author's last map."""
     from teamslam.team.recording.reader import LogError, open_log
     from teamslam.team.shell import describe_missing
     from teamslam.team.wire.codec import WireError, decoded

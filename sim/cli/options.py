@@ -38,7 +38,7 @@ FAILED = 1
 
 
 def check_folder(path: Path) -> None:
-    """Check before the work that a folder can be created and written; fails else."""
+    """Exit unless the folder can be created and written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK):
@@ -48,7 +48,6 @@ def check_folder(path: Path) -> None:
 
 
 def _either(names: object) -> str:
-    """Values of a Literal as text: `a, b or c.`"""
     *first, last = get_args(names)
     return f"{', '.join(first)} or {last}."
 
@@ -137,7 +136,7 @@ SpeedText = Annotated[
 
 
 def check_pieces(scenario: Scenario) -> None:
-    """Check that only a one-robot data set's log is cut."""
+    """Exit unless the scenario is a data set of one robot with detections."""
     if not isinstance(scenario.world, UnlabelledWorld | GraphWorld):
         fail(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
@@ -153,9 +152,9 @@ def connect_bus(
     node: str,
     stop: threading.Event | None = None,
 ) -> "ZenohBus":
-    """Connect to the router's endpoint; with keys by TLS, with the node's certificate.
+    """Connect to the router; with keys by TLS, with the node's certificate.
 
-    stop: ends the wait of a team process for a silent router.
+    stop: ends the wait for a silent router.
     """
     from teamslam.team.wire.zenoh.bus import ZenohBus
 
@@ -174,7 +173,7 @@ def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
 
 
 def over_tls(endpoint: str) -> str:
-    """The default endpoint over TLS; a chosen one stays."""
+    """Endpoint over TLS if it is a default one; others unchanged."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint in (LOOPBACK, ANY_PORT) else endpoint
 
 
@@ -210,7 +209,7 @@ def fail(message: str, status: int) -> NoReturn:
 
 @contextmanager
 def failing(status: int, *errors: type[Exception], at: object = "") -> Iterator[None]:
-    """Exit with this status and the text of such an error; at: named before it."""
+    """Exit with this status and the text of such an error, after the text of `at`."""
     try:
         yield
     except errors as error:
@@ -218,7 +217,7 @@ def failing(status: int, *errors: type[Exception], at: object = "") -> Iterator[
 
 
 def write_json(path: Path | None, figures: object) -> None:
-    """Write a command's figures to its --json file, if given: a regular file at once."""
+    """Write a command's figures to its --json file, if given."""
     if path is None:
         return
     is_device = path.exists() and not path.is_file()  # such as /dev/stdout
@@ -235,7 +234,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Warn on stderr of missing messages, which results lack."""
+    """Warn on stderr of messages that the log lacks."""
     from teamslam.team.recording.check import holes
 
     tell_holes(log.path, holes(log))
@@ -265,7 +264,7 @@ def count_noun(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
-def parsed_speed(text: str) -> float:
+def parse_speed(text: str) -> float:
     """Parse a positive multiple of real time; infinite for `max`."""
     if text == "max":
         return math.inf
@@ -278,8 +277,8 @@ def parsed_speed(text: str) -> float:
     return speed
 
 
-def parsed_start(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse `[ROBOT:]x,y,theta[,sigma,sigma]`: robot (may be empty) and numbers."""
+def parse_start(text: str) -> tuple[str, tuple[float, ...]]:
+    """Parse `[ROBOT:]x,y,theta[,sigma,sigma]` into robot (may be empty) and numbers."""
     robot, colon, numbers = text.rpartition(":")
     try:
         pose = tuple(float(part) for part in numbers.split(","))
@@ -316,7 +315,7 @@ def scenario_of(name: str) -> Scenario:
 
 
 def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
-    """Read saved maps; ends with 2 for an unusable file, or two maps of one name."""
+    """Read saved maps; exit with 2 for an unusable file, or two maps of one name."""
     from teamslam.team.saved_map import SavedMapError, read_map
 
     with failing(WRONG_USE, SavedMapError):
@@ -329,13 +328,13 @@ def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
 
 
 def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
-    """End with 2 where maps are given to a team whose fusion rule joins no submaps."""
+    """Exit with 2 where maps are given to a fusion rule that joins no submaps."""
     if maps and scenario.central.fusion != "join":
         fail(f"--map: the fusion rule {scenario.central.fusion} joins no saved map", WRONG_USE)
 
 
 def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" = None) -> None:
-    """End with 2 unless robots can be localised: in one map, by a centre."""
+    """Exit with 2 unless robots can be localised: in one map, by a centre."""
     if len(maps or ()) != 1:
         fail("--localise: give one saved map by --map", WRONG_USE)
     if scenario is not None and (scenario.peers or not scenario.centre):
@@ -343,7 +342,7 @@ def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" =
 
 
 def check_names(team: str, robot: str | None = None) -> None:
-    """Exit if a team's name is invalid, or a robot's, which may be that of a saved map."""
+    """Exit if the name of a team, or of a robot or saved map, is invalid."""
     from teamslam.team.keys.roster import ROBOT, TEAM
 
     if robot is not None and not ROBOT.fullmatch(robot.removeprefix(MAP)):

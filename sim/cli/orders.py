@@ -71,7 +71,7 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is
     recorded and holds until it is withdrawn.
     """
-    from teamslam.central.desk.evaluation.verdicts import contradicting, in_words
+    from teamslam.central.desk.evaluation.verdicts import contradicting, describe_verdict
     from teamslam.central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
     from teamslam.team.wire.messages import Judgement
 
@@ -92,11 +92,13 @@ def verdict(
     opposite = "different" if word == "same" else "same"
     chain = () if withdraw else contradicting(judgement, fused.verdicts)
     if len(chain) > 1:
-        every = "; ".join(map(in_words, (*chain[:-1], judgement) if word == "same" else chain))
+        every = "; ".join(
+            map(describe_verdict, (*chain[:-1], judgement) if word == "same" else chain)
+        )
         apart = chain[-1] if word == "same" else judgement
         fail(
-            f"these verdicts contradict each other: {every}; yet {in_words(apart)}, which is what "
-            "holds, so that one of the others has no effect: withdraw what is wrong by "
+            f"these verdicts contradict each other: {every}; yet {describe_verdict(apart)}, which "
+            "is what holds, so that one of the others has no effect: withdraw what is wrong by "
             "`teamslam verdict … --withdraw`",
             FAILED,
         )

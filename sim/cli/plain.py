@@ -1,7 +1,7 @@
 """Parse the words of a command by its signature.
 
-Typer's parser loads Pydantic: 9 MB and 80 ms of CPU for each process of a team. What is parsed here
-is parsed as by Typer, which answers everything else: help, mistakes, options with bounds.
+Typer's parser loads Pydantic: 9 MB and 80 ms of CPU per process. Typer answers all else: help,
+mistakes, options with bounds.
 """
 
 import inspect
@@ -14,7 +14,7 @@ from typer.models import ArgumentInfo
 
 
 def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict[str, Any] | None:
-    """Arguments of a command's function that are words, paths and flags; None: ask Typer."""
+    """Arguments that are words, paths and flags; None: ask Typer."""
     places: list[tuple[str, type]] = []
     options: dict[str, tuple[str, type, bool]] = {}
     found: dict[str, Any] = {}

@@ -20,7 +20,7 @@ from teamslam.sim.cli.options import (
     connect_bus,
     count_noun,
     fail,
-    parsed_speed,
+    parse_speed,
     refuse_existing,
     refuse_open_door,
     warn_of_holes,
@@ -63,7 +63,7 @@ def replay(
     from teamslam.team.shell import process
     from teamslam.team.wire.zenoh.router import router
 
-    pace = parsed_speed(speed)
+    pace = parse_speed(speed)
     if connect is None:
         if keys is not None:
             fail("--keys is for a router that is there: give --connect", WRONG_USE)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from teamslam.sim.cli.help import Command, output_option, rare
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -113,13 +113,6 @@ def rerun(
     ] = None,
     fusion: FusionOption = None,
     estimator: EstimatorOption = None,
-    unsafe_feedback: Annotated[
-        bool,
-        rare(
-            "--unsafe-feedback",
-            help="Robots send the team's map back as their own: law 1 broken, for comparison.",
-        ),
-    ] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Recompute a log, to verify it or to compare it under other conditions.
@@ -145,7 +138,6 @@ def rerun(
         delay_s=delay,
         no_centre=None if no_centre is None else _span(no_centre, "--no-centre"),
         partitions=tuple(_partition(each) for each in partition or ()),
-        unsafe_feedback=unsafe_feedback,
         noise=_noise(noise or []),
         maps=tuple(map(str, map_ or ())),
         localise=localise,
@@ -367,13 +359,13 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     from teamslam.central.desk.ledger import ledger
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.tables import disposition_sheet, terminal_table
-    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.desk.verification.recorded import RerunError, index_log
     from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)
     warn_of_holes(opened)
     with failing(FAILED, RerunError, at=log):
-        found = ledger(recorded(opened))
+        found = ledger(index_log(opened))
     robots = in_order({robot for robot, _ in found.entries})
     console = Console()
     sheet = disposition_sheet({robot: found.totals(robot) for robot in robots})

@@ -22,10 +22,10 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
     from teamslam.central.desk.export.take_home import take_home
     from teamslam.central.desk.ledger import ledger
     from teamslam.central.desk.report.run import Run
-    from teamslam.central.desk.verification.recorded import RerunError, recorded
+    from teamslam.central.desk.verification.recorded import RerunError, index_log
 
     steps.begin("reading the robots' inputs")
-    messages = recorded(log)
+    messages = index_log(log)
     found, why = None, Run.no_ledger
     if proves_ledger:
         steps.begin("proving the ledger (--no-ledger leaves it out)")

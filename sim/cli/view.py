@@ -131,7 +131,7 @@ def view(
         fail(f"{log}: not found; --export and --layout need a log", WRONG_USE)
     with (
         process("view", endless=True) as stop,
-        shown_on_page(log, host, port, foxglove_port, browser, growing=follow) as shown,
+        show_on_page(log, host, port, foxglove_port, browser, growing=follow) as shown,
     ):
         stop.wait()
         if shown.feed.error is not None:
@@ -139,7 +139,7 @@ def view(
 
 
 @contextmanager
-def shown_on_page(
+def show_on_page(
     log: Path,
     host: str,
     port: int,

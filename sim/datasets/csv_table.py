@@ -73,8 +73,9 @@ class CsvTable:
         return np.array(parsed, dtype=np.int64)
 
     def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
-        """Landmark numbers, or final numbers of texts with one prefix, such as tag36h11:5. Raises
-        DatasetError.
+        """Landmark numbers, or final numbers of texts with one prefix, such as tag36h11:5.
+
+        Raises DatasetError.
         """
         ends = [NAMED.fullmatch(cell) for cell in self.columns[column]]
         named = [end for end in ends if end is not None]
@@ -98,7 +99,7 @@ class CsvTable:
         return CsvTable(self.name, columns, [self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
-        """Table without entirely empty columns, except needed ones.
+        """Omit entirely empty columns, except needed ones.
 
         All columns stay if no row has more than the first needed one: a time alone is an empty
         message.
@@ -133,7 +134,7 @@ class CsvTable:
 
 
 def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
-    """Read a table with a header line; skips empty lines and lines with `#`.
+    """Read a table with a header line; skip empty lines and lines with `#`.
 
     known: allowed columns, in either case; None: any. Columns may be separated by ; or tabs,
     decimals then by commas. An unnamed first column that counts rows is omitted. Raises
@@ -185,13 +186,11 @@ def cells_of(numbers: Float[np.ndarray, "R C"]) -> Sequence[Sequence[object]]:
 
 
 def _delimiter(lines: Sequence[str]) -> str:
-    """Column delimiter of the header: comma, else ; or tab."""
     first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
     return next((mark for mark in (",", ";", "\t") if mark in first), ",")
 
 
 def _replace_commas(cells: list[list[str]]) -> list[list[str]]:
-    """Convert decimal commas to points, unless points occur."""
     if any(POINT.fullmatch(cell) for row in cells for cell in row):
         return cells
     return [[c.replace(",", ".") if COMMA.fullmatch(c) else c for c in row] for row in cells]

@@ -31,7 +31,7 @@ FILES = ("detections.csv", "labels.csv")
 
 
 def detections_of(place: File, robot: str, classes: Sequence[str] = ()) -> Detections | None:
-    """A robot's detections without identities, or None. Raises DatasetError.
+    """Read a robot's detections without identities, or None. Raises DatasetError.
 
     Rows of one time are a scan; ids are labels, or NO_LABEL. classes: their names.
     """
@@ -106,7 +106,7 @@ def _classes_of(table: CsvTable, names: Sequence[str]) -> Float[np.ndarray, "R C
     return np.asarray(np.log(np.where(is_reported, right[:, np.newaxis], others)))
 
 
-def together(named: Detections, unnamed: Detections | None) -> Detections:
+def merge_detections(named: Detections, unnamed: Detections | None) -> Detections:
     """Merge named and unnamed scans by time."""
     if unnamed is None:
         return named
@@ -144,7 +144,6 @@ def split(seen: Detections) -> tuple[Detections, Detections | None]:
 
 
 def _without_empty(seen: Detections) -> Detections:
-    """Without columns that no row has a number in."""
     optional = ("points", "covariances", "signatures", "classes")
     columns = {name: getattr(seen, name) for name in optional}
     empty: dict[str, Any] = {

@@ -1,7 +1,6 @@
 """A planar landmark graph: poses of robots, odometry between them, and points measured from them.
 
-`graph_lines` and `pyfg` read it from text, `graph_writer` writes it, and `streams_of_graph` turns
-it into measurements: an odometry edge is an increment, the points from a pose are one scan.
+As measurements, an odometry edge is an increment, and the points from a pose are one scan.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,8 +54,7 @@ class FactorGraph:
     """Edges in the order of the file, and vertices where they are given.
 
     poses, landmarks: initial values, or with are_true true ones. priors: initial poses with their
-    covariance, None: exact. stamps_ns: times of the poses, if the format has them. unused: numbers
-    of lines by keyword that are not read.
+    covariance, None: exact. unused: numbers of lines by keyword that are not read.
     """
 
     name: str
@@ -100,7 +98,7 @@ def _show_key(key: Key) -> str:
 
 
 def split_at_gaps(graph: FactorGraph) -> FactorGraph:
-    """Name robots of a graph whose poses have numbers alone: one ends where no edge leads on."""
+    """Split a graph whose poses have numbers alone: a robot ends where no edge leads on."""
     links = {(edge.start, edge.end) for edge in graph.pose_edges}
     keys = sorted({key for link in links for key in link} | {e.pose for e in graph.point_edges})
     ends = [after for before, after in pairwise(keys) if (before, after) not in links]
@@ -117,7 +115,7 @@ def split_at_gaps(graph: FactorGraph) -> FactorGraph:
     )
 
 
-def dead_reckoned(graph: FactorGraph) -> None:
+def place_by_odometry(graph: FactorGraph) -> None:
     """Place poses without a vertex by odometry, and landmarks without one by their first edge."""
     for robot in graph.robots:
         keys, edges = graph.chain(robot)
@@ -131,7 +129,6 @@ def dead_reckoned(graph: FactorGraph) -> None:
 
 
 def _place_point(pose: Pose, point: Point) -> Point:
-    """Point in the frame of a pose."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.asarray(pose[:2] + np.array([[c, -s], [s, c]]) @ point)
 

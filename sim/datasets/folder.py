@@ -28,8 +28,8 @@ from teamslam.sim.datasets.csv_table import (
     UnknownColumnError,
     read_table,
 )
-from teamslam.sim.datasets.detections_table import detections_of, together
-from teamslam.sim.datasets.folder_files import EXPECTED, left_out, name_table, open_folder
+from teamslam.sim.datasets.detections_table import detections_of, merge_detections
+from teamslam.sim.datasets.folder_files import EXPECTED, name_table, open_folder, unused_files
 from teamslam.sim.datasets.folder_odometry import intervals_of
 from teamslam.sim.datasets.tables import DatasetError, File
 from teamslam.sim.world.config import FolderWorld, starts_unknown
@@ -82,7 +82,7 @@ def folder(
             )
         streams = [_stream(name, folders[name], world, clocks, classes) for name in clocks]
         surveyed = _table(root, "landmarks", "")
-        unused = left_out(root, folders, TABLES)
+        unused = unused_files(root, folders, TABLES)
     if world.duration_s is not None:
         end_ns = min(each.start_ns for each in streams) + round(world.duration_s * 1e9)
         streams = [each.until(end_ns) for each in streams]
@@ -142,7 +142,7 @@ def _stream(
     notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
     pose = None if start is None else rows.start_of(start)
     landmarks, mates = (
-        together(_insert_empty(seen.grouped(), empty_ns), unnamed),
+        merge_detections(_insert_empty(seen.grouped(), empty_ns), unnamed),
         teammates.grouped(),
     )
     begins = (np.array(driven or (), np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
@@ -164,7 +164,6 @@ def _stream(
 
 
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:
-    """Table with its required columns; None if missing or empty."""
     file = place / f"{kind}.csv"
     if not file.is_file():
         return None

@@ -43,7 +43,6 @@ def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
 
 
 def _root(archive: zipfile.Path) -> zipfile.Path:
-    """Single folder of an archive, or the archive."""
     entries = list(archive.iterdir())
     return entries[0] if len(entries) == 1 and entries[0].is_dir() else archive
 
@@ -107,8 +106,8 @@ def name_table(place: File, file: File, robot: str) -> str:
     return f"{robot}/{file.name}" if place.name == robot else file.name
 
 
-def left_out(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
-    """Notes on CSV files that are no table, and on folders with tables of no robot."""
+def unused_files(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
+    """Describe CSV files that are no table, and folders with tables of no robot."""
     known = {*tables, "detections", "labels"}
     notes = []
     for place in dict.fromkeys([root, *folders.values()]):

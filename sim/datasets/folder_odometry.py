@@ -70,7 +70,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     duration = np.diff(stamps)
     used = slice(None)
     if form == POSES:
-        steps, ends, used = between(numbers), stamps[1:], slice(1, None)
+        steps, ends, used = motions_between(numbers), stamps[1:], slice(1, None)
         steps = _omit_resets(rows, numbers, steps, duration)
     elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
         steps, ends, used = numbers[:-1], stamps[1:], slice(0, -1)
@@ -104,7 +104,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def pace_notes(duration_ns: Int64[np.ndarray, " I"], name: str = "") -> list[str]:
-    """Note on odometry whose usual interval is implausible in seconds.
+    """Note a usual odometry interval that is implausible in seconds.
 
     Raises DatasetError for a table (name) whose usual interval is impossible.
     """
@@ -144,7 +144,7 @@ def _omit_resets(
     steps: Float[np.ndarray, "M 3"],
     duration: Int64[np.ndarray, " M"],
 ) -> Float[np.ndarray, "M 3"]:
-    """Motions; across an odometry reset or a wrong row, the previous motion continues.
+    """Continue the previous motion across an odometry reset or a wrong row.
 
     A step of RESET_M or more is a reset if it returns to the first pose faster than any usual step,
     or is RESET_TIMES as fast as nine steps of ten.
@@ -171,7 +171,6 @@ def _omit_resets(
 def _covariances_of(
     rows: Rows, form: tuple[str, ...], used: slice
 ) -> Float[np.ndarray, "N 3 3"] | None:
-    """Motion covariances of these rows, or None."""
     table = rows.table
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return None
@@ -201,9 +200,7 @@ def _find_filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, 
 
 
 def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
-    """Check duration_s: raises DatasetError for non-positive values; notes deviations from row
-    times.
-    """
+    """Raise DatasetError for a duration_s that is not positive; note deviations from row times."""
     if not rows.table.has("duration_s"):
         return
     stated = rows.table.stamps("duration_s")
@@ -221,9 +218,7 @@ def _judge_speeds(
     steps: Float[np.ndarray, "N _"],
     duration: Int64[np.ndarray, " N"],
 ) -> None:
-    """Note implausible motions, which robots refuse; raises DatasetError for a usual turn in
-    degrees.
-    """
+    """Note implausible motions, which robots refuse; raise DatasetError for a turn in degrees."""
     if form == STEERED or not len(steps):
         return
     seconds = duration * 1e-9
@@ -250,7 +245,6 @@ def _judge_speeds(
 
 
 def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
-    """Form of the rows, or speeds and increments for a mixed table."""
     found = tuple(form for form in FORMS if table.has(*form))
     if len(found) == 1 or (found in MIXED and table.has("duration_s")):
         return found
@@ -276,7 +270,7 @@ def arcs(
     return np.column_stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn])
 
 
-def between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
+def motions_between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
     """Each pose in the frame of the previous one: (forward, left, turn)."""
     dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])

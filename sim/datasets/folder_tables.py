@@ -69,7 +69,7 @@ class Rows:
         self.stamps_ns = self.stamps_ns[~dropped]
 
     def take_out(self, chosen: Bool[np.ndarray, " rows"]) -> Int64[np.ndarray, " chosen"]:
-        """Remove these rows without a note; returns their times."""
+        """Remove these rows without a note; return their times."""
         stamps: Int64[np.ndarray, " chosen"] = self.stamps_ns[chosen]
         if chosen.any():
             self.table = self.table.rows((~chosen).tolist())
@@ -99,10 +99,10 @@ def measurements_of(
     team: tuple[str, Sequence[str]] | None,
     driven: tuple[int, int] | None,
 ) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
-    """Measurements of landmarks, or of teammates by index (team: own name and all names), and the
-    times of empty rows.
+    """Measurements of landmarks, or of teammates by index, and the times of empty rows.
 
-    driven: begin and end of the odometry, or None. Raises DatasetError.
+    team: own name and all names. driven: begin and end of the odometry, or None. Raises
+    DatasetError.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -150,7 +150,6 @@ def measurements_of(
 
 
 def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
-    """Check that a row lies within the odometry's time; raises DatasetError."""
     first_ns, last_ns = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
     begin_ns, end_ns = driven
     if first_ns > end_ns or last_ns < begin_ns - EARLY_NS:
@@ -164,7 +163,6 @@ def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
 
 
 def _cells(table: CsvTable) -> list[tuple[str, ...]]:
-    """Cells by row, time first."""
     columns = [table.columns["t_s"], *(c for name, c in table.columns.items() if name != "t_s")]
     return list(zip(*columns, strict=True))
 
@@ -197,7 +195,6 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
 def _own(
     rows: Rows, forms: Sequence[tuple[str, ...]], as_points: Bool[np.ndarray, " R"]
 ) -> Float[np.ndarray, "R 3"] | None:
-    """Covariances of ranges and bearings and of points, NaN where absent."""
     table, claimed = rows.table, np.full((len(rows.table), 3), np.nan)
     allowed = [POLAR_COVARIANCE if form == POLAR else POINT_COVARIANCE for form in forms]
     present = {c for c in (*POLAR_COVARIANCE, *POINT_COVARIANCE) if table.has(c)}
@@ -221,8 +218,9 @@ def _own(
 def fixes_of(
     table: CsvTable | None, driven: tuple[int, int] | None
 ) -> tuple[Int64[np.ndarray, " F"], Float[np.ndarray, "F 5"], list[str]]:
-    """Times, absolute positions with covariances (x, y, xx, xy, yy; NaN where not stated), and
-    notes; raises DatasetError.
+    """Times, absolute positions with covariances (x, y, xx, xy, yy; NaN if not stated), and notes.
+
+    Raises DatasetError.
     """
     if table is None:
         return np.empty(0, np.int64), np.empty((0, 5)), []

@@ -68,8 +68,10 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
 
 
 def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
-    """Columns and rows on the odometry's clock: a row at each interval's start and one at the end
-    of the last; for increments or mixed forms, one at each end.
+    """Columns and rows on the odometry's clock.
+
+    A row is at each interval's start and at the end of the last; for increments or mixed forms, at
+    each end.
     """
     intervals = stream.intervals
     ends_ns = intervals.end_ns - stream.clock_offset_ns
@@ -98,7 +100,6 @@ def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
 def _measured(
     seen: Detections, name: str, names: Sequence[object]
 ) -> tuple[Sequence[str], Iterable[Row]]:
-    """Columns and rows by message; an empty message is a time alone."""
     columns, parts = ["t_s", name], []
     polar = np.column_stack((seen.ranges, seen.bearings))
     points = np.full_like(polar, np.nan) if seen.points is None else seen.points
@@ -124,7 +125,6 @@ def _measured_rows(
     numbers: Sequence[Sequence[object]],
     width: int,
 ) -> Iterable[Row]:
-    """Rows of each message; width: cells after the time."""
     offsets = seen.offsets.tolist()
     for message, stamp_ns in enumerate(seen.stamps_ns.tolist()):
         time = seconds(stamp_ns)

@@ -25,7 +25,7 @@ from teamslam.sim.datasets.factor_graph import (
     Matrix,
     PointEdge,
     PoseEdge,
-    dead_reckoned,
+    place_by_odometry,
     split_at_gaps,
 )
 from teamslam.sim.datasets.tables import LARGEST, DatasetError
@@ -147,7 +147,7 @@ def read_graph(path: Path) -> FactorGraph:
     twin = path.with_name(f"{path.stem}{TRUTH}{path.suffix}")
     if twin.is_file():
         truth = _read(twin)
-        dead_reckoned(truth)
+        place_by_odometry(truth)
         graph.poses, graph.landmarks, graph.are_true = truth.poses, truth.landmarks, True
     return graph
 
@@ -168,7 +168,7 @@ def _read(path: Path) -> FactorGraph:
         elif line.keyword in POSE_EDGES:
             covariance = _covariance(line, values[3:], 3, is_toro=is_toro)
             if line.keyword != "EDGE_SE2":
-                covariance = turned(covariance, values[2])
+                covariance = turn_covariance(covariance, values[2])
             edge = PoseEdge(first, ("", line.identity(1)), values[:3], covariance)
             graph.pose_edges.append(edge)
         elif line.keyword in POINT_EDGES:
@@ -201,7 +201,7 @@ def inverse_of(line: Line, information: Matrix) -> Matrix:
     return np.asarray(0.5 * (inverse + inverse.T))
 
 
-def turned(
+def turn_covariance(
     covariance: Float[np.ndarray, "*N 3 3"], theta: Float[np.ndarray, "*N"] | float
 ) -> Float[np.ndarray, "*N 3 3"]:
     """Covariance of a motion, from the axes of its start to those of its end, turned by theta."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from teamslam.sim.datasets.factor_graph import FactorGraph, Key, Matrix
-from teamslam.sim.datasets.graph_lines import turned
+from teamslam.sim.datasets.graph_lines import turn_covariance
 
 LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
 """Names of robots in pyfg, where L is a landmark's."""
@@ -50,7 +50,7 @@ def isam_lines(graph: FactorGraph, robot: str) -> Iterator[str]:
             )
     for edge in graph.chain(robot)[1]:
         yield from seen_from.pop(edge.start, ())
-        covariance = turned(edge.covariance, -edge.motion[2])
+        covariance = turn_covariance(edge.covariance, -edge.motion[2])
         yield (
             f"ODOMETRY {number[edge.start]} {number[edge.end]} {_numbers(edge.motion)} "
             f"{_upper(_root(covariance))}"

@@ -58,7 +58,6 @@ def _other_tables(place: Path) -> list[str]:
 
 
 def _find_tables_within(place: Path) -> Path | None:
-    """First inner folder that is a data set of tables."""
     if not place.is_dir():
         return None
     inner = (each for each in sorted(place.iterdir()) if each.is_dir())

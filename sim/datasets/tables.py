@@ -48,7 +48,7 @@ EXPECTED = (
 def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows columns"]:
     """Numbers of a white-space table with `#` comments; may have 0 rows.
 
-    Raises DatasetError with file, line and text of a line without as many finite numbers.
+    Raises DatasetError for a line without as many finite numbers.
     """
     lines = file.read_bytes().decode("utf-8", errors="replace").splitlines()
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]

@@ -18,7 +18,7 @@ import numpy as np
 from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable, matrices, read_table
 from teamslam.sim.datasets.detections_table import labels_of, scans_of
 from teamslam.sim.datasets.folder_odometry import pace_notes
-from teamslam.sim.datasets.graph_lines import turned
+from teamslam.sim.datasets.graph_lines import turn_covariance
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import (
@@ -64,9 +64,9 @@ def is_car(path: str | Path) -> bool:
 
 
 def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
-    """Streams of a data set, cut into one piece per robot.
+    """Streams of a data set, cut into one piece per robot. Raises DatasetError.
 
-    Pieces are consecutive in the log and begin at one time here. Raises DatasetError.
+    Pieces are consecutive in the log and begin at one time here.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset FOLDER; {EXPECTED}")
@@ -186,7 +186,7 @@ def _read_steps(
         raise odometry.fault("step does not count from 0 by ones")
     ends = (steps + 1) * STEP_NS
     increments = odometry.numbers(*STEPS[1:])
-    covariances = turned(matrices(odometry.numbers(*POSE_COVARIANCE)), increments[:, 2])
+    covariances = turn_covariance(matrices(odometry.numbers(*POSE_COVARIANCE)), increments[:, 2])
     intervals = moved(ends, np.full(len(ends), STEP_NS), increments, covariances)
     x, y = detections.numbers("x_m", "y_m").T
     ranges = np.maximum(np.hypot(x, y), 1e-3)
@@ -207,7 +207,6 @@ def _steps(table: CsvTable) -> Int64[np.ndarray, " rows"]:
 
 
 def _name_by_labels(seen: Detections) -> Detections:
-    """Scans with labels as identities, for comparison; unlabelled detections are omitted."""
     chosen = seen.ids != NO_LABEL
     _, first = np.unique(np.column_stack((seen.message_of, seen.ids)), axis=0, return_index=True)
     once = np.zeros(len(chosen), np.bool_)
@@ -284,7 +283,6 @@ def _cut_values(
     end_ns: int,
     back_ns: int,
 ) -> tuple[Int64[np.ndarray, " K"] | None, Float[np.ndarray, "K n"] | None]:
-    """Values of a time, with their stamps moved back."""
     if stamps_ns is None or values is None:
         return None, None
     inside = (stamps_ns >= begin_ns) & (stamps_ns <= end_ns)

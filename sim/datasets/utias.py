@@ -1,9 +1,8 @@
 """UTIAS multi-robot cooperative localisation and mapping data sets (MRCLAM).
 
-Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. A set has 17 text files: `Barcodes.dat`,
-`Landmark_Groundtruth.dat`, and odometry, measurements and ground truth of each robot N.
-Measurements name a *barcode*; `Barcodes.dat` gives its subject: a robot (its number) or a landmark.
-Dropped rows are counted in notes.
+Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. Measurements name a *barcode*;
+`Barcodes.dat` gives its subject: a robot (its number) or a landmark. Dropped rows are counted in
+notes.
 """
 
 import re
@@ -107,7 +106,7 @@ def _landmarks(
 
 
 class _Reading(NamedTuple):
-    """A data set's files, and the values that all its robots share.
+    """Files of a data set, and the values that all its robots share.
 
     subject_of: barcode → subject. clocks: offset [ns] of each robot of the team. last_robot: the
     largest subject of a robot.
@@ -226,7 +225,7 @@ def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
 def intervals_of(
     rows: Float[np.ndarray, "N 3"], delay_ns: int
 ) -> tuple[Intervals, tuple[str, ...]]:
-    """Odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
+    """Convert odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
     rows, backward = _sort_by_time(rows)
     stamps = nanoseconds(rows[:, 0]) + delay_ns
     duration = np.diff(stamps)
@@ -321,6 +320,6 @@ def start_pose(
 
 
 def _sort_by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
-    """Sort rows stably by the first column; also returns the number of backward steps."""
+    """Sort rows stably by the first column; also return the number of backward steps."""
     backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward

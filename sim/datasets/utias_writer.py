@@ -110,7 +110,6 @@ def _measured_rows(stream: RobotStream, number: Mapping[str, int], shift: int) -
 
 
 def _seconds(stamp_ns: int) -> str:
-    """Seconds with six decimals, exact to the microsecond."""
     micro = (stamp_ns + 500) // 1000
     sign, micro = ("-", -micro) if micro < 0 else ("", micro)
     return f"{sign}{micro // 10**6}.{micro % 10**6:06d}"

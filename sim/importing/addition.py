@@ -19,7 +19,7 @@ LANDMARKS = "landmarks.csv"
 
 
 def takes_robot(folder: Path, robot: str) -> bool:
-    """Whether a folder is a data set with a sub-folder for each robot, and none for this one."""
+    """Whether a folder is a data set with a sub-folder per robot, and none for this one."""
     try:
         robots = robots_of(str(folder))
     except DatasetError:
@@ -28,11 +28,7 @@ def takes_robot(folder: Path, robot: str) -> bool:
 
 
 def add_robot(request: Request, folder: Path) -> Report:
-    """Import one robot into a data set, whose other files stay as they are.
-
-    An existing landmarks.csv is kept, and the robot's fixes are in the plane of the data set's
-    datum. Raises DatasetError.
-    """
+    """Import one robot into a data set, whose other files and datum stay; raises DatasetError."""
     assert request.robot is not None
     with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as place:
         added = Path(place)
@@ -66,7 +62,7 @@ def add_robot(request: Request, folder: Path) -> Report:
 def _with_robot(folder: Path, added: Path, robot: str) -> str:
     """Text of the data set's scenario with the added robot; empty if it needs no change.
 
-    A robot without an entry is not in the team, once a scenario has entries. Raises DatasetError.
+    Raises DatasetError.
     """
     own = _document(added / SCENARIO)
     text = (folder / SCENARIO).read_text("utf-8") if (folder / SCENARIO).exists() else ""

@@ -1,4 +1,4 @@
-"""Import ROS 2 bags: find the topics and convert their messages to tables."""
+"""Import ROS 2 bags: convert their messages to tables."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -30,8 +30,7 @@ from teamslam.team.ros2.translator import Translator
 class Imported:
     """Tables of a bag's robots.
 
-    notes: topics used and omitted, with reasons. messages: number read. datum: origin of the plane
-    of the fixes, if there are any.
+    notes: topics used and omitted, with reasons. messages: number read. datum: origin of fixes.
     """
 
     robots: list[RobotTables]
@@ -45,8 +44,8 @@ def import_bag(
 ) -> Imported:
     """Tables of a bag; raises BagError, UndecidedError.
 
-    topics: of each robot; None: from names and types if unambiguous. robot: name of the only robot.
-    datum: where the topics give none; None: the first fix.
+    topics: of each robot; None: from names and types if unambiguous. datum: where the topics give
+    none; None: the first fix.
     """
     with opened_bag(path) as bag:
         chosen = topics or decide_topics(bag, path, robot)
@@ -107,7 +106,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
     for name, translator in translators.items():
         notes += [f"{name}: {note}" for note in translator.said]
         notes += [f"{name}: {count} dropped: {why}" for why, count in translator.dropped.items()]
-        notes += _mounted(translator, tables[name])
+        notes += _add_mount(translator, tables[name])
         tables[name].antenna = translator.antenna or (0.0, 0.0)
     has_fixes = any("fixes" in each.rows for each in tables.values())
     datum = topics.datum if has_fixes else None
@@ -124,9 +123,6 @@ def _first_fix(bag: Bag, topics: Topics) -> Datum | None:
 
 
 def _translators(bag: Bag, topics: Topics) -> dict[str, Translator]:
-    """Translator of each robot; if robots share a detection topic, all transforms are read first to
-    assign detections.
-    """
     frames = {name: _static_frames(bag, each.odometry) for name, each in topics.robots.items()}
     owners = Owners(topics.robots, frames)
     translators = {
@@ -150,8 +146,7 @@ def _stamped(record: Record, arrival_ns: int) -> Record:
     return record if isinstance(record, TransformsRecord) else record._replace(stamp_ns=arrival_ns)
 
 
-def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
-    """Add the mount of the robot's first sensor to the tables; returns notes."""
+def _add_mount(translator: Translator, tables: RobotTables) -> list[str]:
     if not translator.mounts:
         return []
     tables.mount = next(iter(translator.mounts.values())).pose
@@ -164,7 +159,6 @@ def _mounted(translator: Translator, tables: RobotTables) -> list[str]:
 
 
 def _static_frames(bag: Bag, odometry: str) -> Frames:
-    """Static transforms of a robot: those without namespace, or in its odometry topic's."""
     frames = Frames()
     for record in _records(bag, static_topics(odometry)):
         if isinstance(record, TransformsRecord):

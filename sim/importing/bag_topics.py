@@ -124,8 +124,7 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
 def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
     """Namespaces that are robots; None: all topics are one robot's.
 
-    Namespaces belong to one robot if none has both odometry and detections, and all odometry has
-    one frame.
+    They are one robot's if none has both odometry and detections, and all odometry has one frame.
     """
     spaces = sorted({_namespace(name) for name in bases})
     if len(spaces) < 2:
@@ -135,13 +134,11 @@ def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> lis
 
 
 def _only_space(topics: list[Topic]) -> str:
-    """Namespace of a single robot's odometry; empty for several."""
     spaces = {_namespace(topic.name) for topic in topics if topic.kind in ODOMETRY}
     return spaces.pop() if len(spaces) == 1 else ""
 
 
 def _base_in(bag: Bag, topic: Topic) -> str:
-    """Frame of an odometry topic's pose, by its first valid message."""
     for raw in bag.messages([topic.name]):
         try:
             record = decode(raw.kind, raw.data, bag.store)
@@ -152,7 +149,6 @@ def _base_in(bag: Bag, topic: Topic) -> str:
 
 
 def _choice(odometry: list[str]) -> str:
-    """Proposed odometry topic of several, with the reason."""
     if len(odometry) < 2:
         return ""
     return (
@@ -214,7 +210,7 @@ def _tags_in(bag: Bag) -> set[str]:
 
 
 def listing(topics: list[Topic]) -> str:
-    """A bag's topics, one per line, with remarks on unusable ones."""
+    """Describe a bag's topics, one per line, with remarks on unusable ones."""
     lines = []
     for topic in topics:
         used = "" if topic.kind in READERS else "   (not read here)"

@@ -24,7 +24,7 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table: endings of the names of files joined side by side, and its columns.
+    """Table: endings of the names of files joined side by side, and its columns.
 
     drop: by user column, texts of rows that are no measurements.
     """
@@ -39,9 +39,7 @@ Map = dict[str, Table]
 
 
 class ColumnMap(msgspec.Struct, frozen=True):
-    """A team's column map. shared: tables of every robot. robots: tables of single robots, which
-    replace shared ones of the same kind.
-    """
+    """Team's column map: tables of every robot, and those of single robots, which replace them."""
 
     shared: Map
     robots: dict[str, Map]

@@ -49,8 +49,8 @@ def import_files(
 ) -> tuple[RobotTables, list[str]]:
     """Import one robot's tables from CSV files by a map; also returns notes on the files.
 
-    everyones: file names of all robots; a table whose files only other robots have is omitted.
-    Raises DatasetError, also for an unused file that is probably an omitted table.
+    everyones: file names of all robots. Raises DatasetError, also for an unused file that is
+    probably a missing table.
     """
     tables = RobotTables(robot)
     notes: list[str] = []
@@ -79,9 +79,7 @@ def import_files(
 def _refuse_second_robot(
     endings: Sequence[str], used: Collection[str], unused: Collection[str]
 ) -> None:
-    """Raise DatasetError for an unused file that is called as the odometry, after another prefix:
-    `jackal_odometry.csv` beside `husky_odometry.csv`.
-    """
+    """Raise DatasetError for an unused file with the odometry's name after another prefix."""
     rest = {re.split("[_-]", n, maxsplit=1)[-1] for n in used if n.endswith(tuple(endings))}
     for name in unused:
         prefix, *behind = re.split("[_-]", name, maxsplit=1)
@@ -118,7 +116,7 @@ def _take(
             )
         used.add(named[0])
         side_by_side.append(files[named[0]])
-    whole = _joined(side_by_side)
+    whole = _join_columns(side_by_side)
     notes: list[str] = []
     for column, texts in table.drop.items():
         if column not in whole.columns:
@@ -134,14 +132,13 @@ def _take(
             whole = whole.rows(chosen)
     found = map_columns(whole, table.columns)
     if kind == "detections":
-        found = _polar(found, whole)
+        found = _convert_points(found, whole)
     tables.columns[kind] = list(found)
     tables.rows[kind] = [*zip(*found.values(), strict=True)]
     return notes
 
 
-def _polar(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
-    """Convert detections from points (ahead, left) to range and bearing."""
+def _convert_points(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
     if not all(name in columns for name in POINTS):
         return columns
     x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)
@@ -164,7 +161,7 @@ def _texts(numbers: Float[np.ndarray, " rows"]) -> list[str]:
     return list(map(repr, numbers.tolist()))
 
 
-def _joined(tables: Sequence[CsvTable]) -> CsvTable:
+def _join_columns(tables: Sequence[CsvTable]) -> CsvTable:
     first = tables[0]
     columns = dict(first.columns)
     for other in tables[1:]:
@@ -187,7 +184,7 @@ def trajectory(path: Path) -> list[tuple[str, ...]]:
 def _tum_table(path: Path) -> CsvTable | None:
     """Read poses (t x y z qx qy qz qw) in TUM's format; None: another format.
 
-    The heading is that of the pose's x axis. Raises DatasetError.
+    Heading is that of the pose's x axis. Raises DatasetError.
     """
     rows: list[tuple[str, ...]] = []
     lines: list[int] = []

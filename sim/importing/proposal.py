@@ -85,10 +85,10 @@ Files = Mapping[str, CsvTable]
 
 
 def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
-    """Propose a TOML map for the files of each robot, as far as names allow.
+    """Propose a TOML map for the files of each robot.
 
-    Robots whose tables of a kind differ, with `own` all robots, have tables of their own,
-    `[robots.NAME.KIND]`. Missing columns and files without a table are comments at the end.
+    Robots whose tables of a kind differ, with `own` all robots, have tables `[robots.NAME.KIND]`.
+    Missing columns and files without a table are comments at the end.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
     kinds = dict.fromkeys(kind for tables, _ in found.values() for kind in tables)
@@ -110,7 +110,7 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
 
 
 def write_proposal(text: str, path: Path) -> str:
-    """Write a proposal to the missing file that an option names; returns the request to check it.
+    """Write a proposal to the missing file of an option; return the request to check it.
 
     Raises DatasetError.
     """
@@ -130,10 +130,8 @@ def proposed_kinds(files: Files) -> set[str]:
 
 
 def split_by_robot(files: Files) -> dict[str, Files]:
-    """Files of each robot, if the first or last words of their names are the names of at least two
-    robots with odometry and measurements; else empty.
-
-    Other files with a robot's name in their own are this robot's; the rest is every robot's.
+    """Files of each robot, by first or last words of names that name at least two robots with
+    odometry and measurements; else empty.
     """
     for position in (0, -1):
         words = {name: _words(name)[position] for name in files}
@@ -165,7 +163,6 @@ def _words(name: str) -> list[str]:
 
 
 def _tables(files: Files) -> tuple[dict[str, str], list[str]]:
-    """TOML text of each probable table, with KIND for its name; also returns missing columns."""
     guesses: list[_Guess] = []
     lacking: list[str] = []
     for name, table in files.items():
@@ -193,11 +190,7 @@ def _tables(files: Files) -> tuple[dict[str, str], list[str]]:
 
 
 def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
-    """Table with most of these columns, then by file name; and truth, if odometry has reference
-    columns.
-
-    Reference files and columns are no measurements.
-    """
+    """Table with most of these columns, then by file name; and truth, from reference columns."""
     reference = [each for each in header if has_word(each, TRUTH_WORDS)]
     is_reference = has_word(Path(name).stem, TRUTH_WORDS)
     own = [each for each in header if each not in reference]
@@ -218,7 +211,6 @@ def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
 
 
 def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
-    """Columns of a table kind in a file; None if incomplete."""
     found = {ours: near for ours in TABLES[kind] if (near := _near(ours, header)) is not None}
     columns = _of_one_form(kind, found)
     whole = all(ours in columns for ours in REQUIRED[kind]) and len(columns) > 2
@@ -231,7 +223,6 @@ def _guess(name: str, kind: str, header: Sequence[str]) -> _Guess | None:
 
 
 def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
-    """Columns of one measurement form only."""
     left_out: Sequence[str] = ()
     if kind == "odometry" and "forward_m_s" in columns:
         left_out = POSES
@@ -241,12 +232,15 @@ def _of_one_form(kind: str, columns: dict[str, str]) -> dict[str, str]:
 
 
 def _near(ours: str, header: Sequence[str]) -> str | None:
-    """Column with a name close to ours, if any."""
-    names = {_joined(name) for name in SYNONYMS.get(ours, "").split()}
-    names.add(_joined(_without_unit(ours)[0]))
+    names = {_join_words(name) for name in SYNONYMS.get(ours, "").split()}
+    names.add(_join_words(_without_unit(ours)[0]))
     for theirs in header:
         bare, scale = _without_unit(theirs)
-        if theirs == ours or _joined(bare) in names or _joined(_without_prefix(bare)) in names:
+        if (
+            theirs == ours
+            or _join_words(bare) in names
+            or _join_words(_without_prefix(bare)) in names
+        ):
             if scale == "1" or theirs == ours:
                 return f'"{theirs}"'
             return f'{{ column = "{theirs}", scale = {scale} }}'
@@ -268,7 +262,7 @@ def _without_prefix(name: str) -> str:
     return _without_prefix(rest) if rest and first in PREFIXES else name
 
 
-def _joined(name: str) -> str:
+def _join_words(name: str) -> str:
     return name.replace("_", "")
 
 

@@ -43,9 +43,8 @@ HEAD = 64
 class Request:
     """Import request.
 
-    sources: files or folders. starts: initial poses by robot (pose, then two or no standard
-    deviations); "" is the only robot. truth: trajectory of the only robot. datum: origin of the
-    plane of fixes, where the topics state none; None: the first fix.
+    sources: files or folders. starts: pose and zero or two standard deviations by robot, "" for the
+    only one. truth: trajectory of the only robot. datum: origin of fixes; None: the first one.
     """
 
     sources: Sequence[Path]
@@ -59,10 +58,7 @@ class Request:
 
 @dataclass
 class Report:
-    """Result of an import.
-
-    robots: names. notes: used and omitted files and rows. messages: number read from bags.
-    """
+    """Result of an import: robots, notes, number of messages read from bags."""
 
     robots: list[str]
     notes: list[str]
@@ -92,7 +88,6 @@ def import_data(request: Request, folder: Path) -> Report:
 
 
 def _own_form(request: Request, folder: Path) -> Report:
-    """Copy our own data set or log, with the given initial poses."""
     source = request.sources[0]
     given = {"--robot": request.robot, "--columns": request.columns, "--truth": request.truth}
     for option in (name for name, value in given.items() if value is not None):
@@ -107,7 +102,7 @@ def _own_form(request: Request, folder: Path) -> Report:
         notes = [] if missing is None else [missing]
     robots = {stream.robot: stream for stream in streams.streams}
     for name, (x, y, theta, *sigmas) in request.starts.items():
-        robot = _started(name, robots)
+        robot = _robot_of_start(name, robots)
         pose = np.array([x, y, theta])
         variances = [sigmas[0] ** 2, sigmas[0] ** 2, sigmas[1] ** 2] if sigmas else None
         start = StartPose(pose, None if variances is None else np.diag(variances))
@@ -118,8 +113,7 @@ def _own_form(request: Request, folder: Path) -> Report:
     return Report(list(robots), notes)
 
 
-def _started(name: str, robots: Collection[str]) -> str:
-    """Robot that `--start` refers to; raises DatasetError."""
+def _robot_of_start(name: str, robots: Collection[str]) -> str:
     robot = name or (next(iter(robots)) if len(robots) == 1 else "")
     if robot not in robots:
         raise DatasetError(
@@ -129,7 +123,6 @@ def _started(name: str, robots: Collection[str]) -> str:
 
 
 def _is_foreign(source: Path) -> bool:
-    """Whether a folder has foreign CSV files, directly or in one folder per robot."""
     try:
         kind_of(source)
     except DatasetError:
@@ -138,10 +131,8 @@ def _is_foreign(source: Path) -> bool:
 
 
 def _files_by_robot(request: Request) -> dict[str, list[Path]]:
-    """CSV files of each robot: of a folder ("" if nothing names its robot), of its sub-folders, or
-    of each given folder.
-
-    Files beside the robots' folders (true landmarks) belong to every robot.
+    """CSV files by robot: of a folder ("" if nothing names its robot), its sub-folders, or of each
+    given folder. Files beside the robots' folders are every robot's.
     """
     found: dict[str, list[Path]] = {}
     for source in request.sources:
@@ -199,7 +190,7 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
 def _files_by_map(
     read: Mapping[str, Mapping[str, CsvTable]], columns: ColumnMap, path: Path
 ) -> Mapping[str, Mapping[str, CsvTable]]:
-    """Files of each robot: of "" those that the map names for the robot; raises DatasetError."""
+    """Files by robot; those of "" by the map; raises DatasetError."""
     if "" not in read:
         for robot in columns.robots:
             if robot not in read:
@@ -223,7 +214,6 @@ def _files_by_map(
 def _question(
     robots: Mapping[str, Mapping[str, CsvTable]], request: Request, folder: Path
 ) -> DatasetError:
-    """Proposal of a map, which is also written to the file that `--columns` names."""
     proposed = propose_map(robots)
     if request.columns is not None:
         return DatasetError(write_proposal(proposed, request.columns))
@@ -245,7 +235,7 @@ def _question(
 
 
 def proposal(path: Path) -> str:
-    """A bag's topics, with a proposed assignment file; empty for other paths."""
+    """Describe a bag's topics, with a proposed assignment file; empty for other paths."""
     if not is_bag(path) or is_own_log(path):
         return ""
     try:
@@ -321,7 +311,7 @@ def _written(
             "are what"
         )
     for name, (x, y, theta, *sigmas) in request.starts.items():
-        by_name[_started(name, by_name)].start((x, y, theta), sigmas)
+        by_name[_robot_of_start(name, by_name)].start((x, y, theta), sigmas)
     if request.truth is not None:
         if len(tables) != 1:
             raise DatasetError(
@@ -338,9 +328,6 @@ def _written(
 
 
 def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Path) -> list[str]:
-    """Write the places of sensors and antennas on the robots, and the datum of the fixes, if there
-    are any, into a scenario that does not exist; returns notes.
-    """
     robots = []
     for each in tables:
         own: dict[str, object] = {"id": each.robot}
@@ -365,7 +352,7 @@ def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Pa
 
 
 def robot_entry(robot: Mapping[str, Any]) -> str:
-    """Text of a robot's entry in a scenario: its name, and the places of sensor and antenna."""
+    """TOML text of a robot's entry: its name, the places of its sensor and antenna."""
     places = [
         f"{part}.{name} = {place}\n"
         for part in ("sensor", "gnss")

@@ -14,8 +14,8 @@ from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 class RobotTables:
     """Rows of one robot's tables.
 
-    columns: of tables that choose their columns. mount: sensor pose (x, y, yaw) on the base.
-    antenna: place (ahead, left) of the GNSS antenna on the base.
+    columns: of tables that choose theirs. mount: sensor pose (x, y, yaw) on the base. antenna: GNSS
+    antenna (ahead, left) on the base.
     """
 
     robot: str
@@ -78,11 +78,11 @@ class RobotTables:
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
             columns = self.columns[table]
-            fitted = (_fitted(row, len(columns)) for row in rows)
+            fitted = (_fit_row(row, len(columns)) for row in rows)
             write_table(
                 (folder if table == "landmarks" else place) / f"{table}.csv", columns, fitted
             )
 
 
-def _fitted(row: Row, width: int) -> Row:
+def _fit_row(row: Row, width: int) -> Row:
     return [*row, *[""] * (width - len(row))]

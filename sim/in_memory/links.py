@@ -1,7 +1,6 @@
 """Simulated links in team time: delay, loss, partitions, a centre that dies.
 
-Under the delivery `all` a lost submap is sent again. So under the rule `join` none of this can
-change the final map (law 2).
+A lost submap is sent again, so none of this can change the final map of the rule `join` (law 2).
 """
 
 import heapq
@@ -23,9 +22,7 @@ _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Deliver messages to a node at their arrival times; at equal times liveliness tokens come
-    first.
-    """
+    """Delivery of messages to a node at their arrival times; liveliness tokens come first."""
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns

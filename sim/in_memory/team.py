@@ -77,7 +77,6 @@ class _Seat:
 
 @lru_cache(maxsize=SHARED)
 def _open_sample(sample: Sample) -> m.Message:
-    """Decode a sample once for all its receivers, which do not change it."""
     return opened(sample)[2]
 
 
@@ -87,7 +86,7 @@ def run_team(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
-    """Run the team to its final map; yields a recorder's samples, in order."""
+    """Run the team to its final map; yield a recorder's samples, in order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = announce_configuration("world", 0, 0, scenario)
     world = WorldNode(

@@ -72,7 +72,7 @@ REFUSED = 2
 
 
 class LaunchError(RuntimeError):
-    """The team could not start or end well; the text has process and reason."""
+    """The team could not start or end well."""
 
 
 @dataclass
@@ -98,9 +98,9 @@ class Outcome:
 def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
-    `show` repeatedly receives the team's state. A dead process is restarted or given up
-    (`teamslam.sim.launch.supervision`). Raises BusError if the router cannot listen, LaunchError if
-    it does not start. SIGINT and SIGTERM end every process and raise KeyboardInterrupt.
+    `show` repeatedly receives the team's state. A dead process is restarted or given up. Raises
+    BusError if the router cannot listen, LaunchError if it does not start. SIGINT and SIGTERM end
+    every process and raise KeyboardInterrupt.
     """
     began = time.monotonic()
     resolved = plan.folder / "scenario.json"
@@ -113,7 +113,9 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         team = plan.scenario.team
         own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
-        endpoint, connected = entered(router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES))
+        endpoint, connected = enter_team(
+            router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES)
+        )
         watch.place = f"--team {team} --connect {endpoint}{door}"
         at = f'team="{team}", connect="{endpoint}"'
         watch.call = at if plan.keys is None else f'{at}, keys="{plan.keys}"'
@@ -188,13 +190,12 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
 
 
 def _signer(own: Credentials) -> Signs:
-    """Signer of orders, imported only if there are keys."""
     from teamslam.team.keys.signing import Signer
 
     return Signer(own)
 
 
-def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
+def enter_team(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
     """Router's endpoint, and this process's bus there.
 
     A router killed meanwhile is restarted; its own refusal is raised.
@@ -215,7 +216,6 @@ def entered(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, 
 
 
 def _endpoint(service: Supervised) -> str:
-    """Router's endpoint, also of a restarted one."""
     router = service.child
     deadline = time.monotonic() + ROUTER_PATIENCE_S
     while time.monotonic() < deadline:
@@ -233,7 +233,6 @@ def _endpoint(service: Supervised) -> str:
 
 
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
-    """Processes except the router. The world comes early, to make its streams meanwhile."""
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
     robots = [

@@ -37,8 +37,8 @@ _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
 @contextmanager
-def shown(title: str) -> Iterator[Callable[[Watch], None]]:
-    """Function that repeatedly shows a run's state in the output's form."""
+def show_live(title: str) -> Iterator[Callable[[Watch], None]]:
+    """Yield a function that repeatedly shows a run's state."""
     console = Console(stderr=True)
     if console.is_terminal and sys.stderr.isatty():
         with Live(console=console, refresh_per_second=4, transient=True) as live:
@@ -88,7 +88,6 @@ class _Lines:
             self._print(watch, line)
 
     def _progress(self, watch: Watch, world: m.Status) -> str:
-        """Progress line; during the start, the missing processes."""
         robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
             missing = watch.missing_robots
@@ -98,7 +97,7 @@ class _Lines:
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        waiting = ", ".join(who for who, _ in progress.apart(watch))
+        waiting = ", ".join(who for who, _ in progress.unjoined_robots(watch))
         apart = f"; not joined yet: {waiting}" if waiting else ""
         consistency = progress.consistency(watch)
         return (
@@ -108,7 +107,6 @@ class _Lines:
         )
 
     def end(self) -> None:
-        """Print remaining warnings, except those of the final map's table."""
         if self._last is not None:
             fused = self._last.fused
             final = fused.reasons if fused is not None and fused.final else ()
@@ -116,7 +114,6 @@ class _Lines:
             self._warn(self._last, 0.0)
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
-        """Print new lasting warnings, the first of many that differ in numbers."""
         now, warnings = time.monotonic(), progress.warnings(watch, silent_s=settled_s)
         self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
         for warning in warnings:
@@ -181,7 +178,6 @@ _SHOWN_AT_MOST = 12
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:
-    """One row per robot, with pose NEES and coverage given truth; fewer figures if not WIDE."""
     columns = [each for each in _COLUMNS if width >= WIDE or each[0] in _NARROW]
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
@@ -210,9 +206,7 @@ def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) 
 
 
 def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
-    """A robot's share of the set, age of its newest submap of the others, and number of robots with
-    the same set.
-    """
+    """Share of the set, age of the newest submap of the others, robots with the same set."""
     figures = statuses[f"robot/{robot}"].figures
     sets = [status.figures.get("set_submaps", 0.0) for status in statuses.values()]
     newest = {
@@ -237,7 +231,7 @@ def _map_lines(watch: Watch) -> list[str]:
     ]
     consistency = progress.consistency(watch)
     lines += [consistency] if consistency else []
-    return lines + [f"not joined yet: {who}: {why}" for who, why in progress.apart(watch)]
+    return lines + [f"not joined yet: {who}: {why}" for who, why in progress.unjoined_robots(watch)]
 
 
 def _number(value: float | None, form: str) -> str:

@@ -41,10 +41,7 @@ class Used:
 
 
 class Process:
-    """Child of this process.
-
-    used: resources, with the last memory measurement.
-    """
+    """Child of this process; used: resources, with the last memory measurement."""
 
     def __init__(self, started: "subprocess.Popen[bytes]") -> None:
         self.pid = started.pid
@@ -76,7 +73,6 @@ class Process:
             self.used = replace(self.used, pss_mb=pss_mb, peak_rss_mb=peak_rss_mb)
 
     def _kilobytes(self, file: str, word: str) -> int:
-        """Kilobytes behind a word in a /proc file of the process."""
         lines = Path(f"/proc/{self.pid}/{file}").read_text().splitlines()
         return int(next(line for line in lines if line.startswith(word)).split()[1])
 
@@ -96,7 +92,7 @@ class Process:
 
 
 class Starter:
-    """Start the processes of one run.
+    """Starter of the processes of one run.
 
     since_ns: beginning of the run, for a child restarted after its end.
     """
@@ -117,6 +113,5 @@ class Starter:
 
 
 def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
-    """Child environment: one BLAS thread, bound to this process, unbuffered output."""
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
     return {**mine, **ONE_THREAD, **tied}

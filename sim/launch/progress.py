@@ -15,8 +15,7 @@ PATIENCE_S = 8.0
 """Time [s] before absent nodes are reported: processes start slowly on a busy machine."""
 
 
-def _taken(watch: Watch) -> tuple[float, float]:
-    """Measurements consumed by the robots, and the total; the world may be far ahead."""
+def _count_consumed(watch: Watch) -> tuple[float, float]:
     total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
     robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
     taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
@@ -25,7 +24,7 @@ def _taken(watch: Watch) -> tuple[float, float]:
 
 def done(watch: Watch) -> float:
     """Share of the measurements that the robots consumed."""
-    taken, total = _taken(watch)
+    taken, total = _count_consumed(watch)
     return taken / total if total else 0.0
 
 
@@ -37,8 +36,8 @@ def is_live(watch: Watch) -> bool:
 def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     """Failures and node warnings; absent nodes after PATIENCE_S only.
 
-    During the start every node misses every other, so the world's warning stands for all. silent_s:
-    age [s] beyond which a node's warning is dropped, as it may no longer hold; 0: never.
+    During the start only the world's warning is given. silent_s: age [s] beyond which a node's
+    warning is dropped, as it may no longer hold; 0: never.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)
@@ -73,12 +72,12 @@ def share(watch: Watch) -> str:
     """Progress as text; the total is unknown for drivers."""
     if not is_live(watch):
         return f"{done(watch):.0%}"
-    taken, total = _taken(watch)
+    taken, total = _count_consumed(watch)
     return f"{taken:,.0f} of {total:,.0f} measurements mapped"
 
 
 def times(watch: Watch, world: m.Status) -> str:
-    """Team time of the map, and of a world far ahead."""
+    """Describe the team time of the map, and of a world far ahead."""
     ahead_s = _behind_s(watch, world)
     if is_live(watch) or ahead_s < AHEAD_S:
         return team_time(world)
@@ -87,19 +86,18 @@ def times(watch: Watch, world: m.Status) -> str:
 
 
 def _behind_s(watch: Watch, world: m.Status) -> float:
-    """Delay of the map behind the world [s]; the whole run without a map."""
     if watch.fused is None or not watch.fused.stamp_ns:
         return world.figures.get("team_time_s", 0.0)
     return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
 
 
-def apart(watch: Watch) -> list[tuple[str, str]]:
+def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
     """Unjoined robots, each with its failed test."""
     return [] if watch.fused is None else list(not_joined(watch.fused.reasons))
 
 
 def consistency(watch: Watch) -> str:
-    """Consistency monitor's figures; with truth, NEES and coverage of the landmarks."""
+    """Describe the consistency monitor's figures; with truth, NEES and coverage of landmarks."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [

@@ -79,10 +79,6 @@ def supervise(
 
 
 def _receive(bus: Bus, watch: Watch) -> None:
-    """Receive messages; if the router refuses the link, supervise without it.
-
-    The processes have their own links and end by themselves.
-    """
     try:
         watch.take(bus)
     except BusError as error:
@@ -170,7 +166,7 @@ class Memory:
 
 
 class Silence:
-    """Report connected processes that send nothing."""
+    """Report of connected processes that send nothing."""
 
     def __init__(self, end_s: float | None) -> None:
         self._end_s = end_s
@@ -204,7 +200,6 @@ class Silence:
         self._tell(new, watch, now)
 
     def _tell(self, new: Sequence[tuple[Supervised, float]], watch: Watch, now: float) -> None:
-        """Name a few processes or count many, each once in REPEAT_S."""
         many = len(self._silent) > FEW
         for service, silent_s in new:
             child = service.child

@@ -71,7 +71,6 @@ class Child(Process):
 
     @property
     def _state(self) -> str:
-        """State letter of the process on Linux; empty where it is not reported."""
         try:
             return (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
         except (OSError, IndexError):
@@ -88,7 +87,7 @@ class Child(Process):
             self.signal(signal.SIGTERM)
 
     def end(self, deadline: float) -> Ended:
-        """Wait until `deadline` (monotonic), then end it; returns how it ended."""
+        """Wait until `deadline` (monotonic), then end it; return how it ended."""
         while not self.wait(max(0.0, deadline - time.monotonic())):
             self.kill()
             deadline = math.inf

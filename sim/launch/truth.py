@@ -1,7 +1,6 @@
 """Compare a running team's poses and map with the truth as they arrive.
 
-The figures are those of `teamslam.central.desk.evaluation` so far; empty without truth. Frames that
-no known initial pose fixes are not compared.
+Empty without truth. Frames that no known initial pose fixes are not compared.
 """
 
 from dataclasses import dataclass, field
@@ -61,7 +60,7 @@ class LiveErrors:
     )
 
     def of(self, robot: str) -> NeesTally:
-        """Errors of a robot's online poses, given the team's map if there are such."""
+        """Errors of a robot's online poses, given the team's map if there are any."""
         return self._robots[robot].tally if robot in self._robots else NeesTally()
 
     def wants(self, channel: ch.Channel, robot: str, sample: Sample) -> bool:

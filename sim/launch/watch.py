@@ -30,7 +30,7 @@ _PROGRESS = ("measurements", "submaps", "messages")
 
 
 def _no_errors() -> "LiveErrors":
-    """Empty `LiveErrors`, imported here because the import outlasts the start of the processes."""
+    """Make an empty `LiveErrors`, whose import outlasts the start of the processes."""
     from teamslam.sim.launch.truth import LiveErrors
 
     return LiveErrors()
@@ -41,10 +41,9 @@ class Watch:
     """State of a running team: last status of each node, last map.
 
     drivers: awaited drivers of a live team. place: options by which other commands reach the team;
-    call: the same for a driver's program. notes: process events. restarts: by process.
-    last_message: time of each node's last status. peers: robots that need a final map; concluded:
-    those that have it, since concluded_s. centre: presents peers' messages as a centre's. signer:
-    signs orders.
+    call: the same for a driver's program. notes: process events. last_message: time of each node's
+    last status. peers: robots that need a final map; concluded: those that have it, since
+    concluded_s. centre: presents peers' messages as a centre's.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -86,7 +85,6 @@ class Watch:
         )
 
     def _drivers_lacking(self, statuses: Sequence[m.Status]) -> Iterator[str]:
-        """Warnings about missing or silent drivers, given the statuses received."""
         missing = in_order(set(self.drivers or ()) - {_robot(status) for status in statuses})
         if missing:
             first = missing[0]
@@ -124,9 +122,7 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map exists: the centre's, or without a centre every peer's except those
-        given up or withdrawn, whether or not they agree.
-        """
+        """Whether the final map exists: the centre's, or that of every peer."""
         if not self.peers:
             return self.fused is not None and self.fused.final
         for name in self.given_up:
@@ -164,7 +160,6 @@ class Watch:
             self.errors.take(channel, message)
 
     def _take_fault(self, fault: m.Fault) -> None:
-        """Record a node's first fault as a failure; its status counts the others."""
         named = f"{fault.node} set aside "
         if not any(failure.startswith(named) for failure in self.failures):
             what = f"{fault.origin}: {fault.error} at {fault.place}: {fault.text}"
@@ -188,7 +183,7 @@ def _robot(status: m.Status) -> str:
 
 
 def team_time(world: m.Status) -> str:
-    """Team time as text: time of day (UTC) for Unix time."""
+    """Format team time; Unix time as time of day (UTC)."""
     seconds = world.figures.get("team_time_s", 0.0)
     if seconds < UNIX_S:
         return f"team time {seconds:,.0f} s"

@@ -1,8 +1,4 @@
-"""Check that robots and centre run with the configurations of the world's scenario.
-
-Processes started by hand may have other options, so each announcement is compared with the scenario
-by field.
-"""
+"""Check that robots and centre run with the configurations of the world's scenario."""
 
 import json
 from collections.abc import Collection, Iterator, Mapping
@@ -16,10 +12,7 @@ REMEDY = "start it again with the same scenario and options"
 
 
 class Configurations:
-    """Expected configurations by node, and received announcements.
-
-    A node's newest announcement counts. Without expectations nothing is compared.
-    """
+    """Expected configurations by node, and received announcements, of which the newest counts."""
 
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
@@ -59,8 +52,7 @@ class Configurations:
     def forbid(self) -> bool:
         """Whether a scenario's node announced only wrong configurations.
 
-        If both arrived, another process, or a stranger, uses the name: a warning, as for nodes
-        outside the scenario, but the world begins.
+        If both arrived, another process uses the name: a warning, but the world begins.
         """
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
@@ -80,7 +72,6 @@ def differences(announced: str, expected: str) -> list[str]:
 
 
 def _fields(value: Any, at: str = "") -> Iterator[tuple[str, str]]:
-    """(path, JSON value) of every field that is not a table."""
     if isinstance(value, dict) and value:
         for name, part in value.items():
             yield from _fields(part, f"{at}.{name}" if at else name)

@@ -1,7 +1,6 @@
 """World node: publishes every robot's measurements in team time, as far as credit allows.
 
-It begins when every expected node is alive, never drops a measurement, and ends with the last
-counters. As the source of the streams it also answers requests for missed measurements.
+As the source of the streams it also answers requests for missed measurements.
 """
 
 from collections import deque
@@ -101,9 +100,7 @@ class WorldNode:
         return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
-        """First messages: scenario, true landmarks for the evaluator, and the known map for
-        localisation-only robots.
-        """
+        """First messages: scenario, true landmarks for the evaluator, and known map."""
         out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
         if self.streams.landmarks is not None:
             order = np.argsort(self.streams.landmark_ids)
@@ -123,9 +120,7 @@ class WorldNode:
         return out
 
     def refusal(self, message: m.Message) -> str | None:
-        """Reason why a message is impossible: credit beyond the published, or a final map before
-        the end.
-        """
+        """Reason why a message is impossible, or None."""
         match message:
             case m.Progress():
                 source = self._sources.get(message.robot)
@@ -146,7 +141,7 @@ class WorldNode:
         return None
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Process progress, liveliness, configurations and final map; returns nothing to send."""
+        """Process progress, liveliness, configurations and final map; return nothing to send."""
         match message:
             case m.Liveliness():
                 self._take_liveliness(message)
@@ -190,8 +185,7 @@ class WorldNode:
         self.finished = self.finished or (agreed and central)
 
     def _note_too_far(self, progress: m.Progress, source: Source) -> None:
-        """Treat progress beyond the published measurements as complete: a stranger published the
-        rest.
+        """Treat progress beyond the published measurements as complete.
 
         Otherwise the world would wait forever for credit of a node that took a stranger's messages.
         """
@@ -202,7 +196,6 @@ class WorldNode:
             source.consumed = max(source.consumed, source.published)
 
     def _note_consumed(self, progress: m.Progress) -> None:
-        """Record progress reported before this process began: that of an earlier process."""
         stream = (progress.robot, progress.incarnation)
         if progress.robot in self._sources:
             self._consumed[stream] = max(self._consumed.get(stream, 0), progress.measurements)
@@ -222,9 +215,8 @@ class WorldNode:
     def _going_on(self, clock_s: float) -> bool:
         """Whether an earlier process had begun the world, and all progress is known.
 
-        Robots and recorder report to a new world. One scenario gives the same streams, so this
-        process continues from the least progress, in the same incarnations. Receivers drop
-        repetitions and request gaps.
+        One scenario gives the same streams, so this process continues from the least progress, in
+        the same incarnations. Receivers drop repetitions and request gaps.
         """
         if not self._consumed:
             return False
@@ -235,9 +227,7 @@ class WorldNode:
         return not waiting or clock_s - self._resumed_at >= RESUME_S
 
     def _skip(self) -> list[Outgoing]:
-        """Skip measurements that everyone has; returns the initial poses again for a late
-        centre.
-        """
+        """Skip measurements that everyone has; return the initial poses again for a late centre."""
         starts = []
         for name, source in self._sources.items():
             incarnation = max(
@@ -268,7 +258,6 @@ class WorldNode:
 
     @property
     def _out_of_reach(self) -> int:
-        """Number of measurements no longer available to a late recorder."""
         if self.cache is None:
             return 0
         return sum(max(0, x.published - self.cache) for x in self._sources.values())

@@ -106,7 +106,6 @@ class Source:
 
 
 def _stated(values: np.ndarray | None) -> bytes:
-    """Numbers of one message in the order of its rows; empty if absent or NaN."""
     return b"" if values is None or np.isnan(values).any() else from_floats(values.ravel())
 
 
@@ -119,7 +118,6 @@ def _start(start: s.StartPose | None, name: Name) -> m.InitialPose:
 def _observations(
     seen: Detections, message: int, name: Name
 ) -> m.Observations | m.Points | m.Detections:
-    """A scan in its form: without identities, points, or ranges and bearings."""
     at = seen.rows(message)
     points, covariances, signatures, classes = (
         _stated(None if values is None else values[at])

@@ -1,8 +1,7 @@
 """Simulate a robot's radio at its bus: drop messages of robots out of reach on arrival.
 
 The world announces radio reach in advance (`world/radio`). A message counts as sent at its stamp,
-so a run does not depend on the speed of team time; its bytes and receiver decide random loss. Only
-messages of robots and their drivers go by radio.
+so a run does not depend on the speed of team time; its bytes and receiver decide random loss.
 """
 
 import heapq
@@ -59,7 +58,6 @@ class RadioBus:
             self._tap(None)
 
     def _tap(self, tap: Tap | None) -> None:
-        """Record delivered messages only in the robot's own log."""
         if hasattr(self._bus, "tap"):
             self._bus.tap = tap
 
@@ -113,7 +111,6 @@ class RadioBus:
         return received
 
     def _sender(self, channel: ch.Channel, name: str) -> str | None:
-        """Other robot that publishes on this key by radio, or None."""
         if channel.name not in _RADIO:
             return None
         robot = ch.robot_of(name) if channel.template.startswith("{node}") else name

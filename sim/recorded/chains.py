@@ -37,14 +37,11 @@ JITTER_NS = 1_000_000
 
 
 class BatchReferenceError(RuntimeError):
-    """The batch reference cannot be computed; the text gives reason and remedy."""
+    """The batch reference cannot be computed."""
 
 
 class Scan(NamedTuple):
-    """Accepted, calibrated ranges [m] and bearings [rad] from one pose.
-
-    own: their covariances (`teamslam.team.estimation.scans`).
-    """
+    """Accepted, calibrated ranges [m] and bearings [rad] from one pose; own: their covariances."""
 
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
@@ -66,10 +63,9 @@ class Chain:
     """One incarnation of a robot's stream: N + 1 poses of its sensor, the first at the initial
     pose.
 
-    The base is at pose ∘ mount⁻¹ (`of_base`, `of_sensor`). increments[i] leads from pose i to pose
-    i + 1, scans[i] is from pose i + 1. start: initial pose (None: unknown), with its covariance
-    (None: exact). sightings: inter-robot measurements from the base's poses at grid times, if
-    requested.
+    The base is at pose ∘ mount⁻¹. increments[i] leads from pose i to pose i + 1, scans[i] is from
+    pose i + 1. start: initial pose (None: unknown), with its covariance (None: exact). sightings:
+    inter-robot measurements from the base's poses at grid times, if requested.
     """
 
     config: RobotConfig
@@ -134,7 +130,6 @@ def chains_of(
 def _chain(
     config: RobotConfig, incarnation: int, measurements: Sequence[m.Measurement], sightings: bool
 ) -> Chain | None:
-    """None for a stream without odometry."""
     odometry = [
         translate.interval_of(measurement, config)
         for measurement in measurements
@@ -194,7 +189,7 @@ def _grid(config: RobotConfig) -> PoseGrid | None:
     return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
 
 
-def placed(
+def place_chains(
     chains: Sequence[Chain], run: Evaluation
 ) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
     """Chains with a known place in the team's frame, and the joined poses that determine it."""
@@ -215,12 +210,11 @@ def placed(
     return known, anchors, tuple(left_out)
 
 
-def anchored(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
-    """Interpolate a chain's poses between known poses (at least one) by its odometry, in three
-    ways.
+def anchor_chain(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
+    """Interpolate a chain's poses between known poses (at least one) by its odometry.
 
-    Forward from the known pose before; backward from the one after; and the mean of both, weighted
-    by the time to each. Odometry up to a known pose counts to the last pose not after it.
+    Three ways: forward from the known pose before; backward from the one after; the mean of both,
+    weighted by the time to each. Odometry up to a known pose counts to the last pose not after it.
     """
     odometry = chain.dead_reckoned
     at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1

@@ -22,13 +22,8 @@ from teamslam.team.config import (
     Sensor,
 )
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.registry import absence, load
-from teamslam.team.robot.node import robot_node
 from teamslam.team.saved_map import read_map
 from teamslam.team.wire.bus import Sample
-
-UNSAFE_ROBOT = "teamslam.sim.studies.robots.unsafe:unsafe_robot"
-"""Makes a robot that sends the team's map as its own information, which breaks law 1."""
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
@@ -42,8 +37,7 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     world.announce(scenario)
     world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
-    node = load(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else robot_node
-    return list(run_nodes(scenario, world, conditions, node))
+    return list(run_nodes(scenario, world, conditions))
 
 
 def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
@@ -73,15 +67,12 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
         localise=changes.localise,
     )
     links = changes.loss or changes.delay_s or changes.no_centre or changes.partitions
-    if changed.fusion != "join" and (links or changes.unsafe_feedback):
+    if changed.fusion != "join" and links:
         why = "runs in lockstep" if changed.fusion in FEEDBACK else "is for comparison"
         raise ScenarioError(
-            f"the rule {changed.fusion} {why}: loss, delay, partition, a missing centre "
-            "and unsafe feedback are for the rule join"
+            f"the rule {changed.fusion} {why}: loss, delay, partition and a "
+            "missing centre are for the rule join"
         )
-    absent = absence(UNSAFE_ROBOT, "unsafe feedback") if changes.unsafe_feedback else None
-    if absent is not None:
-        raise ScenarioError(absent)
     return changed
 
 

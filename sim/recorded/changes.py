@@ -11,10 +11,9 @@ class Changes:
     """Changes of a run on the log's measurements.
 
     without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
-    centre. no_centre: time without a centre. partitions: robots that the centre cannot reach, and
-    when. unsafe_feedback: see `unsafe_robot`. noise: factors on assumed standard deviations, by
-    kind (`teamslam.sim.recorded.changed_run`). maps: saved maps of earlier days, by path.
-    localise: robots are localised in the map, which stays as it is.
+    centre. partitions: robots that the centre cannot reach, and when. noise: factors on assumed
+    standard deviations, by kind. maps: saved maps, by path. localise: robots are localised in the
+    map, which stays as it is.
     """
 
     without: tuple[str, ...] = ()
@@ -27,7 +26,6 @@ class Changes:
     delay_s: float = 0.0
     no_centre: Span | None = None
     partitions: tuple[tuple[tuple[str, ...], Span], ...] = ()
-    unsafe_feedback: bool = False
     noise: tuple[tuple[str, float], ...] = ()
     maps: tuple[str, ...] = ()
     localise: bool = False

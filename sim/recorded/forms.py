@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from teamslam.sim.datasets.detections_table import together
+from teamslam.sim.datasets.detections_table import merge_detections
 from teamslam.sim.world.streams import NO_LABEL, Detections, Intervals
 from teamslam.team import translate
 from teamslam.team.estimation.scans import Scan
@@ -25,7 +25,7 @@ FORM_NAMES = {
 
 
 def forms_of(messages: Sequence[m.Measurement]) -> str:
-    """The forms of these messages with their counts if there are several; else ""."""
+    """Describe the forms of these messages with their counts if there are several; else ""."""
     kinds = [type(each) for each in messages]
     counts = {kind: kinds.count(kind) for kind in FORM_NAMES if kind in kinds}
     if len(counts) < 2:
@@ -34,7 +34,7 @@ def forms_of(messages: Sequence[m.Measurement]) -> str:
 
 
 def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: float) -> Intervals:
-    """Intervals in their own forms; raises ValueError where speeds are of two kinds.
+    """Intervals in their own forms; raises ValueError if speeds are of two kinds.
 
     clock_offset_s: corrected offset of the odometry's clock [s].
     """
@@ -97,7 +97,7 @@ def landmarks_of(
         signatures=np.concatenate(signatures) if whole else None,
         classes=np.concatenate(classes) if alike else None,
     )
-    return together(seen, hidden)
+    return merge_detections(seen, hidden)
 
 
 def _index_by_time(labels: m.TruthLabels) -> Mapping[int, UInt32[np.ndarray, " R"]]:

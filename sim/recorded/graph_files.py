@@ -2,8 +2,7 @@
 
 Poses are the sensor's at keyframes, from the final map and the odometry between; without a map, by
 odometry alone. Edges are the odometry, and each accepted measurement as a point with the
-first-order covariance of range and bearing. Up to that linearisation it is the problem of the batch
-reference.
+first-order covariance of range and bearing.
 """
 
 from pathlib import Path as FilePath
@@ -18,15 +17,15 @@ from teamslam.sim.datasets.factor_graph import (
     Key,
     PointEdge,
     PoseEdge,
-    dead_reckoned,
+    place_by_odometry,
 )
 from teamslam.sim.datasets.graph_writer import LETTERS, g2o_lines, isam_lines, pyfg_lines
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
-    anchored,
+    anchor_chain,
     chains_of,
-    placed,
+    place_chains,
 )
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.models import predicted
@@ -40,7 +39,7 @@ FORMATS = ("g2o", "isam", "pyfg")
 
 
 def export_graph(log: Log, folder: FilePath, form: str) -> list[FilePath]:
-    """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; returns the files.
+    """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; return the files.
 
     Raises `LogError` for a log without the measurements.
     """
@@ -73,9 +72,9 @@ def _graph(log: Log, run: Evaluation) -> FactorGraph:
     except BatchReferenceError as error:
         raise LogError(log.path, str(error), "") from None
     graph = FactorGraph(log.path.stem)
-    with_place, anchors, _ = placed(chains, run)
+    with_place, anchors, _ = place_chains(chains, run)
     for chain, anchor in zip(with_place, anchors, strict=True):
-        for k, pose in enumerate(anchored(chain, anchor)[2]):
+        for k, pose in enumerate(anchor_chain(chain, anchor)[2]):
             graph.poses[_name(chain), k] = pose
     if run.map is not None:
         graph.landmarks = dict(zip(run.map.ids.tolist(), run.map.means, strict=True))
@@ -87,14 +86,13 @@ def _graph(log: Log, run: Evaluation) -> FactorGraph:
             "no measurement of a landmark with an identity in it",
             "detections without identities are no edges of a graph; `--format csv` writes them",
         )
-    dead_reckoned(graph)
+    place_by_odometry(graph)
     seen = {edge.landmark for edge in graph.point_edges}
     graph.landmarks = {i: point for i, point in graph.landmarks.items() if i in seen}
     return graph
 
 
 def _name(chain: Chain) -> str:
-    """Robot of a chain, with its incarnation if it is a later one."""
     return f"{chain.config.id}{'' if chain.incarnation == 1 else f'/{chain.incarnation}'}"
 
 
@@ -125,7 +123,6 @@ def _add_chain(graph: FactorGraph, chain: Chain) -> None:
 
 
 def _place_truly(graph: FactorGraph, run: Evaluation) -> None:
-    """Replace vertices by the truth where the log has it, as the format's vertices are true."""
     for robot in graph.robots:
         found = run.robots.get(robot)
         if found is None or run.scenario is None:

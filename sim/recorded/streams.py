@@ -29,7 +29,7 @@ PART = "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a par
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
-    """Measurements of a log with its scenario: its world's, or the recorder's.
+    """Read the measurements of a log with its scenario: its world's, or the recorder's.
 
     Uses the first incarnation of each robot. Raises LogError, ScenarioError.
     """

@@ -18,7 +18,7 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 def export_utias(log: Log, folder: Path) -> list[str]:
     """Write the data set into `folder`, robots in the order of their numbers 1, 2, …
 
-    The format has one stream per robot: each one's first incarnation. Raises `LogError` for missing
+    The format has one stream per robot: the first incarnation. Raises LogError for missing
     measurements.
     """
     messages = list(_sound(log))

@@ -31,7 +31,6 @@ class Samples(Protocol):
 
 
 def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measurement:
-    """Remove sightings of these robots from a measurement."""
     if not isinstance(measurement, m.Sightings) or not {*measurement.teammates} & {*robots}:
         return measurement
     kept = [k for k, teammate in enumerate(measurement.teammates) if teammate not in robots]
@@ -46,8 +45,7 @@ def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measureme
 class RecordedWorld:
     """Messages of a log's world, for some of its robots, in the order of team time.
 
-    Each robot's measurements come in order. Raises RerunError for a missing one, after which no
-    robot could continue.
+    Raises RerunError for a missing measurement, after which no robot could continue.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -122,13 +120,11 @@ class RecordedWorld:
         )
 
     def begin(self) -> list[Outgoing]:
-        """First messages: scenario, true landmarks, and the known map of robots that only
-        localise.
-        """
+        """First messages: scenario, true landmarks, and known map."""
         return self._outgoing
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """The next STEP_NS of team time; the last of them with the end."""
+        """Publish the next STEP_NS of team time; the last of them with the end."""
         if self._ended:
             return []
         until_ns = self.now_ns + STEP_NS
@@ -152,7 +148,6 @@ class RecordedWorld:
 
 
 def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
-    """The last incarnation of every robot and its count; raises RerunError for a gap in any."""
     counts: dict[tuple[str, int], int] = {}
     for robot, incarnation, measurement in sorted(published):
         if measurement != counts.setdefault((robot, incarnation), 0):

@@ -89,7 +89,7 @@ def close(name: object, known: Iterable[str]) -> str:
     return f"; did you mean `{found[0]}`?" if found else ""
 
 
-def plain(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
+def plain_error(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
     """Convert "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b"."""
     problem, _, path = str(error).partition(" - at `")
     field = path.rstrip("`").removeprefix("$").lstrip(".")
@@ -106,5 +106,4 @@ def _is_struct(declared: Any) -> bool:
 
 
 def _here(name: str, at: str) -> bool:
-    """Whether a field is allowed at this place; TOP_LEVEL fields only at the top."""
     return not at or name not in TOP_LEVEL

@@ -21,7 +21,13 @@ from typing import Any
 import msgspec
 
 from teamslam.central.config import CentralConfig
-from teamslam.sim.scenarios.checks import ScenarioError, check_fields, check_known, close, plain
+from teamslam.sim.scenarios.checks import (
+    ScenarioError,
+    check_fields,
+    check_known,
+    close,
+    plain_error,
+)
 from teamslam.team.config import RobotConfig
 
 MAX_ROBOTS = 1_000
@@ -75,14 +81,13 @@ def own_document(name: str) -> Fields:
 
 
 def _file_at(path: Path) -> tuple[Path | None, Path | zipfile.Path]:
-    """Zip on the way to a file, if any, and the file."""
     for above in path.parents:
         if above.is_file() and zipfile.is_zipfile(above):
             return above, zipfile.Path(above, path.relative_to(above).as_posix())
     return None, path
 
 
-def resolved(document: Fields, stem: str, known: Sequence[str]) -> Fields:
+def resolve(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     """Merge defaults into every robot and add names; `known`: fields of a scenario.
 
     Values are checked where the user wrote them, so errors name that place.
@@ -155,7 +160,6 @@ def _parse(text: str) -> Fields:
 
 
 def _resolve_base(document: Fields) -> Fields:
-    """Merge the document over its built-in base scenario."""
     if "base" not in document:
         return document
     own = {key: value for key, value in document.items() if key != "base"}
@@ -178,7 +182,6 @@ def _resolve_base(document: Fields) -> Fields:
 
 
 def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
-    """Merge tables at every depth; other values are replaced."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)
@@ -188,9 +191,8 @@ def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> Fields:
 
 
 def _check_part(value: Fields, declared: type[msgspec.Struct], at: str, needed: Fields) -> None:
-    """Check a part of the document, so errors name its place."""
     check_fields(value, declared, at)
     try:
         msgspec.convert(needed | value, declared)
     except msgspec.ValidationError as error:
-        raise plain(error, at) from None
+        raise plain_error(error, at) from None

@@ -1,7 +1,6 @@
 """A scenario: world, robots with models, centre and seed.
 
-Users write TOML (`teamslam.sim.scenarios.document`); processes receive the resolved scenario as
-JSON (`dumps`, `loads`).
+Users write TOML (`teamslam.sim.scenarios.document`); processes receive JSON (`dumps`, `loads`).
 """
 
 import re
@@ -12,7 +11,7 @@ from typing import Any
 import msgspec
 
 from teamslam.central.team_config import TeamConfig
-from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, plain, types_of
+from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, plain_error, types_of
 from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,
     Fields,
@@ -20,7 +19,7 @@ from teamslam.sim.scenarios.document import (
     checked_count,
     checked_table,
     named_document,
-    resolved,
+    resolve,
 )
 from teamslam.sim.world.config import (
     FolderWorld,
@@ -73,14 +72,11 @@ class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """Load a built-in scenario by name, or a user's TOML file; raises ScenarioError.
-
-    A data set's path is relative to the file.
-    """
+    """Load a built-in scenario by name, or a user's TOML file; raises ScenarioError."""
     name = str(name_or_path)
     known = list(types_of(Scenario))
     try:
-        return _convert(resolved(*named_document(name), known))
+        return _convert(resolve(*named_document(name), known))
     except ScenarioError as error:
         raise ScenarioError(f"{name}: {error}") from error.__cause__
 
@@ -99,10 +95,10 @@ def with_options(
     identities: str | None = None,
     localise: bool = False,
 ) -> Scenario:
-    """Apply command-line changes; None leaves a field unchanged.
+    """Apply command-line changes; None leaves a field unchanged. Raises ScenarioError.
 
     peers, centre: whether they exist. robots: number; further ones repeat the scenario's in turn,
-    with new ids. Raises ScenarioError.
+    with new ids.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -145,7 +141,6 @@ def _profile_of(scenario: Scenario) -> AssociationProfile:
 
 
 def _world_of(scenario: Scenario, path: str) -> Fields:
-    """The scenario's world with another data set of any kind."""
     world = scenario.world
     if isinstance(world, SimulatedWorld):
         raise ScenarioError(
@@ -193,9 +188,7 @@ def loads(text: str) -> Scenario:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """Warnings of valid but probably mistaken settings: a simulated robot without odometry
-    noise.
-    """
+    """Warn of valid but probably mistaken settings."""
     if not isinstance(scenario.world, SimulatedWorld):
         return []
     return [
@@ -206,7 +199,6 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 
 def _fit_count(robots: Sequence[Fields], count: int) -> list[Fields]:
-    """Extend or cut robots to a count; further ones repeat the pattern."""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
     unused = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
@@ -215,7 +207,6 @@ def _fit_count(robots: Sequence[Fields], count: int) -> list[Fields]:
 
 
 def _convert(fields: Fields) -> Scenario:
-    """Convert plain fields to a consistent scenario; raises ScenarioError."""
     check_world(checked_table(fields.get("world", {}), "world"))
     for choice, declared in (
         ("estimator", Estimator),
@@ -227,11 +218,10 @@ def _convert(fields: Fields) -> Scenario:
     try:
         return _fill_in(msgspec.convert(fields, Scenario))
     except msgspec.ValidationError as error:
-        raise plain(error) from None
+        raise plain_error(error) from None
 
 
 def _fill_in(scenario: Scenario) -> Scenario:
-    """Copy seed, estimator and rule to robots and centre, and validate."""
     if (scenario.estimator, scenario.fusion) not in PAIRS:
         raise ScenarioError(
             f"the estimator {scenario.estimator} can not feed the rule {scenario.fusion}, "
@@ -277,7 +267,6 @@ def _fill_in(scenario: Scenario) -> Scenario:
 
 
 def _check_way_points(robots: int, world: SimulatedWorld) -> None:
-    """Check that robots without a path drive between endless random way-points."""
     width = world.size_m if world.radius_m is None else 2.0 * world.radius_m
     endless = robots > len(world.paths) and not world.way_point_count
     if endless and world.way_point_tolerance_m > 0.5 * width:

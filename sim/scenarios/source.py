@@ -25,7 +25,7 @@ from teamslam.sim.world.config import (
     UtiasWorld,
 )
 from teamslam.sim.world.identities import Hiding, with_hidden_identities
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.pairs import NEEDS_MAP
 
@@ -48,7 +48,7 @@ def streams_of(scenario: Scenario) -> WorldStreams:
         )
     if isinstance(world, SimulatedWorld):
         seed = noise_seed(scenario)
-        streams = simulated(world, scenario.robots, seed)
+        streams = simulate(world, scenario.robots, seed)
         tagged = world.tagged if world.identities == "hidden" else 1.0
         hiding = Hiding(tagged, world.missed, world.clutter, world.visible_to_m)
         hides = world.identities == "hidden" or world.missed > 0.0
@@ -85,7 +85,7 @@ def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """Remove robots without files in the data set; also returns a note on them.
+    """Remove robots without files in the data set; also return a note on them.
 
     If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
     """
@@ -120,10 +120,6 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 
 
 def noise_seed(scenario: Scenario) -> int:
-    """Key of the world's random numbers, from scenario name and seed.
-
-    Scenarios have independent noise, so results over the seeds of both are independent. A positive
-    63-bit integer.
-    """
+    """Key of the world's random numbers, from scenario name and seed: a positive 63-bit integer."""
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

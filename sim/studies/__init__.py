@@ -1,1 +1,1 @@
-"""Studies: experiments and the batch reference. The product runs without this folder."""
+"""Studies: experiments and the batch reference; the product runs without."""

@@ -17,7 +17,7 @@ def solved_map(
     initial_poses: Mapping[str, InitialPose],
     robust_c: float | None,
 ) -> BatchMap:
-    """Solve for all poses and landmarks of a team; see `teamslam.team.library.batch_map`."""
+    """Solve for all poses and landmarks; see `teamslam.team.library.batch_map`."""
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
     robots = sorted(keyframes)
     steps = [
@@ -27,8 +27,8 @@ def solved_map(
         if keyframe is not None
         for at in (keyframe.calibrated(sensors[robot]),)
     ]
-    grown = batch.extended(batch.initial_state(starts, robust_c), steps)
-    solution = batch.solved(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
+    grown = batch.add_steps(batch.initial_state(starts, robust_c), steps)
+    solution = batch.solve(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
     landmarks = batch.landmark_gaussian(solution)
     return BatchMap(
         landmarks=LandmarkMap(landmarks.ids, landmarks.means, landmarks.covariance),

@@ -1,4 +1,4 @@
-"""The commands `teamslam experiment NAME`: one per entry of the catalogue, `all`, and `merge`."""
+"""Commands `teamslam experiment NAME`: one per catalogue entry, `all`, and `merge`."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -111,12 +111,12 @@ def merge(
     from teamslam.sim.studies.experiments.shards import (
         ShardError,
         collect_results,
-        described_study,
         programs_of,
+        study_of,
     )
 
     with failing(WRONG_USE, ShardError):
-        study, program = described_study(shards)
+        study, program = study_of(shards)
     asked = Asked(
         name=study.name,
         seeds=study.seeds,
@@ -137,7 +137,7 @@ def merge(
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """An experiment's name and the options of its command."""
+    """Name of an experiment and options of its command."""
 
     name: str
     seeds: int | None
@@ -152,12 +152,12 @@ class Asked:
     def plans(self) -> "list[Plan]":
         """Plans of the experiment, or of all."""
         from teamslam.sim.studies.experiments.experiment import Options
-        from teamslam.sim.studies.experiments.runner import dataset, planned
+        from teamslam.sim.studies.experiments.runner import dataset, plan_runs
 
         datasets = tuple(dataset(path) for path in self.paths)
         entries = [entry for entry in ENTRIES if self.name in (entry.name, ALL)]
         return [
-            planned(entry, Options(self._seeds_of(entry), self.quick, datasets))
+            plan_runs(entry, Options(self._seeds_of(entry), self.quick, datasets))
             for entry in entries
         ]
 
@@ -168,7 +168,6 @@ class Asked:
 
 
 def _require_joblib() -> None:
-    """Exit before the work if the studies' libraries are missing."""
     try:
         import joblib  # noqa: F401 - reported before the work, not after it
     except ModuleNotFoundError:
@@ -177,7 +176,6 @@ def _require_joblib() -> None:
 
 @contextmanager
 def _stoppable(output: Path) -> Iterator[None]:
-    """Exit with advice where the runs are interrupted."""
     try:
         yield
     except KeyboardInterrupt:
@@ -188,7 +186,7 @@ def _run_shard(asked: Asked, text: str) -> None:
     _require_joblib()
 
     from teamslam.sim.studies.experiments.experiment import without_datasets
-    from teamslam.sim.studies.experiments.progress import shown
+    from teamslam.sim.studies.experiments.progress import show_progress
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
     from teamslam.sim.studies.experiments.shards import (
         ShardError,
@@ -206,7 +204,7 @@ def _run_shard(asked: Asked, text: str) -> None:
         fail(without_datasets(asked.name), WRONG_USE)
     part = tasks_of(tasks, shard)
     with _stoppable(asked.output):
-        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), shown)
+        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), show_progress)
     study = Study(
         name=asked.name,
         seeds=asked.seeds,
@@ -231,9 +229,9 @@ def _run(asked: Asked) -> None:
     _require_joblib()
 
     from teamslam.sim.studies.experiments.experiment import without_datasets
-    from teamslam.sim.studies.experiments.output import printed, to_json, write
-    from teamslam.sim.studies.experiments.progress import shown
-    from teamslam.sim.studies.experiments.runner import FAILURES, computed, cores
+    from teamslam.sim.studies.experiments.output import render_outcome, to_json, write
+    from teamslam.sim.studies.experiments.progress import show_progress
+    from teamslam.sim.studies.experiments.runner import FAILURES, compute_outcomes, cores
     from teamslam.team.recording.provenance import provenance
 
     name = asked.name
@@ -243,13 +241,13 @@ def _run(asked: Asked) -> None:
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
     with _stoppable(asked.output):
-        concluded = computed(plans, asked.output, asked.jobs or cores(), shown)
+        concluded = compute_outcomes(plans, asked.output, asked.jobs or cores(), show_progress)
     origin = provenance()
     console = Console()
     if not console.is_terminal:
         console.width = FILE_WIDTH
     for each in concluded:
-        console.print(*printed(each), sep="\n")
+        console.print(*render_outcome(each), sep="\n")
     page = write(concluded, asked.output, "index" if name == ALL else name, origin)
     if asked.json_file is not None:
         contents = {each.entry.name: to_json(each, origin) for each in concluded}

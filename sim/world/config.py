@@ -1,4 +1,4 @@
-"""Kinds of world in a scenario, as users describe them."""
+"""Kinds of world in a scenario; docs/scenario.md describes their fields."""
 
 from itertools import pairwise
 from math import hypot
@@ -23,37 +23,8 @@ class SimulatedWorld(
 ):
     """Square of side size_m with point landmarks; robots drive in steps of step_s seconds.
 
-    radius_m: a disc about (0, 0) instead: random landmarks and way-points have uniform direction
-    and radius, and robots start at its centre.
-
-    landmarks: positions, or landmark_count at random. layout: "uniform"; "twins", each with another
-    twin_m away; or "rooms", a grid of rooms × rooms equal squares with one pattern, which no map
-    can distinguish.
-
-    paths: path i has robot i's way-points. Others drive to random way-points at up to speed_m_s and
-    turn_rate_rad_s; a way-point is reached within way_point_tolerance_m. With way_point_count the
-    world ends, before `steps`, when all robots have reached that many. steering: "together" turns
-    and drives in one step; "turn-first" does not drive in a turning step.
-
-    observe_at_start: also observe landmarks before the first step. visible_from_m, visible_to_m:
-    limits on the *true* range of measured landmarks; absent: the sensor's. They belong to the
-    world, since a gate on noisy measurements selects by noise and biases the map. unknown_starts:
-    robots with unknown initial pose; "*" is all, a following "!r1" excludes one.
-
-    outlier_share: outlier probability of a landmark measurement. outlier_kind: "measurement" has
-    uniform range and bearing, "identity" that of another landmark; "drop" omits exactly the
-    measurements that the others spoil, for comparison.
-
-    odometry: "speeds", "increments" on SE(2), or a car's wheel speed and "steering".
-    odometry_claims: increments carry a covariance, that of the motion model's forward, lateral and
-    turn; odometry_correlation correlates the errors of the last two. landmark_form: "ranges" and
-    bearings, or "points" in the sensor frame. landmark_claims: each measurement carries a
-    covariance, with the sensor's standard deviations times factors between these two, and matching
-    errors. claims_factor: carried covariances are the true ones divided by this.
-
-    identities: "hidden" publishes detections without identities, except a share `tagged` of
-    landmarks. missed: probability that a measurement is omitted. clutter: with hidden identities,
-    share of false detections.
+    visible_from_m and visible_to_m limit the *true* range, since a gate on noisy measurements
+    selects by noise and biases the map.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -103,13 +74,7 @@ class SimulatedWorld(
 class UtiasWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="utias"
 ):
-    """Data set in the UTIAS MRCLAM format.
-
-    path: folder or zip. odometry_delay_s: odometry logged at t acts at t + odometry_delay_s on the
-    camera's clock. start_sigma_m, start_sigma_rad: initial-pose uncertainty; both 0: exact.
-    unknown_starts: as in a simulated world. duration_s: limit from the team's first measurement.
-    errata: repair known faults.
-    """
+    """Data set in the UTIAS MRCLAM format."""
 
     path: str = ""
     odometry_delay_s: NonNegative = 0.0
@@ -128,11 +93,7 @@ class UtiasWorld(
 class FolderWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="folder"
 ):
-    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot.
-
-    path: folder. unknown_starts: as in a simulated world, besides robots without start.csv.
-    duration_s: limit from the team's first measurement.
-    """
+    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot."""
 
     path: str = ""
     unknown_starts: tuple[str, ...] = ()
@@ -145,8 +106,7 @@ class LiveWorld(
 ):
     """No world: each robot's driver publishes its measurements and ends its stream.
 
-    admit: unnamed robots may join. newcomer: their configuration unless their process gives
-    another; the scenario's [defaults].
+    newcomer: configuration of unnamed robots, the scenario's [defaults].
     """
 
     admit: bool = False
@@ -158,10 +118,7 @@ class UnlabelledWorld(
 ):
     """Data set of one robot with unnamed landmarks: odometry.csv and detections.csv.
 
-    path: folder. Several robots each drive a piece of the log from an unknown initial pose.
-    duration_s: limit from the first measurement. identities: "known" uses the labels as identities,
-    for comparison. fixes: the rows of gps.csv are measurements, and no initial pose is known in
-    their frame.
+    Several robots each drive a piece of the log from an unknown initial pose.
     """
 
     path: str = ""
@@ -176,9 +133,7 @@ class GraphWorld(
 ):
     """Landmark graph in a text file of isam, TORO, g2o or PyFactorGraph.
 
-    path: file. More robots than the file's one each drive a piece of it, of which the first starts
-    where the file does and the others do not know where. unknown_starts: as in a simulated world.
-    duration_s: limit from the first measurement.
+    More robots than the file's one each drive a piece of it; only the first has an initial pose.
     """
 
     path: str = ""
@@ -209,9 +164,7 @@ class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Radio of robots without a centre; by default instant and lossless.
 
-    comm_range_m: limit on true distance; absent: none. windows: further limits in time. loss: share
-    of lost messages. delay_s: transmission delay. bytes_per_s: link capacity; absent: unlimited.
-    Robots whose streams have ended reach each other: they are collected, and exchange the rest.
+    Robots whose streams have ended reach each other, as if they were collected.
     """
 
     comm_range_m: Positive | None = None

@@ -1,8 +1,4 @@
-"""Further measurement forms of a simulated robot.
-
-Odometry as SE(2) motion, with or without covariance, or as a car's encoder values; landmarks as
-points with covariance. The formulas are independent of the filter's.
-"""
+"""Further measurement forms of a simulated robot, independent of the filter's formulas."""
 
 import numpy as np
 
@@ -81,7 +77,7 @@ def measured_steering(
     return wheel, np.arctan(curvature * motion.wheel_base) - motion.steering_offset
 
 
-def claimed(
+def draw_covariances(
     seen: Visible,
     sensor: Sensor,
     sizes: tuple[float, float],
@@ -111,7 +107,7 @@ def with_errors(
     covariances: Float[np.ndarray, "V 3"],
     normals: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, "V 2"]:
-    """Add errors of these covariances to pairs of numbers, by Cholesky factors."""
+    """Add errors of these covariances to pairs of numbers."""
     xx, xy, yy = covariances.T
     first = np.sqrt(xx)
     across = xy / first

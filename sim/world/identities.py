@@ -1,7 +1,4 @@
-"""Worlds with hidden identities, missed detections and clutter.
-
-The stream keeps the true identities, unpublished, for the evaluation.
-"""
+"""Worlds with hidden identities, missed detections and clutter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -65,14 +62,12 @@ def _hidden(
 
 
 def _mark(seen: Detections, *, hidden: bool) -> Detections:
-    """Mark the messages as published without identities, which have no points."""
     marks = np.full(len(seen.stamps_ns), hidden)
     seen = replace(seen, hidden=marks if seen.hidden is None else seen.hidden | hidden)
     return replace(seen, points=None, covariances=_polar_covariances(seen)) if hidden else seen
 
 
 def _polar_covariances(seen: Detections) -> Float[np.ndarray, "R 3"] | None:
-    """Covariances of ranges and bearings, also where points were measured."""
     if seen.covariances is None or seen.points is None:
         return seen.covariances
     covariances = seen.covariances.copy()
@@ -116,7 +111,7 @@ def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> 
 def in_order(parts: Sequence[Detections]) -> Detections:
     """Merge messages by time; at equal times those with identities first.
 
-    Columns of only some parts, such as points or covariances, are NaN elsewhere.
+    Columns of only some parts are NaN elsewhere.
     """
     if len(parts) == 1:
         return parts[0]
@@ -134,7 +129,6 @@ def in_order(parts: Sequence[Detections]) -> Detections:
 
 
 def _column(parts: Sequence[Detections], name: str) -> Any:
-    """Values of all parts: NaN in those without the column, None if no part has it."""
     values = [getattr(part, name) for part in parts]
     given = [each for each in values if each is not None]
     if not given:

@@ -1,7 +1,7 @@
-"""Simulated odometry of a true step, and the slip that it does not measure.
+"""Simulated odometry of a true step (distance [m], rotation [rad]), and its unmeasured slip.
 
-A step is a pair (distance [m], rotation [rad]). Odometry is the true step with the robot's motion
-noise, converted back through its calibration. The formulas follow the sources, not the filter.
+Odometry is the true step with the robot's motion noise, converted back through its calibration. The
+formulas follow the sources, not the filter.
 """
 
 import numpy as np
@@ -72,11 +72,10 @@ def slip(
 def _interval_deviations(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of translation, rotation and final rotation by Ma & Ma's α; errors of v, ω, γ are constant
-    over an interval T.
+    """σ of translation, rotation and final rotation by Ma & Ma's α.
 
-    In T the translation errs by ε T with var ε = α₁v² + α₂ω². A step of t has t/T such intervals:
-    var = (α₁v² + α₂ω²) T² t/T.
+    Errors of v, ω, γ are constant over an interval T, in which the translation errs by ε T with var
+    ε = α₁v² + α₂ω². A step of t has t/T such intervals: var = (α₁v² + α₂ω²) T² t/T.
     """
     if motion.alphas is None:
         return (np.zeros(len(steps)),) * 3
@@ -92,8 +91,7 @@ def _interval_deviations(
 def _of_the_way(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of forward, lateral and heading errors proportional to the path, constant over an interval
-    T.
+    """σ of forward, lateral and heading errors proportional to the path, constant over a time T.
 
     A step of t has t/T such intervals: σ² = (share · path in T)² t/T.
     """

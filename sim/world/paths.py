@@ -1,7 +1,6 @@
 """True motion of the robots of a simulated world.
 
-A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame. `followed`
-cuts a polyline into equal steps, `driven` steers between way-points.
+A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame.
 """
 
 from collections.abc import Callable, Iterator
@@ -51,7 +50,7 @@ def wrapped(angle: float) -> float:
     return pi if turned == -pi else turned
 
 
-def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
+def follow_way_points(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
     """Follow the polyline through the way-points in steps of equal arc length: rotate, then drive.
 
     A step across a corner is its chord. The first pose points along the first step.
@@ -70,7 +69,7 @@ def followed(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
     )
 
 
-def driven(
+def steer_to_way_points(
     start: Pose,
     way_points: Iterator[tuple[float, float]],
     limits: Limits,
@@ -91,11 +90,11 @@ def driven(
             target = next(way_points, None)
         step = _towards(poses[-1], target, limits) if target else (0.0, 0.0)
         taken.append(step)
-        poses.append(moved(poses[-1], step, kind, *slip(k, step)))
+        poses.append(move_pose(poses[-1], step, kind, *slip(k, step)))
     return Drive(np.array(poses), np.array(taken))
 
 
-def moved(
+def move_pose(
     pose: Pose, step: Step, kind: Kind, final_turn: float = 0.0, lateral: float = 0.0
 ) -> Pose:
     """Pose after a step, a left slip and a final rotation.

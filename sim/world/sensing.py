@@ -27,7 +27,7 @@ class Visible:
     bearings: Float[np.ndarray, " V"]
 
 
-def visible(
+def visible_points(
     poses: Float[np.ndarray, "K 3"],
     points: Float[np.ndarray, "#K P 2"],
     nearest: float,
@@ -48,14 +48,14 @@ def visible(
     return Visible(steps, seen, ranges[steps, seen], bearings[inside])
 
 
-def persistent(
+def persistent_errors(
     seen: Visible, sensor: Sensor, step_s: float, normals: Float[np.ndarray, "V 4"]
 ) -> Float[np.ndarray, "V 2"]:
     """Errors of unit variance, partly correlated over time for each point.
 
     n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
-    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: V × 4 standard
-    normal numbers, two columns of w and two of n', range first.
+    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: two columns of
+    w and two of n', range first.
     """
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
@@ -106,7 +106,7 @@ def on_circle(angles: Float[np.ndarray, " V"]) -> Float[np.ndarray, " V"]:
     return np.where(turned == -np.pi, np.pi, turned)
 
 
-def spoilt(
+def add_outliers(
     seen: Detections,
     share: float,
     kind: OutlierKind,
@@ -120,7 +120,7 @@ def spoilt(
     The first number of a row selects outliers. "measurement": the others are the range, uniform in
     `span` [m], and the bearing, uniform in the field of view. "identity": the second selects
     another of the landmarks 1 … `landmarks`. "drop": the measurement is omitted. All kinds use the
-    same draws, so runs of different kinds are comparable.
+    same draws.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":
@@ -141,7 +141,6 @@ def spoilt(
 def _others(
     ids: UInt32[np.ndarray, " R"], landmarks: int, uniform: Float[np.ndarray, " R"]
 ) -> UInt32[np.ndarray, " R"]:
-    """Any other id of 1 … landmarks with equal probability; the only one stays."""
     ahead = 1 + np.floor(uniform * max(landmarks - 1, 1)).astype(np.int64)
     others: UInt32[np.ndarray, " R"] = (ids - 1 + ahead) % landmarks + 1
     return others.astype(np.uint32)

@@ -1,8 +1,7 @@
 """Simulated world: true paths, noisy odometry, measurements of landmarks and teammates.
 
-Motion and sensor are implemented independently of the estimator in `paths`, `odometry` and
-`sensing`, so an error in either half shows. Random streams are keyed by (seed, robot, purpose): a
-further robot leaves the others' noise unchanged.
+Motion and sensor are implemented independently of the estimator, so an error in either half shows.
+Random streams are keyed by (seed, robot, purpose).
 """
 
 import hashlib
@@ -13,22 +12,29 @@ import numpy as np
 
 from teamslam.sim.world.config import SimulatedWorld, starts_unknown
 from teamslam.sim.world.forms import (
-    claimed,
+    draw_covariances,
     measured_increments,
     measured_steering,
     seen_from,
     with_errors,
 )
 from teamslam.sim.world.odometry import measured_speeds, slip
-from teamslam.sim.world.paths import Drive, Limits, Pose, Step, driven, followed
+from teamslam.sim.world.paths import (
+    Drive,
+    Limits,
+    Pose,
+    Step,
+    follow_way_points,
+    steer_to_way_points,
+)
 from teamslam.sim.world.sensing import (
     SHORTEST_MEASUREMENT_M,
     Visible,
+    add_outliers,
     measurements,
     on_circle,
-    persistent,
-    spoilt,
-    visible,
+    persistent_errors,
+    visible_points,
 )
 from teamslam.sim.world.streams import (
     Detections,
@@ -48,7 +54,7 @@ LEAST_RADIUS = 1.5
 """Turning radius of a simulated car, in wheel bases."""
 
 
-def simulated(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
+def simulate(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
     """Streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
 
     Robot i follows path i; without a path, or with slip or arc motion, it steers to way-points.
@@ -102,7 +108,7 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
     turn_rate = min(world.turn_rate_rad_s, motion.yaw_rate_limit or np.inf)
     path = np.array(world.paths[index]) if index < len(world.paths) else None
     if path is not None and motion.kind == "turn-then-drive" and not motion.slips:
-        return followed(path, world.steps)
+        return follow_way_points(path, world.steps)
     start, way_points = _route(world, robot.id, path, seed)
     limits = Limits(
         world.speed_m_s * world.step_s,
@@ -116,13 +122,12 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
     def slipped(k: int, step: Step) -> tuple[float, float]:
         return slip(motion, step, world.step_s, normals[k])
 
-    return driven(start, way_points, limits, motion.kind, world.steps, slipped)
+    return steer_to_way_points(start, way_points, limits, motion.kind, world.steps, slipped)
 
 
 def _route(
     world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
 ) -> tuple[Pose, Iterator[tuple[float, float]]]:
-    """Initial pose along the first step, and the following way-points."""
     way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
     if path is None and world.radius_m is not None:
         return (0.0, 0.0, 0.0), way_points
@@ -258,7 +263,7 @@ def _observations(
     clean = Detections(at_ns, offsets, ids, ranges, bearings)
     if not world.outlier_share:
         return clean
-    return spoilt(
+    return add_outliers(
         clean,
         world.outlier_share,
         world.outlier_kind,
@@ -286,7 +291,9 @@ def _add_claims(
         random.random((len(seen.steps), 3)),
         random.standard_normal((len(seen.steps), 2)),
     )
-    covariances = claimed(seen, robot.sensor, world.landmark_claims, uniform, points=points)
+    covariances = draw_covariances(
+        seen, robot.sensor, world.landmark_claims, uniform, points=points
+    )
     claims = covariances / world.claims_factor
     if points:
         ahead = np.column_stack([core.cos(seen.bearings), core.sin(seen.bearings)])
@@ -310,7 +317,7 @@ def _read(
     errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
     if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
         lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
-        errors = persistent(seen, sensor, world.step_s, np.column_stack((errors, lasting)))
+        errors = persistent_errors(seen, sensor, world.step_s, np.column_stack((errors, lasting)))
     return measurements(seen, sensor, errors)
 
 
@@ -322,7 +329,6 @@ def _sightings(
     ends_ns: Int64[np.ndarray, " K"],
     seed: int,
 ) -> Detections:
-    """One message per step that ends with a visible teammate; ids index the robots."""
     robot = robots[index]
     none = np.zeros(0)
     columns = [(none.astype(np.int64), none.astype(np.uint32), none, none)]
@@ -347,7 +353,6 @@ def _sightings(
 def _find_within_reach(
     world: SimulatedWorld, robot: RobotConfig, drives: Sequence[Drive], index: int
 ) -> list[int]:
-    """Robots ever close enough, in x and in y, to be visible."""
     _, farthest = _limits(world, robot.sensor)
     reach = 1.001 * (farthest + hypot(*robot.sensor.mount[:2])) + 1e-6
     at = np.stack([drive.poses[1:, :2] for drive in drives])
@@ -361,12 +366,11 @@ def _visible(
     poses: Float[np.ndarray, "K 3"],
     points: Float[np.ndarray, "#K P 2"],
 ) -> Visible:
-    """Points truly visible from these poses."""
     sensor = robot.sensor
     nearest, farthest = _limits(world, sensor)
     if sensor.is_mounted:
         poses = seen_from(poses, sensor.mount)
-    return visible(poses, points, nearest, farthest, sensor.field_of_view)
+    return visible_points(poses, points, nearest, farthest, sensor.field_of_view)
 
 
 def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
@@ -376,7 +380,6 @@ def _limits(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
 
 
 def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
-    """Possible ranges, at most the world's width."""
     nearest, farthest = _limits(world, sensor)
     across = hypot(world.size_m, world.size_m) if world.radius_m is None else 2.0 * world.radius_m
     return nearest, max(nearest, min(farthest, across))

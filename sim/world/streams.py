@@ -1,9 +1,8 @@
 """Streams of a simulated or recorded world: each robot's measurements in order, and the truth.
 
 One counter spans a robot's measurements in the order (stamp, kind); measurement 0 is the initial
-pose. An odometry measurement is an interval stamped with its *end*; a robot's intervals are
-contiguous. So at equal stamps the measurements at the end of an interval come before it. SI units,
-radians, bearings in (−π, π].
+pose. Odometry intervals are contiguous and stamped with their *end*, so at equal stamps the
+measurements at the end of an interval come before it. SI units, radians, bearings in (−π, π].
 """
 
 from dataclasses import dataclass, field, replace
@@ -158,13 +157,11 @@ class RobotStream:
     stamps_ns and rows.
 
     start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
-    (x, y, θ) in the team's frame at truth_ns. notes: repairs and missing data. clock_offset_ns:
-    stamps are team time; published odometry stamps read this much less. positions: by another
-    sensor, such as GPS, at positions_ns in its own frame, for scoring. fixes: measured positions
-    (x, y) [m] in the survey's frame at fixes_ns, with their covariances (xx, xy, yy) [m²], NaN
-    where not stated.
-
-    Raises ValueError for a measurement before the initial pose, or non-contiguous odometry.
+    (x, y, θ) in the team's frame at truth_ns. clock_offset_ns: stamps are team time; published
+    odometry stamps read this much less. positions: by another sensor, such as GPS, in its own
+    frame, for scoring. fixes: measured (x, y) [m] in the survey's frame, with their covariances
+    (xx, xy, yy) [m²], NaN if not stated. Raises ValueError for a measurement before the initial
+    pose, or non-contiguous odometry.
     """
 
     robot: str
@@ -260,10 +257,7 @@ class WorldStreams:
         }
 
     def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
-        """Stream indices and counters of all measurements by (stamp, stream, counter).
-
-        Within one stream the counters ascend, since its stamps never decrease.
-        """
+        """Stream indices and counters of all measurements by (stamp, stream, counter)."""
         lengths = [len(stream) for stream in self.streams]
         stream = np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
         counter = np.concatenate([np.arange(n, dtype=np.int64) for n in lengths])

@@ -9,7 +9,7 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.export.take_home import take_home
-from teamslam.central.desk.verification.centre import recomputed_centre, recorded_map
+from teamslam.central.desk.verification.centre import recompute_centre, recorded_map
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.survey import datum_of
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -138,7 +138,7 @@ def test_a_fix_beyond_the_bounds_is_refused(changed, why):
 def test_maps_with_fixes_are_recomputed_from_the_log():
     recorded = Recorded()
     recorded.take_all(day(3, live=True)[0])
-    computed = recomputed_centre(recorded)
+    computed = recompute_centre(recorded)
     maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
     assert maps
     for each in maps:

@@ -14,7 +14,7 @@ from teamslam.central.submap_fold import SubmapFold
 from teamslam.central.withdrawal import Trial, hold_trial
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.estimation.map_joining.joining import solve_fold
@@ -102,7 +102,7 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
     of: Scenario = scenario()
     talking = tuple(msgspec.structs.replace(each, pose_s=0.0) for each in of.robots)
     of = msgspec.structs.replace(of, robots=talking)
-    return tuple(run_team(of, simulated(of.world, of.robots, of.seed), robot))
+    return tuple(run_team(of, simulate(of.world, of.robots, of.seed), robot))
 
 
 def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.desk.verification.centre import recomputed_centre
+from teamslam.central.desk.verification.centre import recompute_centre
 from teamslam.central.desk.verification.recorded import Recorded, identity
-from teamslam.central.desk.verification.robot import recomputed_robot
+from teamslam.central.desk.verification.robot import recompute_robot
 from teamslam.central.localising import restricted
 from teamslam.central.saved_maps import NothingToSaveError
 from teamslam.sim.cli.main import app
@@ -79,7 +79,7 @@ def test_the_maps_priors_and_poses_are_computed_again_from_the_log(localise):
     samples, _, _ = short_day(localise=localise)
     log = Recorded()
     log.take_all(samples)
-    computed = recomputed_centre(log) | recomputed_robot(log, "r1")
+    computed = recompute_centre(log) | recompute_robot(log, "r1")
     for channel in (ch.FUSED_MAP, ch.FINAL_MAP, ch.PRIOR, ch.TEAM_POSE):
         outputs = log.outputs_of(channel)
         assert outputs

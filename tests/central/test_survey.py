@@ -8,7 +8,7 @@ import pytest
 
 from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.verification.centre import recomputed_centre
+from teamslam.central.desk.verification.centre import recompute_centre
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -144,7 +144,7 @@ def test_coordinates_of_a_national_grid_lose_no_accuracy():
 def test_every_map_is_computed_again_from_the_log():
     recorded = Recorded()
     recorded.take_all(live_day())
-    computed = recomputed_centre(recorded)
+    computed = recompute_centre(recorded)
     maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
     for each in maps:
         assert encoded(computed[identity(each.sample.key, each.message)]) == each.sample.payload

@@ -10,7 +10,7 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.ledger import ledger
-from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.recorded import index_log
 from teamslam.central.desk.verification.verification import verify
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.node import CentralNode
@@ -20,7 +20,7 @@ from teamslam.central.withdrawal import disagreement, hold_trial
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.sim.world.config import OutlierKind, SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team import translate
 from teamslam.team.config import CALIBRATED, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.map_joining.joining import solve_fold
@@ -65,7 +65,7 @@ def run(of: Scenario, wrong: str = "") -> list[Sample]:
     if wrong == "range":
         sensor = msgspec.structs.replace(SENSOR, range_scale=1.25)
     robots = [msgspec.structs.replace(r, sensor=sensor) if r.id == "r3" else r for r in of.robots]
-    streams = simulated(of.world, robots, of.seed)
+    streams = simulate(of.world, robots, of.seed)
     if wrong == "odometry":
         streams = replace(
             streams,
@@ -336,7 +336,7 @@ def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(tm
     result = verify(log)
     assert result.first is None, str(result.first)
     assert all(c.equal == c.messages for c in result.channels)
-    found = ledger(recorded(log))
+    found = ledger(index_log(log))
     assert found.offenders == ()
     assert found.withdrawn == ("r3",)
     held = found.totals("r3")["in a submap"]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.sim.scenarios import scenario
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team.estimation.models import Increment, corrected, increment_of
 
 
@@ -23,7 +23,7 @@ class Keyframe(NamedTuple):
 def world(name, seed):
     """(robots, streams) of a built-in scenario."""
     loaded = scenario.load(name)
-    return loaded.robots, simulated(loaded.world, loaded.robots, seed)
+    return loaded.robots, simulate(loaded.world, loaded.robots, seed)
 
 
 def keyframes_of(config, stream):

@@ -15,7 +15,7 @@ import numpy as np
 
 from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
@@ -145,7 +145,7 @@ def mean_nees(case: Case, seeds: int, mutant: str | None = None) -> tuple[float,
     """The mean NEES per degree of freedom over seeds, and the interval that it should lie in."""
     total, dof = 0.0, 0
     for seed in range(seeds):
-        world = simulated(case.world, [case.robot], seed)
+        world = simulate(case.world, [case.robot], seed)
         told = case.mutants[mutant](case.robot, world) if mutant else (case.robot, world.streams[0])
         for closed in closed_windows(*told):
             squared, numbers = window_nees(closed, world)

@@ -9,7 +9,7 @@ from rosbags.highlevel import AnyReader
 
 from teamslam.central.desk.export.rosbag2 import export_rosbag2
 from teamslam.central.desk.paths import smoothed_paths
-from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.recorded import index_log
 from teamslam.team.ros2.definitions import types
 from teamslam.team.ros2.encoding import compose, ellipse, inverse, names_of
 from teamslam.team.ros2.keys import of_rmw, of_token
@@ -193,7 +193,7 @@ def test_a_log_becomes_a_bag_that_another_reader_opens(tmp_path):
             for each, _, data in reader.messages([read["/tf"]])
             for t in reader.deserialize(data, each.msgtype).transforms
         }
-    path = smoothed_paths(recorded(log))["r1"]
+    path = smoothed_paths(index_log(log))["r1"]
     assert [stamp for stamp, _ in smoothed] == path.stamps_ns.tolist()
     assert [[at.x, at.y] for _, at in smoothed] == path.poses[:, :2].tolist()
     assert frames == {

@@ -8,7 +8,7 @@ import numpy as np
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
@@ -44,7 +44,7 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
 
 def streams(of: Scenario) -> WorldStreams:
     """The world's streams of a scenario."""
-    return simulated(of.world, of.robots, of.seed)
+    return simulate(of.world, of.robots, of.seed)
 
 
 def samples(out: Sequence[Outgoing]) -> list[Sample]:

@@ -1,14 +1,16 @@
-"""The experiments after Downs' thesis: his protocol on his simulator, his tables and tests."""
+"""The experiments after Downs' thesis: his protocol, and a table of his."""
+
+from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.studies.experiments import downs_minima
+from teamslam.sim.studies.experiments.downs import TABLE_5_1
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
-from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.team.estimation.map_joining.alignment import procrustes
+from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+
+SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
 
 def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances():
@@ -21,29 +23,24 @@ def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_co
         assert 0 < robot["rmse"] < 2.0
         assert robot["rmse_aligned"] < 0.5
         assert 0 < robot["position_rmse"] < 2.0
-        assert len(robot["map"]["ids"]) == robot["landmarks"]
+        assert robot["landmarks"] > 10
     assert result["with_covariances"]["rmse"] < 0.5 * result["team"]["rmse"]
 
 
-def _map(points: np.ndarray, sigma: float) -> Figures:
-    return {
-        "ids": list(range(len(points))),
-        "means": points.tolist(),
-        "covariance": (sigma**2 * np.eye(2 * len(points))).tolist(),
+def test_the_map_of_the_first_set_is_drawn_beside_the_errors(tmp_path):
+    options = Options((1,), datasets=(SET_1,))
+    sample = {
+        "robot": "r1",
+        "means": [[1.0, 2.0], [-1.0, 0.5]],
+        "blocks": [[[0.01, 0.0], [0.0, 0.02]]] * 2,
+        "landmarks": [[1.1, 2.0], [-1.0, 0.4]],
+        "online": [[0.0, 0.0], [0.5, 0.1]],
+        "truth": [[0.0, 0.0], [0.5, 0.0]],
     }
-
-
-def test_the_shared_map_has_one_minimum_and_evolution_finds_that_of_the_closed_form():
-    points = np.array([[0.0, 0.0], [5.0, 1.0], [2.0, 7.0], [-4.0, 3.0]])
-    turned = points @ np.array([[0.0, -1.0], [1.0, 0.0]]) + [3.0, -2.0]
-    turned[2] += 0.3
-    pair = downs_minima.common(_map(points, 0.1), _map(turned, 0.2))
-    turns = np.linspace(-np.pi, np.pi, 360, endpoint=False)
-    assert downs_minima.minima(downs_minima.profile(pair, turns)) == 1
-    assert downs_minima.minima(np.cos(2.0 * turns)) == 2
-    closed = procrustes(points, turned, np.ones(4))
-    np.testing.assert_allclose(downs_minima.evolved(pair, 1), closed, atol=1e-4)
-    alike, weighted = (
-        kind(pair, turns) for kind in (downs_minima.profile, downs_minima.profile_with_covariances)
-    )
-    np.testing.assert_allclose(weighted, 2.0 * alike / (0.1**2 + 0.2**2), rtol=1e-9)
+    robots = {f"r{k}": {"rmse": 0.1 * k, "rmse_aligned": 0.02 * k} for k in range(1, 6)}
+    results = {t.name: {"robots": robots, "sample": sample} for t in TABLE_5_1.tasks(options)}
+    outcome = TABLE_5_1.outcome(options, Results(results))
+    assert [picture.name for picture in outcome.pictures] == ["errors", "sample-real"]
+    for picture in outcome.pictures:
+        picture.draw(tmp_path / "picture.png")
+        assert (tmp_path / "picture.png").stat().st_size > 10_000

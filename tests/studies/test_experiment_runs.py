@@ -15,7 +15,7 @@ from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
 from teamslam.sim.studies.experiments.catalogue import Entry
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
-from teamslam.sim.studies.experiments.runner import FAILURES, Plan, computed
+from teamslam.sim.studies.experiments.runner import FAILURES, Plan, compute_outcomes
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 
@@ -79,7 +79,7 @@ def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path):
     wrong = Task(WORK, {"no_such": 1}, "wrong")
     dead = Task("os:_exit", {"status": 3}, "dead")
     good = [counted(1.0), counted(5.0)]
-    (concluded,) = computed([plan(wrong, dead, *good)], tmp_path, 1, silent)
+    (concluded,) = compute_outcomes([plan(wrong, dead, *good)], tmp_path, 1, silent)
     assert concluded.outcome.figures["means"] == [1.0, 5.0]
     assert "TypeError" in concluded.failed["wrong"]
     assert concluded.failed["dead"].startswith("its process died: ")
@@ -88,7 +88,9 @@ def test_a_run_that_fails_or_whose_process_dies_loses_only_itself(tmp_path):
 
 
 def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path):
-    computed([plan(counted(1.0), Task("os:_exit", {"status": 3}, "dead"))], tmp_path, 1, silent)
+    compute_outcomes(
+        [plan(counted(1.0), Task("os:_exit", {"status": 3}, "dead"))], tmp_path, 1, silent
+    )
     asked: list[Task] = []
 
     @contextmanager
@@ -98,7 +100,7 @@ def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path):
         yield lambda _: None
 
     again = plan(counted(1.0), counted(2.0), Task("os:_exit", {"status": 3}, "dead"))
-    (concluded,) = computed([again], tmp_path, 2, watched)
+    (concluded,) = compute_outcomes([again], tmp_path, 2, watched)
     assert {task.label for task in asked} == {"run 2.0", "dead"}
     assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
@@ -136,7 +138,7 @@ def _values_instead_of_filters(monkeypatch):
         experiment = Values()
         return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
 
-    monkeypatch.setattr(runner, "planned", planned)
+    monkeypatch.setattr(runner, "plan_runs", planned)
 
 
 def written(folder: Path) -> dict[str, bytes]:

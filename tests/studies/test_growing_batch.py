@@ -14,7 +14,7 @@ def turns_of(rounds):
 
 
 def converged(start, turns):
-    found = batch.solved(batch.extended(start, turns), 100, 1e-5)
+    found = batch.solve(batch.add_steps(start, turns), 100, 1e-5)
     assert found.converged(1e-5)
     return found
 
@@ -24,8 +24,8 @@ def test_how_it_has_grown_does_not_matter():
     whole = converged(batch.initial_state(KNOWN, None), turns_of(rounds))
     grown = batch.initial_state(KNOWN, None)
     for k in range(0, 9, 3):
-        grown = batch.extended(grown, turns_of(rounds[k : k + 3]))
-        grown = batch.solved(grown, 2, 1e-2)
+        grown = batch.add_steps(grown, turns_of(rounds[k : k + 3]))
+        grown = batch.solve(grown, 2, 1e-2)
     grown = converged(grown, [])
     for one, other in zip(
         batch.landmark_gaussian(whole), batch.landmark_gaussian(grown), strict=True
@@ -42,8 +42,8 @@ def test_a_robust_batch_leaves_outliers_out(robust):
     ranges[0] += 20.0
     spoilt = [*turns[:9], victim._replace(ranges=ranges), *turns[10:]]
     clean = batch.landmark_gaussian(converged(batch.initial_state(KNOWN, None), turns))
-    found = batch.solved(
-        batch.extended(batch.initial_state(KNOWN, 2.0 if robust else None), spoilt), 200, 1e-6
+    found = batch.solve(
+        batch.add_steps(batch.initial_state(KNOWN, 2.0 if robust else None), spoilt), 200, 1e-6
     )
     assert found.converged(1e-6)
     off = (batch.landmark_gaussian(found).means - clean.means).ravel()

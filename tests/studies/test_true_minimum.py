@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.errors import Path
-from teamslam.sim.studies.experiments.true_minimum import judged
+from teamslam.sim.studies.experiments.true_minimum import compare_minima
 from teamslam.team.estimation.map_joining.gauss_newton import Island, JoinSettings
 from teamslam.team.estimation.map_joining.minima import search_minima, solve_minimum
 from tests.estimation.sighting_world import joined_with, mirrored
@@ -30,7 +30,7 @@ def test_a_map_of_sound_submaps_is_in_the_minimum_of_the_truth():
     rises = []
     for seed in range(8):
         _, island, landmarks, paths = world(seed)
-        found = judged(island, landmarks, paths)
+        found = compare_minima(island, landmarks, paths)
         assert not found.wrong
         assert not found.excluded
         assert found.dof == 2 * len(island.graph.landmarks) + 6
@@ -47,7 +47,7 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum():
         free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
         anywhere = np.random.default_rng(seed).uniform(-30.0, 30.0, len(free))
         lost = solve_minimum(replace(island, state=np.where(free, anywhere, island.state)))
-        found = judged(lost.island, landmarks, paths)
+        found = compare_minima(lost.island, landmarks, paths)
         assert found.wrong == (lost.cost > solve_minimum(island).cost + 1.0)
         wrong += found.wrong
     assert wrong >= 2, "the state anywhere is often lost"
@@ -63,8 +63,8 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
         for robot, (x, y, a) in {"r0": (0.0, 0.0, 0.0), "r1": (0.0, 3.0, 0.2)}.items()
     }
     paths = {robot: Path(stamps, way) for robot, way in poses.items()}
-    assert not judged(solve_minimum(island).island, {}, paths).wrong
-    found = judged(solve_minimum(across).island, {}, paths)
+    assert not compare_minima(solve_minimum(island).island, {}, paths).wrong
+    found = compare_minima(solve_minimum(across).island, {}, paths)
     assert found.other_minimum
     assert (found.lower > 1.0) == lower
 
@@ -77,6 +77,6 @@ def test_a_map_that_is_not_at_rest_is_wrong():
     step = 1e-4
     while replace(island, state=off).cost < island.cost + 3.0:
         off[at] += step
-    found = judged(replace(island, state=off), landmarks, paths)
+    found = compare_minima(replace(island, state=off), landmarks, paths)
     assert found.wrong
     assert found.lower == pytest.approx(3.0, abs=0.1)

@@ -1,8 +1,7 @@
 """Score data association with labels that no estimator receives.
 
-A landmark takes the majority label of its *labelled* detections; unlabelled ones do not count.
-Pairs of detections: same label and landmark is right, same label in two landmarks is missed, two
-labels in one landmark is wrong.
+A landmark takes the majority label of its detections. A pair of detections with the same label and
+landmark is right, with one label in two landmarks missed, with two labels in one landmark wrong.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -24,7 +23,7 @@ UNKNOWN = int(m.NO_LABEL)
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Pairwise precision and recall over labelled detections, and the number of wrong ones."""
+    """Pairs of labelled detections, and the number of wrong detections."""
 
     right: int
     wrong: int
@@ -52,19 +51,19 @@ class Pairs:
 
     @property
     def wrong_percent(self) -> float | None:
-        """Percentage of labelled detections whose label is not their landmark's."""
+        """Percentage of detections whose label is not their landmark's."""
         return 100.0 * self.wrong_detections / self.detections if self.detections else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class AssociationResult:
-    """Association scores of a run: over all detections, inside windows, and of the map.
+    """Association scores: over all detections, inside windows, and of the map.
 
-    label_of: label of each unnamed landmark, UNKNOWN without one. duplicates: landmarks beyond the
-    first of a label; confirmed: with at least two submaps, or all for an estimator without submaps;
-    shown: in the final map. merges_right, merges_wrong: pairs of robots that share landmarks, by
-    whether at least half of those labelled by both agree. merges_refused: pending attempts.
-    left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a submap.
+    label_of: label of each unnamed landmark, or UNKNOWN. duplicates: landmarks beyond the first of
+    a label; confirmed: with at least two submaps; shown: in the final map. merges_right,
+    merges_wrong: pairs of robots that share landmarks, by whether half of those labelled by both
+    agree. merges_refused: pending attempts. left_out: labelled detections in no submap.
+    clutter_in_map: unlabelled ones in a submap.
     """
 
     pairs: Pairs
@@ -82,13 +81,13 @@ class AssociationResult:
 
 
 def association_result(log: Collected) -> AssociationResult | None:
-    """Association scores; None if all detections had identities or none was labelled."""
+    """Compute the scores; None without labelled detections without identities."""
     labels = _labels(log)
     if all(label == UNKNOWN for label in labels.values()):
         return None
     detections = list(_detections(log, labels))
     places = [place for _, place, _ in detections]
-    # Without submaps, a place's number is that of the estimator's own map.
+    # Without submaps, a place has the number of the estimator's own map.
     identity = _identities(log) or {place: place[3] for place in places if place is not None}
     label = np.array([each[0] for each in detections], np.int64)
     windows = [each[2] for each in detections]
@@ -141,7 +140,7 @@ def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
 def _detections(
     log: Collected, labels: Mapping[tuple[str, int, int], int]
 ) -> Iterable[tuple[int, Place | None, tuple[str, int, int]]]:
-    """Each detection's label, its place in a submap (None: in none) and its window."""
+    """Label, place (None: in no submap) and window of each detection."""
     seen: set[tuple[str, int, int]] = set()
     for message in log.of_all(ch.ASSOCIATION, m.Association):
         window = (message.robot, message.incarnation, message.sequence)
@@ -157,7 +156,6 @@ def _detections(
 
 
 def _identities(log: Collected) -> dict[Place, int]:
-    """Number in the final map of each local landmark."""
     final = log.newest(ch.FINAL_MAP, m.FusedMap)
     found: dict[Place, int] = {}
     for each in () if final is None else final.memberships:
@@ -169,7 +167,6 @@ def _identities(log: Collected) -> dict[Place, int]:
 
 
 def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:
-    """Number equal values alike, from 0; None has −1."""
     numbers: dict[object, int] = {}
     return np.array(
         [-1 if v is None else numbers.setdefault(v, len(numbers)) for v in values], np.int64
@@ -181,7 +178,7 @@ def _pairs(
     landmark: Int64[np.ndarray, " n"],
     window: Int64[np.ndarray, " n"] | None = None,
 ) -> Pairs:
-    """Count pairs of labelled detections; with windows, only inside one window."""
+    """Count pairs of labelled detections; with windows, inside one only."""
     window = np.zeros(len(label), np.int64) if window is None else window
     used = landmark >= 0
     real = _choose_two(np.column_stack((window, label)))
@@ -212,7 +209,6 @@ def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
 def _majorities(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[dict[int, int], dict[int, set[Place]]]:
-    """Majority label and submaps of each landmark of the map."""
     votes: dict[int, dict[int, int]] = {}
     submaps: dict[int, set[Place]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
@@ -233,7 +229,6 @@ def _majorities(
 def _merges(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[int, int]:
-    """Numbers of robot pairs that share landmarks, right and wrong."""
     votes: dict[int, dict[str, dict[int, int]]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
         number = None if place is None else identity.get(place)

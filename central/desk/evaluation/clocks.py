@@ -1,12 +1,9 @@
 """Estimate the time offset of a robot's detections against its odometry, without truth.
 
 A landmark measured at t_i and t_j is at points b_i, b_j in the base frame. With the odometry motion
-D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise; D depends on τ if the speeds at t_i and
-t_j differ. Neither map nor true path is needed.
-
-Effects similar to τ are estimated jointly: sensor mount, range offset, odometry scales and drift.
-The variance is the sandwich over stretches of time (Liang and Zeger 1986), which allows for
-correlation within a stretch.
+D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise. Sensor mount, range offset, odometry
+scales and drift are estimated jointly. The variance is the sandwich over stretches of time (Liang
+and Zeger 1986), which allows for correlation within a stretch.
 """
 
 import math
@@ -30,16 +27,14 @@ APART_NS = 2_000_000_000
 """Greatest time between two compared measurements of a landmark."""
 STRETCH_NS = 5_000_000_000
 LEAST_STRETCHES = 12
-"""Least effective number of stretches, 1/Σ share² of the information on τ, for a variance."""
+"""Least effective number of stretches, 1/Σ share² of the information on τ."""
 STEP_NS = 250_000_000
-"""Step of the central derivative by τ: averages interval noise, and keeps the derivative's noise
-uncorrelated with that of D.
-"""
+"""Step of the central derivative by τ; averages interval noise."""
 HUBER = 2.0
 ROUNDS = 20
 SETTLED_NS = 1_000_000
 LEAST_SLOPE = 0.2
-"""Least share of the derivative that is motion rather than odometry noise."""
+"""Least share of the derivative that is motion, not odometry noise."""
 LARGEST_NS = 2_000_000_000
 """Largest plausible clock offset."""
 NEAR_M = 1.0
@@ -47,7 +42,7 @@ NEAR_M = 1.0
 BEYOND_DOUBT = 5.0
 """Offset, in standard deviations, from which it is reported."""
 CONTRADICTION = 4.0
-"""Difference, in standard deviations, from which two estimates of an offset exclude each other."""
+"""Standard deviations from which two estimates of an offset exclude each other."""
 LEAST_S = 0.02
 """Smallest reported offset [s]."""
 UNIX_S = 1e9
@@ -57,7 +52,7 @@ UNIX_S = 1e9
 class Timed:
     """Stamps, motions and measurements of named landmarks of one stream, in any order.
 
-    motions: (forward [m/s], left [m/s], turn [rad/s]) per interval, or (wheel speed [m/s], steering
+    motions: per interval (forward [m/s], left [m/s], turn [rad/s]), or (wheel speed [m/s], steering
     [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement.
     """
 
@@ -117,7 +112,7 @@ class Late:
 
 
 def clock_cause(robot: str, found: Late) -> m.Diagnosis | None:
-    """Make the cause of a robot with significantly different clocks, or None."""
+    """Diagnose a significant clock offset, or None."""
     if not found.is_beyond_doubt:
         return None
     return m.Diagnosis(
@@ -133,8 +128,8 @@ def clock_cause(robot: str, found: Late) -> m.Diagnosis | None:
 def is_refuted(cause: m.Diagnosis, found: Late | None) -> bool:
     """Whether the measurements alone exclude a clock offset of the map.
 
-    That follows from the windows' sensitivities, which large errors of the odometry exceed: windows
-    bent by a wrong scale look like late ones. The motion between two measurements does not.
+    A wrong odometry scale bends the windows' sensitivities as a late clock does, but not the motion
+    between two measurements.
     """
     if found is None or cause.cause != "clock_offset" or found.is_beyond_doubt:
         return False
@@ -143,8 +138,7 @@ def is_refuted(cause: m.Diagnosis, found: Late | None) -> bool:
 
 
 def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | None:
-    """Warning about robots whose measurement times overlap with no other robot's, directly or
-    through a chain; or None.
+    """Warn about groups of robots whose measurement times do not overlap.
 
     spans_ns: first and last measurement time by robot.
     """
@@ -172,7 +166,6 @@ def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | Non
 
 
 def _time(stamp_ns: int) -> str:
-    """Time in seconds, or date and time for Unix time."""
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.0f} s"
@@ -180,10 +173,10 @@ def _time(stamp_ns: int) -> str:
 
 
 def lateness(timed: Timed, config: RobotConfig) -> Late | None:
-    """Delay of a robot's detections beyond its `clock_offset_s`; None if undetermined.
+    """Estimate a robot's delay beyond its `clock_offset_s`; None if undetermined.
 
-    Gauss–Newton under Huber's loss. Derivative noise shortens a step by the slope of the step in τ,
-    and σ is divided by that slope.
+    Gauss–Newton under Huber's loss; σ is divided by the slope of the step in τ, which derivative
+    noise reduces.
     """
     if not timed.ends_ns or not timed.ids:
         return None
@@ -224,9 +217,7 @@ class _DeadReckoning:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of measurements of one landmark, at base points b_i and b_j; stretch: time stretch of
-    each pair.
-    """
+    """Pairs of measurements of one landmark, at base points b_i and b_j, and their time stretch."""
 
     path: _DeadReckoning
     t_i: Int64[np.ndarray, " k"]
@@ -238,7 +229,7 @@ class Pairs:
     def step(self, late_ns: int) -> tuple[float, float]:
         """Further delay of the detections [s] and its σ; NaN if undetermined."""
         d, turn = self._motion(late_ns)
-        q, way = _turned(self.b_i - d, -turn), _turned(d, -turn)
+        q, way = _turn(self.b_i - d, -turn), _turn(d, -turn)
         before, after = (self._again(late_ns + by) for by in (-STEP_NS, STEP_NS))
         ahead, left = (np.broadcast_to(each, q.shape) for each in ((1.0, 0.0), (0.0, 1.0)))
         r_i, r_j = (np.maximum(np.hypot(*b.T), 1e-3)[:, np.newaxis] for b in (self.b_i, self.b_j))
@@ -248,10 +239,10 @@ class Pairs:
             way,  # scale of the way, then of the turn, then drift
             turns * (_across(q) - 0.5 * _across(way)),
             seconds * _across(q),
-            ahead - _turned(ahead, -turn),  # mount
-            left - _turned(left, -turn),
-            _across(self.b_j) - _turned(_across(self.b_i), -turn),
-            self.b_j / r_j - _turned(self.b_i / r_i, -turn),  # offset of the range
+            ahead - _turn(ahead, -turn),  # mount
+            left - _turn(left, -turn),
+            _across(self.b_j) - _turn(_across(self.b_i), -turn),
+            self.b_j / r_j - _turn(self.b_i / r_i, -turn),  # offset of the range
         )
         scale = np.maximum(r_j, NEAR_M)
         J = np.stack(columns, axis=2) / scale[:, :, np.newaxis]
@@ -267,17 +258,16 @@ class Pairs:
         return found
 
     def _motion(self, late_ns: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-        """Translation and turn of D(τ)."""
         one, two = self.path.at(self.t_i - late_ns), self.path.at(self.t_j - late_ns)
-        return _turned(two[:, :2] - one[:, :2], -one[:, 2]), two[:, 2] - one[:, 2]
+        return _turn(two[:, :2] - one[:, :2], -one[:, 2]), two[:, 2] - one[:, 2]
 
     def _again(self, late_ns: int) -> Float[np.ndarray, "k 2"]:
         d, turn = self._motion(late_ns)
-        return _turned(self.b_i - d, -turn)
+        return _turn(self.b_i - d, -turn)
 
 
 def pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
-    """Pairs of subsequent measurements of a landmark; None if too few."""
+    """Pair subsequent measurements of each landmark; None if too few."""
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
     order = np.lexsort((stamps, names))
@@ -295,7 +285,6 @@ def pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
 
 
 def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:
-    """Dead-reckoned path from the origin, on the detections' clock."""
     ends = np.array(timed.ends_ns, np.int64) + round(1e9 * config.clock_offset_s)
     rates = np.array(timed.motions).reshape(-1, 3)
     for k in np.flatnonzero(np.array(timed.steered)).tolist():
@@ -323,14 +312,14 @@ def _on_base(seen: Float[np.ndarray, "k 2"], sensor: Sensor) -> Float[np.ndarray
 def _after(
     poses: Float[np.ndarray, "k 3"], twists: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Poses after Exp(twist), whose chord points at half the turn."""
+    """Compose poses with Exp(twist), whose chord points at half the turn."""
     half = 0.5 * twists[:, 2]
     chord = np.sinc(half / math.pi)[:, np.newaxis] * twists[:, :2]
-    places = poses[:, :2] + _turned(chord, poses[:, 2] + half)
+    places = poses[:, :2] + _turn(chord, poses[:, 2] + half)
     return np.column_stack([places, poses[:, 2] + twists[:, 2]])
 
 
-def _turned(
+def _turn(
     points: Float[np.ndarray, "k 2"], angles: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k 2"]:
     c, s = np.cos(angles), np.sin(angles)
@@ -350,8 +339,7 @@ def _first_of_fit(
     """First component of argmin_p of Huber's loss of e + J p, and its σ; NaN if undetermined.
 
     Iteratively reweighted least squares, scaled by the median error. σ² = Σ (s/(1 − h))² over
-    stretches, with a stretch's influence s and share h of the information: approximately the
-    jackknife (Bell and McCaffrey 2002).
+    stretches with influence s and share h of the information (Bell and McCaffrey 2002).
     """
     errors, rows = e.reshape(-1), J.reshape(len(e) * 2, -1)
     norms = np.linalg.norm(rows, axis=0)

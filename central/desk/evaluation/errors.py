@@ -1,5 +1,6 @@
-"""Errors against the truth: distances, headings on the circle, NEES, alignment."""
+"""Errors against the truth: distances, headings, NEES, alignment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,15 @@ class Path:
     poses: Float[np.ndarray, "K 3"]
 
 
+def join_batches(batches: Sequence[Path]) -> Path:
+    """Join batches to one path by stamp, with the first pose of equal stamps."""
+    if not batches:
+        return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
+    stamps = np.concatenate([batch.stamps_ns for batch in batches])
+    stamps, first = np.unique(stamps, return_index=True)
+    return Path(stamps, np.concatenate([batch.poses for batch in batches])[first])
+
+
 SMALL_TURN = 1e-6
 """Below this [rad], (δ/2) cot(δ/2) is 1 to the last bit."""
 
@@ -32,7 +42,7 @@ class PoseErrors:
     """Estimate − truth of the K poses with truth, (x [m], y [m], theta [rad]).
 
     sigmas: estimated standard deviations. nees: eᵀ P⁻¹ e with 3 degrees of freedom. motion_nees:
-    the same for the rigid motion that carries the estimate to the truth.
+    that of the rigid motion from the estimate to the truth.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
@@ -66,11 +76,9 @@ class PoseErrors:
 class MapErrors:
     """Map errors against the true positions of the same landmarks.
 
-    rmse_m, aligned_rmse_m: 2-D distances without alignment, and after truth_from_map, the
-    least-squares rigid motion (None below two landmarks). nees_per_dof: joint, unaligned; `band`:
-    its 95 % interval for one run with 2L degrees of freedom. shape: non-rigid part of the error,
-    independent of initial poses (None like aligned_rmse_m). coverage: share of landmarks in their
-    95 % ellipse, unaligned.
+    rmse_m: unaligned; aligned_rmse_m: after the rigid motion truth_from_map. nees_per_dof: joint,
+    unaligned, 2L degrees of freedom; `band`: its 95 % interval for one run. shape: non-rigid
+    errors. coverage: share of landmarks in their 95 % ellipse, unaligned.
     """
 
     count: int
@@ -97,8 +105,8 @@ class MapErrors:
 class ShapeErrors:
     """Map errors without their rigid part, with that part's covariance removed.
 
-    nees_per_landmark: NEES of the 2L − 3 remaining degrees of freedom, scaled to an expectation of
-    2 per landmark. coverage: share of landmarks whose remaining error lies in its 95 % ellipse.
+    nees_per_landmark: NEES of the 2L − 3 degrees of freedom, scaled to an expectation of 2.
+    coverage: share of landmarks in their 95 % ellipse.
     """
 
     nees_per_landmark: float
@@ -123,7 +131,7 @@ def map_errors(
     covariance: Float[np.ndarray, "m m"],
     truth: Float[np.ndarray, "L 2"],
 ) -> MapErrors:
-    """Compute the errors of L ≥ 1 landmarks with joint covariance 2L × 2L."""
+    """Errors of L ≥ 1 landmarks with joint covariance 2L × 2L."""
     count = len(means)
     difference = means - truth
     motion = rigid_alignment(truth, means)
@@ -149,8 +157,8 @@ def _shape_errors(
 ) -> ShapeErrors:
     """Compute the errors after alignment, in the map frame.
 
-    With G = ∂(positions moved by x, y, θ)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g); the
-    covariance of the remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
+    With G = ∂(positions)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g); the covariance of the
+    remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
     """
     count = len(means)
     error = (means - transform_points(between(truth_from_map, np.zeros(3)), truth)).ravel()
@@ -170,7 +178,6 @@ def _shape_errors(
 
 
 def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m m"]) -> float:
-    """Share of points in the 95 % ellipse of their own 2 × 2 covariance."""
     count = len(errors)
     blocks = covariance.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count), :]
     # Two landmarks have a one-dimensional shape, so their blocks are singular.
@@ -184,7 +191,7 @@ def rigid_alignment(
 ) -> Float[np.ndarray, "3"] | None:
     """truth_from_points by least squares without scale (Kabsch 1976; Umeyama 1991).
 
-    None if undetermined: fewer than two distinct points.
+    None below two distinct points.
     """
     if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
         return None
@@ -210,11 +217,10 @@ def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> f
 def interpolate_truth(
     truth: Path, stamps_ns: Int64[np.ndarray, " K"]
 ) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
-    """Interpolate the true poses at the stamps; returns poses and a mask of known rows (others
-    zero).
+    """Interpolate the true poses at the stamps; return poses and a mask of known rows.
 
-    Positions linear, headings along the shorter arc; no extrapolation, no gap above TRUTH_GAP_NS. A
-    truth sample's own stamp is always known.
+    Positions linearly, headings by the shorter arc; unknown outside the truth and in gaps above
+    TRUTH_GAP_NS.
     """
     poses = np.zeros((len(stamps_ns), 3))
     if not len(truth.stamps_ns):
@@ -238,7 +244,7 @@ def interpolate_truth(
 def pose_errors(
     path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
 ) -> PoseErrors | None:
-    """Compute a path's errors at poses with truth; None if there is none."""
+    """Errors of a path's poses with truth; None without any."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
@@ -260,9 +266,8 @@ def _motion_nees(
 ) -> Float[np.ndarray, " K"]:
     """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for rotation about a far point.
 
-    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 radially, which an
-    ellipse in (x, y, θ) does not cover. ξ = (V⁻¹ (p' − R p), δ) with V of the SE(2) exponential; to
-    first order (dx, dy, dθ) → ξ is A = [1 0 y; 0 1 −x; 0 0 1].
+    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 radially. ξ = (V⁻¹
+    (p' − R p), δ) with V of the SE(2) exponential; A = [1 0 y; 0 1 −x; 0 0 1].
     """
     turn = on_circle(truth[:, 2] - poses[:, 2])
     p = poses[:, 0] + 1j * poses[:, 1]

@@ -57,7 +57,7 @@ UPLINK = {
 
 
 TeamMotion = tuple[Float[np.ndarray, "3"], str]
-"""Rigid motion from map to truth, and what it aligns."""
+"""Rigid motion from map to truth, and the aligned points or paths."""
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
@@ -105,7 +105,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         notes=(
             *(() if end is None else end.notes),
             *log.disagreement,
-            *_never_came(log),
+            *_warn_of_missing(log),
             *_set_aside(faults),
         ),
         unsound=log.unsound,
@@ -132,9 +132,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 
 
 class _Streams(NamedTuple):
-    """Findings in the measurements alone: mirrored robots, clock offsets where they are determined,
-    and the warning of times that do not overlap.
-    """
+    """Findings in the measurements alone."""
 
     mirrored: tuple[m.Diagnosis, ...]
     lateness: Mapping[str, Late]
@@ -142,7 +140,6 @@ class _Streams(NamedTuple):
 
 
 def _streams(log: Collected) -> _Streams:
-    """Judge each robot's incarnation with most measurements."""
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -179,9 +176,6 @@ def _frames(log: Collected) -> TruthFrames:
 
 
 def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
-    """Whether neither a known initial pose nor a survey fixes the final map's frame (or any frame,
-    without a map).
-    """
     if fused is None or not fused.members:
         return frames.none_is_known
     if fused.frame == SURVEY_FRAME:
@@ -189,8 +183,7 @@ def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
     return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
 
 
-def _never_came(log: Collected) -> list[str]:
-    """Robots whose driver missed published messages, by its last status."""
+def _warn_of_missing(log: Collected) -> list[str]:
     warnings = []
     for robot in log.robots:
         status = log.newest(ch.STATUS, m.Status, ch.source_node(robot))
@@ -205,7 +198,6 @@ def _never_came(log: Collected) -> list[str]:
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    """Messages that each node set aside, and the first exception, as text."""
     by_node: dict[str, list[m.Fault]] = {}
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
@@ -217,7 +209,6 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
 
 
 def _by_robot(log: Collected, name: str) -> dict[str, float]:
-    """Last values of the centre's figure of this name, by robot."""
     status = log.newest(ch.STATUS, m.Status, "central")
     if status is None:
         return {}
@@ -245,8 +236,6 @@ class _Place(msgspec.Struct):
 
 
 class _World(msgspec.Struct):
-    """Part of a scenario that names a data set."""
-
     world: _Place
 
 
@@ -310,7 +299,6 @@ def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> floa
 
 
 def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
-    """Rigid motion of the team's map onto the truth, and its source."""
     if fused is None:
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:
@@ -320,7 +308,6 @@ def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotio
 
 
 def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
-    """Rigid motion that aligns smoothed with true positions."""
     true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
     for log in logs:
         truth, known = interpolate_truth(log.truth, log.smoothed.stamps_ns)

@@ -1,4 +1,4 @@
-"""Detect a team's events: robots that join, are lost or refused, and node warnings."""
+"""Detect a team's events: robots that join, are lost or refused, and warnings."""
 
 import re
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ Kind = Literal[
     "done",
 ]
 MOST = 2000
-"""Most events of a run, above the rate of one new warning per node and second."""
+"""Most events of a run."""
 FIRST = 1
 _NUMBER = re.compile(r"\d+\.\d+")
 _AWAITED = (
@@ -36,7 +36,7 @@ _AWAITED = (
 
 @dataclass(frozen=True)
 class Event:
-    """Event: team time [ns], kind, node, description."""
+    """One event at a team time."""
 
     stamp_ns: int
     kind: Kind
@@ -67,7 +67,7 @@ class EventDetector:
     _ended: bool = False
 
     def take(self, message: m.Message, now_ns: int) -> list[Event]:
-        """Events caused by a message at team time `now_ns`."""
+        """Detect the events of a message at team time `now_ns`."""
         match message:
             case m.Liveliness():
                 return self._liveliness(message, now_ns)
@@ -128,7 +128,6 @@ class EventDetector:
         return [Event(now_ns, "restarted", robot_node(start.robot), text)]
 
     def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """Changes in the set of mapped robots."""
         apart = {
             name: f"{who} not joined: {why}"
             for who, why in not_joined(fused.reasons)
@@ -172,7 +171,6 @@ class EventDetector:
         return events
 
     def _decisions(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        """Accepted and undone closures and merges, each once; pending ones are left out."""
         events = []
         for each in fused.decisions:
             name = (each.stamp_ns, each.kind, each.about)
@@ -184,7 +182,6 @@ class EventDetector:
         return events
 
     def _status(self, status: m.Status, now_ns: int) -> list[Event]:
-        """Warnings, once regardless of decimals; start-up waits are no events."""
         events = []
         refused = int(status.figures.get("refused", 0.0))
         if refused > self._refused and status.node == "central":
@@ -202,7 +199,7 @@ class EventDetector:
 
 
 def decision_words(decision: m.AssociationDecision) -> str:
-    """Closure or merge with its figures and the reason for its undoing."""
+    """Describe a closure or merge with its figures."""
     figures = (
         f"{decision.pairs} landmarks, log-likelihood ratio {decision.llr:.0f} against "
         f"{decision.rival_llr:.0f}, share {decision.share:.2f}, {decision.absent} absent"
@@ -216,15 +213,14 @@ def decision_words(decision: m.AssociationDecision) -> str:
 
 
 def is_awaited(warning: str) -> bool:
-    """Whether a warning is the start-up state of a node, which is no event."""
+    """Whether a warning is a start-up state of a node."""
     return any(text in warning for text in _AWAITED)
 
 
 def _is_apart(reason: str) -> bool:
-    """Whether a warning repeats the map's reason for an unjoined robot."""
     return any(not_joined([reason]))
 
 
 def without_decimals(text: str) -> str:
-    """Mask decimals: the same finding with other figures is no new event."""
+    """Mask decimals: other figures make no new event."""
     return _NUMBER.sub("#", text)

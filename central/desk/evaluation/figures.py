@@ -1,17 +1,42 @@
 """Figures of a run under their JSON names."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
 import msgspec
 
 from teamslam.central.desk.evaluation.association import AssociationResult
-from teamslam.central.desk.evaluation.causes import absent_robots, warning_objects
 from teamslam.central.desk.evaluation.results import Evaluation, figure
+from teamslam.central.desk.evaluation.states import NO_MEMBER, RobotState
 from teamslam.central.diagnosis import to_object
 from teamslam.team.wire import messages as m
 
+# A program compares causes; texts are for people.
+_NOT_JOINED = (
+    (NO_MEMBER, "no_submaps"),
+    ("disagree", "maps_disagree"),
+    ("leave two places", "ambiguous"),
+    ("margin", "ambiguous"),
+    ("needed", "too_little_shared"),
+    ("shared", "too_little_shared"),
+)
+_WARNINGS = (
+    ("left out", "landmarks_left_out"),
+    ("refused", "refused"),
+    ("placed weakly", "weak_heading"),
+    ("farther off than its covariance", "nonlinear"),
+    ("was lost", "weak_heading"),
+    ("two places look alike", "places_alike"),
+    ("not settled", "not_settled"),
+    ("no full solution", "no_solution"),
+    ("another map fits", "wrong_minimum"),
+    ("does not fit its submaps", "misfit"),
+    ("contradict each other", "robots_contradict"),
+    ("not calibrated", "not_calibrated"),
+    ("claim to be surer", "covariance_raised"),
+    ("measurement times", "clocks"),
+)
 _TEAM = {
     "scenario": "scenario.name",
     "seed": "scenario.seed",
@@ -87,13 +112,12 @@ _ASSOCIATION = {
 
 
 def _named(of: object, paths: Mapping[str, str]) -> dict[str, Any]:
-    """Figures by name; tuples as lists, as JSON has them."""
     found = {name: figure(of, path) for name, path in paths.items()}
     return {name: list(of) if isinstance(of, tuple) else of for name, of in found.items()}
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Figures under their JSON names; `extra` replaces or adds figures."""
+    """Collect the figures under their JSON names; `extra` replaces or adds some."""
     fused, association = evaluation.map, evaluation.association
     states = evaluation.states
     of_map: dict[str, Any] = {
@@ -120,9 +144,9 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         **of_map,
         "data_set": evaluation.data_set or None,
         "diagnosis": [to_object(each) for each in evaluation.diagnosis],
-        "not_joined": absent_robots(states, "not joined"),
-        "withdrawn": absent_robots(states, "withdrawn"),
-        "warnings": warning_objects(evaluation.other_warnings),
+        "not_joined": _absent_robots(states, "not joined"),
+        "withdrawn": _absent_robots(states, "withdrawn"),
+        "warnings": _warning_objects(evaluation.other_warnings),
         "robot_states": {name: of._asdict() for name, of in states.items()},
         "robots": {
             name: _named(robot, _ROBOT) | {"online_in_team_frame": not robot.outside}
@@ -144,7 +168,7 @@ def association_json(result: AssociationResult) -> dict[str, Any]:
 
 
 def change_json(change: m.LandmarkChange) -> dict[str, Any]:
-    """A landmark's state against the saved maps; `expected`: observations of one that is gone."""
+    """A landmark's state against the saved maps; `expected`: missed observations."""
     return {
         "landmark": change.landmark,
         "state": change.state,
@@ -154,3 +178,24 @@ def change_json(change: m.LandmarkChange) -> dict[str, Any]:
         "chi2": change.chi2,
         "expected": change.expected,
     }
+
+
+def _cause(text: str, table: Iterable[tuple[str, str]], otherwise: str) -> str:
+    return next((cause for words, cause in table if words in text), otherwise)
+
+
+def _absent_robots(states: Mapping[str, RobotState], state: str) -> list[dict[str, str]]:
+    found = []
+    for robot, of in states.items():
+        if of.state != state:
+            continue
+        if state == "withdrawn":
+            cause = "contradicts_the_rest" if of.why.startswith("by central") else "ordered"
+        else:
+            cause = _cause(of.why, _NOT_JOINED, "no_place_found")
+        found.append({"robot": robot, "cause": cause, "text": of.why})
+    return found
+
+
+def _warning_objects(texts: Iterable[str]) -> list[dict[str, str]]:
+    return [{"cause": _cause(each, _WARNINGS, "other"), "text": each} for each in texts]

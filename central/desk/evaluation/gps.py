@@ -1,4 +1,4 @@
-"""Compare a path with positions of another sensor, such as GPS, in another frame and clock."""
+"""Compare paths with positions of another sensor in another frame and clock."""
 
 from collections.abc import Mapping
 
@@ -25,8 +25,7 @@ Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
     """Median distance [m] of smoothed poses from the other sensor's positions, or None.
 
-    One rigid motion, lever arm and time shift per team, by least absolute distances (iterated
-    weights 1/d), since fixes may be wrong by metres.
+    Fits one rigid motion, lever arm and time shift per team by least absolute distances.
     """
     fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
     if not fixes:
@@ -64,10 +63,10 @@ def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: floa
 def distances(
     poses: Float[np.ndarray, "n 3"], there: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, " n"]:
-    """‖there − (A (t + R(θ) lever) + b)‖ after the rigid motion (A, b) and the lever that fit best.
+    """‖there − (A (t + R(θ) lever) + b)‖ after the best rigid motion (A, b) and lever.
 
-    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); u² + v² = 1 is restored
-    after each solution.
+    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); then u² + v² = 1 is
+    restored.
     """
     n = len(poses)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -1,7 +1,4 @@
-"""History of a run over team time: consistency, latency, events, in one pass.
-
-`evaluation` has the figures at the end. Only the plotted numbers of each message are kept.
-"""
+"""History of a run over team time: consistency, latency, events."""
 
 from array import array
 from bisect import bisect_left
@@ -39,7 +36,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Innovations:
-    """Σ νᵀ S⁻¹ ν of one robot's windows and degrees of freedom, at window ends."""
+    """Σ νᵀ S⁻¹ ν and degrees of freedom of one robot's windows."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     squared: Float[np.ndarray, " n"]
@@ -59,10 +56,9 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Latencies:
-    """Latencies of one robot's used submaps: wall time [s] from measurement to first map.
+    """Wall time [s] from measurement to first map, of one robot's used submaps.
 
-    stamps_ns: submap end. first, last: from publication of its first and last measurement. `first`
-    is longer, since a measurement waits for its window to close.
+    stamps_ns: submap end. first, last: from publication of its first and last measurement.
     """
 
     stamps_ns: Int64[np.ndarray, " n"]
@@ -74,9 +70,8 @@ class Latencies:
 class History:
     """History of a run by team time.
 
-    start_ns, end_ns: span of the measurements, else of all messages. map_nees: landmark-block NEES
-    per degree of freedom of every fused map, empty without truth. map_cost: of every fused map;
-    robot_cost: from the centre's status.
+    start_ns, end_ns: span of the measurements, else of all messages. map_nees: per degree of
+    freedom of every fused map, in blocks.
     """
 
     start_ns: int
@@ -96,8 +91,6 @@ class History:
 
 @dataclass
 class _Column:
-    """Growing (stamp, number) pairs."""
-
     stamps: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
 
@@ -134,7 +127,7 @@ class _Clocks:
 
 @dataclass
 class _Submap:
-    """Submap that no map has used, with the clocks of its measurements."""
+    """Submap that no map has used."""
 
     end_ns: int
     first_measurement: int
@@ -168,7 +161,6 @@ class _Gathering:
         self.take_contents(sample)
 
     def take_contents(self, sample: Sample) -> None:
-        """Process a message of any channel."""
         if ch.row_of(sample.key) not in _CHANNELS:
             return
         if (sound := try_open(sample)) is None:

@@ -85,7 +85,7 @@ class Traffic:
 
 @dataclass
 class Measurements:
-    """Measurements of one robot on its sensor channels, each (incarnation, measurement) once."""
+    """Measurements of one robot as (incarnation, measurement)."""
 
     all: set[tuple[int, int]] = field(default_factory=set)
     odometry: set[tuple[int, int]] = field(default_factory=set)
@@ -96,8 +96,7 @@ class Collected:
     """Contents of a log by channel and robot.
 
     samples: by key, decoded on demand. timed: by (robot, incarnation). first_ns: wall clock of the
-    first sample that has one. unsound: invalid samples, counted as traffic only. disagreement:
-    peers whose final map differs, as text.
+    first sample that has one. disagreement: peers whose final map differs, as text.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
@@ -121,7 +120,7 @@ class Collected:
         return in_order(names)
 
     def newest(self, channel: Channel, kind: type[M], name: str = "") -> M | None:
-        """Newest message of a channel (with this name), if valid."""
+        """Newest valid message of a channel."""
         found = self.sound(self.latest.get(channel.key(name)))
         return found if isinstance(found, kind) else None
 
@@ -131,12 +130,12 @@ class Collected:
         return [each for each in found if isinstance(each, kind)]
 
     def of_all(self, channel: Channel, kind: type[M]) -> list[M]:
-        """Valid messages of a channel, ordered by key, then in log order."""
+        """Valid messages of a channel, by key, in log order."""
         names = sorted(name for key in self.samples if (name := channel.owner(key)) is not None)
         return [each for name in names for each in self.messages(channel, kind, name)]
 
     def sound(self, sample: Sample | None) -> m.Message | None:
-        """Message of a sample; None, counted once as unsound, if invalid."""
+        """Decode a sample; None if invalid, which is counted once."""
         if sample is None:
             return None
         try:
@@ -166,9 +165,7 @@ class Collected:
             self._keep(sample, channel)
 
     def keep(self, sample: Sample) -> None:
-        """Store a message that a peer published in the centre's place; the traffic stays the
-        peer's.
-        """
+        """Store a message in the centre's place, without its traffic."""
         found = channel_of(sample.key)
         if found is not None:
             self._keep(sample, found[0].name)
@@ -193,7 +190,6 @@ class Collected:
             of_robot.odometry.add(name)
 
     def _time(self, sample: Sample, robot: str) -> None:
-        """Add a measurement to its stream; only count an invalid one."""
         try:
             message = decoded(sample.payload, *_TIMED)
         except WireError:

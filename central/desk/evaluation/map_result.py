@@ -1,4 +1,4 @@
-"""The final map of a run, and each robot's own map, against the true landmarks."""
+"""Final map of a run, and each robot's own map, against the truth."""
 
 import hashlib
 from collections.abc import Mapping
@@ -25,10 +25,9 @@ def map_result(
     label_of: Mapping[int, int],
     truth_from_map: Float[np.ndarray, "3"] | None,
 ) -> MapResult:
-    """Final map and its errors.
+    """Evaluate the final map.
 
-    truth_from_map: motion after which landmarks without identity or label are matched to the
-    nearest true ones; None: unknown.
+    truth_from_map: motion by which unnamed landmarks are matched to true ones; None: unknown.
     """
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
@@ -65,9 +64,6 @@ def map_result(
 
 
 def _is_refuted(found: m.Diagnosis, errors: MapErrors | None) -> bool:
-    """Whether the truth refutes that covariances are too large: an error common to all submaps,
-    such as a late clock, does not show in their differences.
-    """
     is_small = found.cause == "noise_overestimated"
     return is_small and errors is not None and errors.nees_per_dof > 1.0
 
@@ -79,7 +75,6 @@ def _match_unnamed(
     truth: Float[np.ndarray, "L 2"],
     known: Bool[np.ndarray, " L"],
 ) -> Matching | None:
-    """Fill in true positions of unnamed landmarks from the nearest unidentified true landmarks."""
     unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
     free = true.positions[~np.isin(true.ids, ids)]
     found = nearest(means[unnamed], free) if len(unnamed) else None
@@ -102,7 +97,7 @@ def _gospa(
 
 
 def own_map(log: Collected, robot: str, true: TrueLandmarks) -> MapErrors | None:
-    """Errors of a robot's last own map; None without one or without truth."""
+    """Evaluate a robot's last own map; None without one or without truth."""
     message = log.newest(ch.OWN_MAP, m.MapEstimate, robot)
     if message is None:
         return None

@@ -1,4 +1,4 @@
-"""Match landmarks to true ones by distance: GOSPA, and true positions of unnamed landmarks."""
+"""Match landmarks to true ones by distance."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,7 @@ from teamslam.team.shapes import Float, Int64
 
 @dataclass(frozen=True)
 class Matching:
-    """Number of landmarks within `gate_m` of a true one, one to one, `of` all unnamed ones.
-
-    Errors beyond the gate are not counted.
-    """
+    """Number of landmarks within `gate_m` of a true one, one to one, `of` all unnamed ones."""
 
     gate_m: float
     matched: int
@@ -38,8 +35,9 @@ class Gospa:
 def assign(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], gate_m: float
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Assign points one to one within the gate, with least sum of squared distances; returns rows
-    of both sets and squared distances [m²].
+    """Assign points one to one within the gate, with least sum of squared distances.
+
+    Returns rows of both sets and squared distances [m²].
     """
     squared = np.minimum(((found[:, None] - true[None]) ** 2).sum(axis=2), gate_m**2)
     rows, columns = _cheapest(squared)
@@ -50,10 +48,7 @@ def assign(
 def nearest(
     means: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"]
 ) -> tuple[Int64[np.ndarray, " n"], Matching] | None:
-    """Row of each landmark's true position (−1: none), in the true frame.
-
-    The gate is half the median nearest-neighbour distance of the true landmarks. None below two.
-    """
+    """Row of each landmark's true position (−1: none); None below two true ones."""
     gate_m = half_spacing(true)
     if not gate_m:
         return None
@@ -66,11 +61,9 @@ def nearest(
 def gospa(
     found: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"], cut_off_m: float
 ) -> Gospa:
-    """GOSPA of points in the true frame.
+    """GOSPA of points in the true frame (Rahmathullah, García-Fernández and Svensson 2017).
 
-    A set distance that counts misplaced, missed and false points (Rahmathullah, García-Fernández
-    and Svensson 2017, p = 2, α = 2): over the best assignment of pairs nearer than the cut-off c,
-    GOSPA² = Σ d² + c²/2 · (missed + false).
+    With p = 2, α = 2 and pairs nearer than the cut-off c, GOSPA² = Σ d² + c²/2 · (missed + false).
     """
     assigned = assign(found, true, cut_off_m)[2]
     missed, false = len(true) - len(assigned), len(found) - len(assigned)
@@ -80,7 +73,7 @@ def gospa(
 
 
 def half_spacing(true: Float[np.ndarray, "m 2"]) -> float | None:
-    """Half the median nearest-neighbour distance of true landmarks, used as cut-off."""
+    """Half the median nearest-neighbour distance; None below two landmarks."""
     if len(true) < 2:
         return None
     apart = np.hypot(*(true[:, None] - true[None]).transpose(2, 0, 1))
@@ -93,7 +86,7 @@ def _cheapest(
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
     """Assign min(n, m) rows to columns with least sum of costs, rows ascending.
 
-    Shortest augmenting paths with potentials (Jonker and Volgenant 1987): O(n² m).
+    Shortest augmenting paths with potentials (Jonker and Volgenant 1987).
     """
     if len(costs) > costs.shape[1]:
         columns, rows = _cheapest(costs.T)

@@ -1,10 +1,7 @@
 """Find robots whose bearings have the wrong sign, by the odometry, without truth and map.
 
-A landmark measured twice within two seconds is at b_i, b_j in the base frame, with b_j = D⁻¹ b_i by
-the odometry's motion D (see `clocks`). With bearings of the wrong sign that holds for the reflected
-points, not for the measured ones, where the robot turns. This is all that shows a fault of a robot
-alone: its submaps follow the mirrored landmarks, and agree with each other. Turn rates of the wrong
-sign look the same.
+Then b_j = D⁻¹ b_i of `clocks` holds for the reflected points where the robot turns. Turn rates of
+the wrong sign look the same.
 """
 
 import math
@@ -24,17 +21,14 @@ from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
 MIRRORED = 0.9
-"""Least share of the stretches that fit reflected, of those that decide: 11 of 12, which chance
-reaches three times in a thousand where neither fits.
-"""
+"""Least share of the deciding stretches that fit reflected: 11 of 12."""
 
 
 def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis | None:
-    """Make the cause of a robot whose measurements fit its odometry reflected, or None.
+    """Diagnose a robot whose measurements fit its odometry reflected, or None.
 
-    A stretch of time decides by the χ² of its measured points less that of the reflected ones,
-    where that is beyond GATE; evidence is the mean of these. The unit is the smaller median, and a
-    pair counts GATE at most.
+    A stretch decides if the χ² of its measured points less that of the reflected ones is beyond
+    GATE; evidence is the mean of these. A pair counts GATE at most.
     """
     gains = _gains(timed, config)
     deciding = gains[np.abs(gains) > GATE]
@@ -52,7 +46,7 @@ def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis
 
 
 def _gains(timed: Timed, config: RobotConfig) -> Float[np.ndarray, " n"]:
-    """Evaluate the χ² that a reflection removes from each stretch of time."""
+    """χ² that a reflection removes from each stretch of time."""
     none = np.zeros(0)
     if not timed.ends_ns or not timed.ids:
         return none

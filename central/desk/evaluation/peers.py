@@ -14,9 +14,8 @@ _OF, _OVER, _OVER_BYTES = "set_submaps.", "set_over.", "set_over_bytes."
 class PeerResult:
     """Announced conclusion of one peer.
 
-    complete_at_s: wall time from log start to its final map. uplink_bytes, downlink_bytes:
-    set messages published (each once) and received. have: submaps by robot. over: new members by
-    relaying node. agrees_with: number of peers whose last summary named the same set.
+    complete_at_s: wall time from log start to its final map. have: submaps by robot. over: new
+    members by relaying node. agrees_with: number of peers with the same set.
     """
 
     final_map_sha256: str | None

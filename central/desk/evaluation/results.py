@@ -1,7 +1,6 @@
-"""Results of a run: its map, its robots and its traffic, and figures of them by name.
+"""Results of a run: its map, its robots and its traffic.
 
-A figure without its inputs is None. Metres and radians; NEES per degree of freedom, 1 if the
-covariance is right.
+A figure without its inputs is None. Metres and radians; NEES per degree of freedom.
 """
 
 from collections.abc import Mapping
@@ -30,7 +29,7 @@ USUAL = ("hybrid", "join")
 
 
 def figure(of: object, path: str) -> Any:
-    """Value at a path of attributes such as `smoothed.coverage`; None behind a missing part."""
+    """Value at a path of attributes such as `smoothed.coverage`; None if absent."""
     for name in path.split("."):
         of = None if of is None else getattr(of, name)
     return of
@@ -38,14 +37,12 @@ def figure(of: object, path: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class MapResult:
-    """Final map: L landmarks by id and their joint covariance (blocks unless `joint`).
+    """Final map: L landmarks by id and their covariance (blocks unless `joint`).
 
-    truth: true positions, zero without truth; known: rows with truth; errors: of those.
-    cost_per_dof: χ² of the join. covariance_scale: factor by which the submap covariances should be
-    multiplied; None: unknown. withdrawn: robots left out. lost: incomplete robots. gospa: of all
-    landmarks after truth_from_map. matching: how unnamed landmarks got true positions; None: by
-    identity or label. changes: states of the landmarks against saved maps. diagnosis: causes of
-    misfit, the best one first.
+    truth: true positions, zero unless `known`; errors: of the known rows. cost_per_dof: χ² of the
+    join. covariance_scale: factor to apply to submap covariances. lost: incomplete robots. gospa:
+    of all landmarks. matching: of unnamed landmarks. changes: against saved maps. diagnosis: causes
+    of misfit, best first.
     """
 
     rule: str
@@ -73,14 +70,12 @@ class MapResult:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotResult:
-    """One robot: its measurements, their dispositions, and its poses against the truth.
+    """One robot: dispositions of its measurements, and its poses against the truth.
 
-    smoothed: final map's poses at submap ends. online: poses published during the run, given the
-    team map (`online_channel`: "team/pose"), or from own measurements if never in the team's frame.
-    aligned_rmse_m, online_aligned_rmse_m: after the rigid motion that aligns the map (`alignment`:
-    "map"), or without true landmarks all smoothed paths ("paths"), or without a map the robot's own
-    path ("trajectory"). own_map: last own map, unaligned. outside: running poses are not in the
-    team's frame, so there is no online path.
+    smoothed: final map's poses at submap ends. online: poses published during the run, on
+    `online_channel`. aligned_rmse_m, online_aligned_rmse_m: after the rigid motion that aligns the
+    map (`alignment`: "map"), or all smoothed paths ("paths"), or the robot's own path
+    ("trajectory"). own_map: unaligned. outside: running poses are not in the team's frame.
     """
 
     consumption: Consumption
@@ -107,17 +102,12 @@ class RobotResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A run: scenario (None: not in the log), map, robots and traffic.
+    """A run: scenario, map, robots and traffic.
 
-    true_landmarks: all, measured or not. notes: remarks of the world, and messages set aside.
-    faults: number of messages set aside. unsound: number of invalid samples. arbitrary_frame: no
-    mapped robot has a known initial pose, so only aligned errors are meaningful. decisions:
-    closures and merges by unnamed landmarks. verdicts: an operator's, as text. states: of every
-    robot in the final map. data_set: folder or file name; empty for a simulated world.
-    separate_times: of measurements that do not overlap, as text. mirrored, lateness: bearings of
-    the wrong sign, and each robot's clock offset where it is determined, by the measurements alone.
-    recorded_ns: wall time of the first message. truth_from_map: rigid motion that aligns the map's
-    landmarks with the true ones, or where none is known the paths.
+    notes: remarks of the world, and messages set aside (number: faults). unsound: number of invalid
+    samples. arbitrary_frame: only aligned errors are meaningful. verdicts, separate_times: as text.
+    mirrored, lateness: by the measurements alone. recorded_ns: wall time of the first message.
+    truth_from_map: aligns landmarks with the true ones, or the paths.
     """
 
     scenario: TeamConfig | None
@@ -147,17 +137,16 @@ class Evaluation:
 
     @property
     def late(self) -> tuple[m.Diagnosis, ...]:
-        """Clock offsets by the measurements alone, beyond doubt, of robots not mirrored."""
+        """Significant clock offsets of robots that are not mirrored."""
         out = {each.robot for each in self.mirrored}
         found = (clock_cause(robot, of) for robot, of in self.lateness.items() if robot not in out)
         return tuple(filter(None, found))
 
     @property
     def diagnosis(self) -> tuple[m.Diagnosis, ...]:
-        """Causes of misfit: those of the map that the measurements alone do not exclude; mirrored
-        robots, and late clocks that the map does not determine, by the measurements alone.
+        """Causes of misfit of the map that the measurements do not exclude, and of these alone.
 
-        Of a mirrored robot nothing else is a cause; nor of the team where all robots are mirrored.
+        A mirrored robot has no other cause, nor has a team whose robots are all mirrored.
         """
         of_map = () if self.map is None else self.map.diagnosis
         found = {each.robot for each in self.mirrored}
@@ -175,9 +164,7 @@ class Evaluation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for every command that shows the result: robots missing from the map, causes of
-        misfit, the map's own warnings, times that do not overlap.
-        """
+        """Warnings for every command that shows the result."""
         causes = map(describe, self.diagnosis)
         return (*not_in_the_map(self.states), *causes, *self.other_warnings)
 
@@ -206,5 +193,5 @@ class Evaluation:
 
     @property
     def matched_by(self) -> str:
-        """Method that matched unnamed landmarks to true ones; may be empty."""
+        """Method that matched unnamed landmarks to true ones."""
         return "" if self.map is None or self.map.matching is None else str(self.map.matching)

@@ -1,4 +1,4 @@
-"""One robot in a log: poses, truth, and dispositions of its measurements."""
+"""One robot in a log: poses, truth, dispositions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ REJECTED = "rejected: "
 class RobotLog:
     """A robot's paths with covariances, and truth; each may be empty.
 
-    online_channel: "team/pose", "central/pose", "own/pose", or None. `online` has only poses in the
-    evaluated frame; outside: poses exist, but none in it.
+    online_channel: "team/pose", "central/pose", "own/pose", or None. outside: no pose is in the
+    evaluated frame.
     """
 
     truth: Path
@@ -40,8 +40,8 @@ class Consumption:
     """Measurements on a robot's sensor channels, and their dispositions.
 
     steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
-    `Done`, else None and empty. each_once: no measurement lies in two submaps, and the ledger sums
-    to consumed. gated: detections of used scans that their windows rejected as outliers.
+    `Done`. each_once: no measurement is in two submaps, and the ledger sums to consumed. gated:
+    detections that windows rejected as outliers.
     """
 
     steps: int
@@ -64,7 +64,7 @@ class Consumption:
 
     @property
     def used(self) -> int | None:
-        """Number of measurements in a submap or factor, or used as initial pose."""
+        """Number of measurements in the map, or used as initial pose."""
         if not self.ledger:
             return None
         return sum(self.ledger.values()) - sum(self.rejected.values())
@@ -76,7 +76,7 @@ class Consumption:
 
     @property
     def not_used(self) -> str:
-        """Counts of rejected and open measurements with reasons, as text."""
+        """Describe rejected and open measurements with reasons."""
         parts = [f"{count} rejected ({reason})" for reason, count in self.rejected.items()]
         return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
 
@@ -85,7 +85,7 @@ def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) ->
     """Collect one robot's paths; is_in_frame: whether a named frame is evaluated."""
     trajectories = log.messages(ch.TRAJECTORY, m.Trajectory, robot)
     truths = log.messages(ch.TRUTH, m.Truth, robot)
-    smoothed, smoothed_covariances = _stacked(
+    smoothed, smoothed_covariances = _stack_paths(
         [translate.trajectory_of(t) for t in trajectories],
         [floats(t.covariances, "covariances") for t in trajectories],
     )
@@ -97,12 +97,12 @@ def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) ->
         if estimates:
             online_channel, outside = channel, False
             break
-    online, online_covariances = _stacked(
+    online, online_covariances = _stack_paths(
         [(np.array([p.stamp_ns]), floats(p.pose, "pose").reshape(1, 3)) for p in estimates],
         [floats(p.covariance, "covariance") for p in estimates],
     )
     return RobotLog(
-        _stacked([translate.trajectory_of(t) for t in truths], [])[0],
+        _stack_paths([translate.trajectory_of(t) for t in truths], [])[0],
         smoothed,
         smoothed_covariances,
         online,
@@ -113,7 +113,7 @@ def robot_log(log: Collected, robot: str, is_in_frame: Callable[[str], bool]) ->
 
 
 def consumption(log: Collected, robot: str) -> Consumption:
-    """Measurements of one robot and their dispositions."""
+    """Count one robot's measurements by disposition."""
     dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, m.Done, robot)}
     submaps = {(s.incarnation, s.sequence): s for s in log.messages(ch.SUBMAP, m.Submap, robot)}
     ledger: dict[str, int] = {}
@@ -137,7 +137,6 @@ def consumption(log: Collected, robot: str) -> Consumption:
 
 
 def _disjoint(submaps: Sequence[m.Submap]) -> bool:
-    """Whether ordered submaps share no measurement."""
     return all(
         a.incarnation != b.incarnation or a.last_measurement < b.first_measurement
         for a, b in pairwise(submaps)
@@ -148,10 +147,9 @@ def _short(channel: ch.Channel) -> str:
     return channel.template.removeprefix("robot/{robot}/").removesuffix("/{robot}")
 
 
-def _stacked(
+def _stack_paths(
     parts: Sequence[tuple[np.ndarray, np.ndarray]], covariances: Sequence[np.ndarray]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """Stack parts into one path by stamp, keeping the last of equal stamps."""
     stamps = np.concatenate([np.empty(0, np.int64), *(stamps for stamps, _ in parts)])
     poses = np.concatenate([np.empty((0, 3)), *(poses for _, poses in parts)])
     order = np.argsort(stamps, kind="stable")

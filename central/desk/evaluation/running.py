@@ -12,6 +12,7 @@ from teamslam.central.desk.evaluation.errors import (
     PoseErrors,
     distance_rmse,
     interpolate_truth,
+    join_batches,
     pose_errors,
 )
 from teamslam.central.fused_map import START_POSES
@@ -27,18 +28,14 @@ KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}
 SPACING_NS = 100_000_000
 """Least spacing of compared estimates."""
 WAITING = 4_096
-"""Most poses per robot that await truth; the oldest are dropped."""
+"""Most poses per robot that await truth."""
 BATCHES = 20_000
 """Most truth batches kept per robot."""
 
 
 @dataclass
 class TruthFrames:
-    """Frames with truth: those fixed by a known initial pose or a survey.
-
-    Without initial poses every frame counts, as does a message without a frame (both from earlier
-    versions).
-    """
+    """Frames fixed by a known initial pose or a survey, which have truth; without any, all."""
 
     _starts: dict[str, bool] = field(default_factory=dict)
 
@@ -59,9 +56,8 @@ class TruthFrames:
 class MapFit(NamedTuple):
     """Unaligned map errors of the landmarks that have truth.
 
-    rmse_m: of positions. nees_per_dof: eᵀ P⁻¹ e / 2K with the covariance P that the map carries,
-    as in the report: joint, or of each landmark by itself; 1 if it is right. nees: of each landmark
-    in its own covariance, 2 degrees of freedom, for the coverage.
+    nees_per_dof: eᵀ P⁻¹ e / 2K with the map's covariance P. nees: of each landmark in its own
+    covariance.
     """
 
     rmse_m: float
@@ -121,7 +117,7 @@ class NeesTally:
     inside: int = 0
 
     def take(self, nees: Float[np.ndarray, " n"], dof: int) -> None:
-        """Add squared errors of `dof` degrees of freedom each."""
+        """Add NEES of `dof` degrees of freedom each."""
         self.nees_per_dof += float(nees.sum()) / dof
         self.count += len(nees)
         self.inside += int(np.count_nonzero(nees <= chi2_quantile(BAND, dof)))
@@ -196,19 +192,14 @@ class RunningErrors:
             self._poses.popleft()
 
     def forget_poses(self) -> None:
-        """Discard poses that await truth, before others replace them."""
+        """Discard poses that await truth."""
         self._poses.clear()
         self.last_ns = None
 
     def _path(self, until_ns: int) -> Path:
-        """Ordered truth up to the first batch that reaches beyond a time."""
         batches: list[Path] = []
         for batch in self._truth:
             batches.append(batch)
             if batch.stamps_ns[-1] > until_ns:
                 break
-        if not batches:
-            return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
-        times = np.concatenate([batch.stamps_ns for batch in batches])
-        times, first = np.unique(times, return_index=True)
-        return Path(times, np.concatenate([batch.poses for batch in batches])[first])
+        return join_batches(batches)

@@ -10,9 +10,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 
 State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
-"""joined: in the team's map. not joined: its map, if any, is separate. withdrawn: by an order, or
-since it contradicts the rest. lost: its stream is incomplete in the map. alone: the rule does not
-fuse.
+"""joined: in the team's map. not joined: its map, if any, is separate. withdrawn: by an order or a
+contradiction. lost: its stream is incomplete. alone: the rule does not fuse.
 """
 UNNAMED_REASON = "the log does not contain the reason"
 SAVED_MAP = "the saved map "
@@ -21,7 +20,7 @@ NO_MEMBER = "nothing of it is in the map"
 
 
 class RobotState(NamedTuple):
-    """Robot state in the final map, and the reason unless joined."""
+    """State in the final map, and the reason unless joined."""
 
     state: State
     why: str = ""
@@ -30,7 +29,7 @@ class RobotState(NamedTuple):
 def robot_states(
     log: Collected, fused: m.FusedMap | None, robots: Collection[str]
 ) -> dict[str, RobotState]:
-    """State of every robot, and of every saved map as `map-<name>`; empty without a final map."""
+    """State of every robot, and of every saved map as `map-<name>`."""
     if fused is None:
         return {}
     members = {member.robot for member in fused.members}
@@ -60,13 +59,12 @@ def robot_states(
 
 
 def _reason_in(fused: m.FusedMap, name: str) -> str:
-    """Reason for a robot's absence in a map of a rule other than `join`."""
     found = (each.partition(": ") for each in fused.reasons)
     return next((why for who, _, why in found if who == name), "")
 
 
 def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
-    """Robots not or incompletely in the map, with state, as text; saved maps need not be in it."""
+    """Describe robots not or incompletely in the map."""
     return tuple(
         f"{name} {of.state}{': ' if of.why else ''}{of.why}"
         for name, of in states.items()

@@ -1,10 +1,10 @@
 """Absolute and relative path errors, as defined by evo.
 
 Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012. `evo_ape` and
-`evo_rpe` give the same figures for files written by `teamslam.central.desk.export.tum`.
+`evo_rpe` give the same figures for files of `teamslam.central.desk.export.tum`.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,11 +22,11 @@ from teamslam.team.shapes import Float
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """RMS over poses with truth; radians; rigid alignment without scale.
+    """RMS over poses with truth [m], [rad]; rigid alignment without scale.
 
     ape_m, ape_rad: absolute, unaligned (evo: -r trans_part, angle_rad). ape_aligned_m,
-    ape_aligned_rad: after the best position alignment (evo: -a); None if undetermined. rpe_m,
-    rpe_rad: motion between consecutive poses (evo: --delta 1 --delta_unit f); None below two poses.
+    ape_aligned_rad: after the best position alignment (evo: -a). rpe_m, rpe_rad: motion between
+    consecutive poses (evo: --delta 1 --delta_unit f).
     """
 
     poses: int
@@ -37,10 +37,6 @@ class TrajectoryErrors:
     rpe_m: float | None
     rpe_rad: float | None
 
-    def to_json(self) -> dict[str, float | int | None]:
-        """By name."""
-        return asdict(self)
-
 
 def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
     """Poses of the path with truth, and the true poses at these stamps."""
@@ -50,7 +46,7 @@ def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
 
 
 def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
-    """Errors of a path; None without truth."""
+    """Compute the errors of a path; None without truth."""
     estimate, true = (each.poses for each in associate_truth(path, truth))
     if not len(estimate):
         return None

@@ -4,7 +4,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from teamslam.central.desk.evaluation.errors import Path, interpolate_truth, rigid_alignment
+from teamslam.central.desk.evaluation.errors import (
+    Path,
+    interpolate_truth,
+    join_batches,
+    rigid_alignment,
+)
 from teamslam.central.desk.evaluation.running import SPACING_NS, TrueLandmarks, TruthFrames
 from teamslam.team import translate
 from teamslam.team.shapes import Float
@@ -13,11 +18,10 @@ from teamslam.team.wire import messages as m
 
 @dataclass
 class TruthAlignment:
-    """Truth of a team, and map_from_truth of its maps.
+    """Truth of a team, and map_from_truth of its maps, as `evaluate` aligns the final map.
 
-    In a frame that neither a known initial pose nor a survey fixes, map_from_truth aligns the true
-    landmarks with those of the map, or without them the true with the smoothed paths, which the
-    final map has. `evaluate` aligns the final map in the same way.
+    In a frame that no known initial pose or survey fixes, it aligns the true landmarks with those
+    of the map, or else the true with the smoothed paths.
     """
 
     landmarks: TrueLandmarks = field(default_factory=TrueLandmarks)
@@ -26,7 +30,7 @@ class TruthAlignment:
     _smoothed: dict[tuple[str, int, int], Path] = field(default_factory=dict)
 
     def take(self, message: m.Message) -> None:
-        """Store initial poses, truth and smoothed paths; other messages have no effect."""
+        """Store initial poses, truth and smoothed paths."""
         match message:
             case m.InitialPose():
                 self.frames.take(message)
@@ -47,7 +51,7 @@ class TruthAlignment:
     def map_from_truth(self, fused: m.FusedMap | None) -> Float[np.ndarray, "3"] | None:
         """Rigid motion (x [m], y [m], theta [rad]); None if undetermined.
 
-        fused: the map; None or without landmarks: the frame is that of the initial poses.
+        Without landmarks the frame is that of the initial poses.
         """
         if fused is None or not fused.ids:
             return None if self.frames.none_is_known else np.zeros(3)
@@ -61,16 +65,9 @@ class TruthAlignment:
     def _align_paths(self) -> Float[np.ndarray, "3"] | None:
         places, true_places = [np.empty((0, 2))], [np.empty((0, 2))]
         for (robot, _, _), path in self._smoothed.items():
-            poses, known = interpolate_truth(self._path(robot), path.stamps_ns)
+            poses, known = interpolate_truth(
+                join_batches(self._truth.get(robot, [])), path.stamps_ns
+            )
             places.append(path.poses[known, :2])
             true_places.append(poses[known, :2])
         return rigid_alignment(np.concatenate(places), np.concatenate(true_places))
-
-    def _path(self, robot: str) -> Path:
-        batches = self._truth.get(robot, [])
-        if not batches:
-            return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
-        stamps, first = np.unique(
-            np.concatenate([each.stamps_ns for each in batches]), return_index=True
-        )
-        return Path(stamps, np.concatenate([each.poses for each in batches])[first])

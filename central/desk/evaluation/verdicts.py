@@ -1,4 +1,4 @@
-"""Operator verdicts on pairs of unnamed landmarks, and their effect on the map."""
+"""Operator verdicts on pairs of unnamed landmarks."""
 
 from collections.abc import Collection
 
@@ -19,7 +19,7 @@ def name_of(landmark: m.LocalLandmark) -> str:
     return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
 
 
-def in_words(judgement: m.Judgement) -> str:
+def describe_verdict(judgement: m.Judgement) -> str:
     """Verdict as text."""
     first, second = name_of(judgement.first), name_of(judgement.second)
     return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
@@ -30,8 +30,7 @@ def contradicting(
 ) -> tuple[m.Judgement, ...]:
     """Smallest set of other verdicts that contradicts a verdict; empty if consistent.
 
-    A chain of "same" verdicts (possibly with this one), and last the "different" verdict on its
-    ends.
+    A chain of "same" verdicts, and last the "different" one on its ends.
     """
     pair = pair_of(judgement)
     same = [each for each in others if each.same and pair_of(each) != pair]
@@ -52,7 +51,6 @@ def contradicting(
 def _chain(
     first: m.LocalLandmark, last: m.LocalLandmark, same: Collection[m.Judgement]
 ) -> list[m.Judgement] | None:
-    """Shortest chain of "same" verdicts between two landmarks."""
     chains: dict[m.LocalLandmark, list[m.Judgement]] = {first: []}
     reached = [first]
     for at in reached:  # grows during the loop
@@ -66,7 +64,7 @@ def _chain(
 
 
 def verdicts_given(log: Collected) -> tuple[str, ...]:
-    """Verdicts of a log as text, in order."""
+    """Describe the verdicts of a log, in order."""
     keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
@@ -77,7 +75,7 @@ def verdicts_given(log: Collected) -> tuple[str, ...]:
 
 def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     judgement = verdict.judgement
-    text = in_words(judgement) + (f": {verdict.reason}" if verdict.reason else "")
+    text = describe_verdict(judgement) + (f": {verdict.reason}" if verdict.reason else "")
     if verdict.withdrawn:
         return f"{text} (withdrawn)"
     holds = any(
@@ -89,5 +87,5 @@ def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     if judgement.same and len(chain) == 1:
         return f"{text} (without effect: another verdict has them as two)"
     if len(chain) > 1:
-        return f"{text} (contradicted: {', '.join(map(in_words, chain))}; two they stay)"
+        return f"{text} (contradicted: {', '.join(map(describe_verdict, chain))}; two they stay)"
     return text

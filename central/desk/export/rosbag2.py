@@ -1,8 +1,7 @@
 """Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
-Each robot's dead-reckoned odometry with odom → base on the transform topic, the messages of
-`teamslam.team.ros2_answers`, and the smoothed path as stamped poses, which evo reads. Log times
-are team time.
+Dead-reckoned odometry with odom → base, the messages of `teamslam.team.ros2_answers`, and the
+smoothed path as stamped poses. Log times are team time.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from teamslam.central.desk.paths import smoothed_paths
-from teamslam.central.desk.verification.recorded import RerunError, recorded
+from teamslam.central.desk.verification.recorded import RerunError, index_log
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.recording.reader import Log, LogError
@@ -39,8 +38,6 @@ ODOMETRY_HZ = 50.0
 
 
 class _Robot:
-    """Dead reckoning and ROS 2 answers of one robot."""
-
     def __init__(self, name: str) -> None:
         self.config: RobotConfig | None = None
         frames = {"odometry_frame": f"{name}/odom", "base_frame": f"{name}/base_link"}
@@ -51,7 +48,6 @@ class _Robot:
         self._written_ns = -(2**62)
 
     def drive(self, message: m.AnyOdometry) -> Iterator[Answer]:
-        """Odometry pose after an interval, at most ODOMETRY_HZ."""
         if self.config is None:
             return
         if message.incarnation != self.incarnation:
@@ -72,7 +68,7 @@ class _Robot:
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
-    """ROS 2 messages of a log, in log order; then the smoothed poses."""
+    """Convert a log to ROS 2 messages, in log order; then the smoothed poses."""
     robots: dict[str, _Robot] = {}
     team = Answers(Names(TEAM_SPACE))
     final = False
@@ -93,13 +89,12 @@ def answers_of(log: Log) -> Iterator[Answer]:
                 continue
             final |= is_final
             yield from team.convert(message)
-    with suppress(RerunError):  # a log without what recomputation needs
+    with suppress(RerunError):  # a log without an input of the recomputation
         yield from _smoothed(log)
 
 
 def _smoothed(log: Log) -> Iterator[Answer]:
-    """Poses of every robot's smoothed path, at keyframe rate."""
-    for robot, path in smoothed_paths(recorded(log)).items():
+    for robot, path in smoothed_paths(index_log(log)).items():
         names = Names(f"/{robot}")
         for stamp_ns, (x, y, theta), P in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), path.covariances, strict=True
@@ -112,7 +107,7 @@ def _smoothed(log: Log) -> Iterator[Answer]:
 def export_rosbag2(
     log: Log, folder: Path, progress: Callable[[int], None] = lambda _: None
 ) -> dict[str, int]:
-    """Write a bag (MCAP) into a new folder; returns message counts by topic.
+    """Write a bag (MCAP) into a new folder; return message counts by topic.
 
     Raises LogError for a log without odometry or poses.
     """

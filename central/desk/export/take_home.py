@@ -1,8 +1,6 @@
 """Write a run's map and paths as tables in common formats.
 
-`map.csv` and `map.json` have one landmark per row, `paths/<robot>.csv` and `.tum` one pose. Metres,
-seconds, radians, in the frame that the map names; numbers have all digits. With a datum each
-landmark has latitude and longitude, too, and `map.geojson` has landmarks and paths (RFC 7946).
+Metres, seconds, radians, in the frame that the map names; numbers have all digits.
 """
 
 import csv
@@ -51,9 +49,9 @@ PATH_COLUMNS = (
 
 @dataclass(frozen=True)
 class TakenHome:
-    """Robots' smoothed paths, measurement counts of the landmarks in the log, and the datum of the
-    final map's frame, if there is one. classes: name and probability of a landmark's likeliest
-    class, where detections have classes.
+    """Contents of the tables besides the final map.
+
+    measurements: count by landmark. classes: name and probability of a landmark's likeliest class.
     """
 
     paths: Mapping[str, SmoothedPath]
@@ -63,7 +61,7 @@ class TakenHome:
 
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
-    """Paths at keyframe rate and measurement counts; `progress` receives each robot's name."""
+    """Compute paths at keyframe rate and counts; progress receives each robot's name."""
     counts, classes = measurement_counts(found), landmark_classes(found)
     return TakenHome(smoothed_paths(found, progress), counts, _datum(found), classes)
 
@@ -71,7 +69,7 @@ def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None)
 def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
     """Name (else number) and probability of the likeliest class of each unnamed landmark.
 
-    P(c) ∝ Π P(reports | c) over its submaps' landmarks, for classes that are equally frequent.
+    P(c) ∝ Π P(reports | c) over its submaps' landmarks, for equally frequent classes.
     """
     config = None if "central" not in found.configured else found.central_config()[0]
     names = () if config is None else config.classes
@@ -118,7 +116,7 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
 
 
 def _members(found: Recorded) -> Iterator[tuple[Member, int]]:
-    """The submaps' landmarks that are in the final map, each with its number there."""
+    """Submap landmarks in the final map, each with its number there."""
     for fused in found.of(ch.FINAL_MAP)[-1:]:
         assert isinstance(fused, m.FusedMap)
         for of in fused.memberships:
@@ -142,11 +140,10 @@ def write_map(
     datum: Datum | None = None,
     classes: Mapping[int, tuple[str, float]] = NO_CLASSES,
 ) -> list[FilePath]:
-    """Write map.csv and map.json, with latitude and longitude given a datum, and with classes where
-    there are some; returns the files.
+    """Write map.csv and map.json; return the files.
 
-    Covariances are 2 × 2 blocks; correlations between landmarks are in the log. The count of an
-    unnamed landmark is absent if no submap reports it.
+    Covariances are 2 × 2 blocks. The count of an unnamed landmark is absent if no submap reports
+    it.
     """
     rows: list[dict[str, Any]] = []
     blocks = landmark_blocks(fused.covariance)
@@ -185,8 +182,9 @@ def write_map(
 def write_geojson(
     fused: MapResult, paths: Mapping[str, SmoothedPath], folder: FilePath, datum: Datum
 ) -> FilePath:
-    """Write map.geojson: a point for each landmark, with sigma_m, the larger semi-axis of its
-    1 sigma ellipse, and a line for each path; returns the file.
+    """Write map.geojson (RFC 7946): landmarks as points, paths as lines; return the file.
+
+    sigma_m: larger semi-axis of the 1 sigma ellipse.
     """
     places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
     sigmas = np.sqrt(np.linalg.eigvalsh(landmark_blocks(fused.covariance))[:, 1]).tolist()
@@ -210,7 +208,7 @@ def _feature(kind: str, at: list[Any], properties: Mapping[str, Any]) -> dict[st
 
 
 def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[FilePath]:
-    """Write <robot>.csv and <robot>.tum; returns the files."""
+    """Write <robot>.csv and <robot>.tum; return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for robot, path in paths.items():

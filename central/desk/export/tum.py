@@ -1,6 +1,6 @@
-"""Paths in the TUM format, as read by evo and most trajectory tools.
+"""Paths in the TUM format of evo and other trajectory tools.
 
-One pose a line, `timestamp tx ty tz qx qy qz qw`: seconds, metres, a unit quaternion.
+One pose per line, `timestamp tx ty tz qx qy qz qw`: seconds, metres, a unit quaternion.
 https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 """
 
@@ -18,7 +18,7 @@ KINDS = ("smoothed", "online")
 
 
 def write_tum(path: Path, file: FilePath) -> None:
-    """Write a planar path (z = 0), with nanosecond stamps and poses with all digits."""
+    """Write a planar path (z = 0) with all digits."""
     half = 0.5 * path.poses[:, 2]
     with file.open("w", encoding="ascii", newline="\n") as lines:
         lines.write("# timestamp tx ty tz qx qy qz qw\n")
@@ -35,10 +35,10 @@ def seconds(stamp_ns: int) -> str:
 
 
 def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
-    """Write every robot's paths; returns the files.
+    """Write r1.smoothed.tum, r1.online.tum and r1.truth.tum of every robot; return the files.
 
-    r1.smoothed.tum, r1.online.tum, r1.truth.tum; with truth, r1.smoothed.truth.tum and
-    r1.online.truth.tum hold the true poses at the path's stamps.
+    With truth, r1.smoothed.truth.tum and r1.online.truth.tum hold the true poses at the path's
+    stamps.
     """
     written = []
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,10 +55,7 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
 
 
 def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
-    """Write every robot's paths in the TUM format; returns the files.
-
-    Raises `LogError` for a log without a path.
-    """
+    """Write every robot's paths; return the files. Raises LogError without a path."""
     written = write_trajectories(evaluate(log.samples()), folder)
     if not written:
         remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"

@@ -1,4 +1,4 @@
-"""Draw a run as an animated GIF: robots, their paths so far, and the map as it grows."""
+"""Draw a run as an animated GIF."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
@@ -23,12 +23,12 @@ if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
 FRAMES, LAST_FRAMES, PER_S = 90, 20, 12
-"""Frames of the run, frames that show its result, and frames per second."""
+"""Frames of the run, of its result, and per second."""
 SIZE_IN, DPI = 5.0, 96
 
 
 class MapAt(NamedTuple):
-    """A map of the running team: team time, landmarks, their own covariances."""
+    """A map of the running team: team time [ns], landmarks, covariances."""
 
     stamp_ns: int
     means: Float[np.ndarray, "L 2"]
@@ -36,7 +36,7 @@ class MapAt(NamedTuple):
 
 
 def maps_over_time(maps: Iterable[m.FusedMap]) -> list[MapAt]:
-    """Maps by team time."""
+    """Sort maps by team time."""
     found = [
         MapAt(each.stamp_ns, translate.landmarks_of(each)[1], translate.landmark_blocks_of(each))
         for each in maps
@@ -45,11 +45,7 @@ def maps_over_time(maps: Iterable[m.FusedMap]) -> list[MapAt]:
 
 
 def draw_film(evaluation: Evaluation, maps: Sequence[MapAt], path: FilePath) -> bool:
-    """Write the GIF; False without a final map or poses.
-
-    Online paths grow with the maps that the team had at the time; the last frames show the final
-    map with the smoothed paths. Ellipses have the factor of the map picture.
-    """
+    """Write the GIF of online paths, then the final map; False without a map."""
     from matplotlib.animation import PillowWriter
 
     evaluation = in_the_maps_frame(evaluation)

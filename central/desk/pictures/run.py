@@ -37,17 +37,15 @@ DRAWN_ROBOTS = 12
 DRAWN_POINTS = 4000
 """Most points of a line; longer paths are thinned."""
 DRAWN_ERRORS = 1200
-"""Most points of a panel of errors, which has some 500 pixels."""
+"""Most points of a panel of errors."""
 DRAWN_BARS = 60
-"""Most error bars, evenly spaced; more would hide the online poses."""
+"""Most error bars."""
 LABELLED_LANDMARKS = 60
 MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 SAME_M = 1e-9
 """Distance of equal points [m]."""
 LEAST_SHARE = 0.01
-"""Least share of the map's extent of a drawn ellipse's median semi-axis; smaller ones are
-magnified.
-"""
+"""Least share of the map's extent of a drawn ellipse's median semi-axis."""
 
 
 def map_picture(
@@ -90,7 +88,7 @@ def map_picture(
 
 
 def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
-    """Move the truth into an arbitrary map frame by the alignment of landmarks or paths."""
+    """Move the truth into an arbitrary map frame."""
     fused, motion = evaluation.map, evaluation.truth_from_map
     if not evaluation.arbitrary_frame or fused is None or motion is None:
         return evaluation
@@ -110,10 +108,7 @@ def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 
 
 def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
-    """Draw errors of x, y and heading over team time with ±3σ.
-
-    False without truth, or for an arbitrary map frame, whose errors need alignment.
-    """
+    """Draw errors of x, y and heading over team time with ±3σ; False without truth."""
     if evaluation.arbitrary_frame:
         return False
     shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
@@ -159,7 +154,7 @@ def new_figure(
 
 
 def set_up_map(axis: "Axes") -> None:
-    """Equal scales, labels in metres and a faint grid."""
+    """Set equal scales, labels in metres and a faint grid."""
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
@@ -180,8 +175,7 @@ def _draw_paths(
 ) -> None:
     """Draw the true path with its start, and the smoothed or else the online path.
 
-    apart: other robots have smoothed paths and this one has none, so its online path is not in the
-    map frame and is omitted.
+    apart: the online path is not in the map frame, so it is omitted.
     """
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
@@ -208,9 +202,9 @@ def _draw_paths(
 
 
 def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
-    """Draw ellipses, and true landmarks; both magnified about the estimates if they are small.
+    """Draw ellipses and true landmarks, both magnified about the estimates if they are small.
 
-    An ellipse contains its landmark's truth as drawn if and only if it does so in scale.
+    A magnified ellipse contains its landmark's truth if and only if the true ellipse does.
     """
     truth, fused = evaluation.true_landmarks, evaluation.map
     has_map = fused is not None and len(fused.ids) > 0
@@ -250,7 +244,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
 
 
 def magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) -> int:
-    """Factor at which the median ellipse is visible on a map of this extent."""
+    """Factor at which the median ellipse is visible."""
     assert evaluation.map is not None
     paths = [each.smoothed_path.poses[:, :2] for each in evaluation.robots.values()]
     extent = float(np.ptp(np.vstack([evaluation.map.means, *paths]), axis=0).max())
@@ -262,7 +256,6 @@ def magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) ->
 def _magnified_truth(
     truth: Float[np.ndarray, "T 2"], fused: MapResult, times: int
 ) -> Float[np.ndarray, "T 2"]:
-    """True landmarks at `times` their distance from the estimates; others in place."""
     means, matched = fused.means[fused.known], fused.truth[fused.known]
     kept = [p for p in truth if np.hypot(*(matched - p).T).min(initial=np.inf) > SAME_M]
     moved = means + times * (matched - means)
@@ -270,10 +263,7 @@ def _magnified_truth(
 
 
 def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """Label offset of each point [typographic points], away from its neighbours.
-
-    Neighbours lie within a twentieth of the map's extent; without any, offset to the upper right.
-    """
+    """Label offset of each point [typographic points], away from its neighbours."""
     reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
     offsets = np.empty_like(points)
     for i, point in enumerate(points):
@@ -318,7 +308,6 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
 
 
 def _fit(axis: "Axes", errors: Float[np.ndarray, " n"], bound: float) -> None:
-    """Limit the axis to all but one error in 500, and annotate the number outside."""
     most = float(errors.max(initial=0.0))
     limit = 1.1 * max(bound, float(np.quantile(errors, 0.998)) if len(errors) else 0.0)
     if most <= 1.5 * limit:
@@ -343,7 +332,7 @@ def _thinned(path: Path) -> Path:
 
 
 def thinning(count: int, most: int = DRAWN_POINTS) -> slice:
-    """Slice that leaves at most about this many points."""
+    """Slice that leaves about this many points."""
     return slice(None, None, max(1, count // most))
 
 

@@ -34,7 +34,7 @@ def parsed_width(text: str) -> float:
 
 
 class Form(StrEnum):
-    """The file format of a picture."""
+    """File format of a picture."""
 
     PNG = "png"
     SVG = "svg"
@@ -42,7 +42,7 @@ class Form(StrEnum):
 
 
 class Picture(StrEnum):
-    """The pictures of a report."""
+    """Pictures of a report."""
 
     MAP = "map"
     ERRORS = "errors"
@@ -58,9 +58,9 @@ class Look(StrEnum):
 
 @dataclass(frozen=True)
 class Style:
-    """Style and format of a report's pictures; only: the one picture drawn; vectors: SVG, too.
+    """Style and format of a report's pictures.
 
-    width_in: paper width [inches]; None: COLUMN_IN, or TEXT_IN for several panels.
+    only: the one picture drawn. width_in: paper width [inches]. vectors: SVG, too.
     """
 
     look: Look = Look.SCREEN
@@ -70,7 +70,7 @@ class Style:
     vectors: bool = False
 
     def file_name(self, picture: Picture) -> str:
-        """File name of a picture; differs between paper and page."""
+        """File name of a picture."""
         paper = "-paper" if self.look is Look.PAPER and self.form is Form.PNG else ""
         return f"{picture}{paper}.{self.form}"
 
@@ -82,7 +82,7 @@ class Style:
 
 SCREEN = Style()
 PAGE = Style(vectors=True)
-"""Screen pictures, and beside each the same as SVG for the page."""
+"""Screen pictures, with SVG for the page."""
 _current: ContextVar[Style] = ContextVar("style", default=SCREEN)
 
 
@@ -105,9 +105,7 @@ def drawn_in(style: Style) -> Iterator[None]:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a picture in its suffix's format; for paper without titles, in its width, with text in
-    PAPER_PT.
-    """
+    """Write a picture in its suffix's format; on paper without titles."""
     style = _current.get()
     if style.look is not Look.PAPER:
         figure.savefig(path, dpi=DPI)
@@ -123,10 +121,7 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def _resize(figure: "Figure", width_in: float | None) -> None:
-    """Scale a figure to a width: lines and markers shrink, text has PAPER_PT.
-
-    Point labels are smaller. In a column, legends lie below their axes, and panels have no titles.
-    """
+    """Scale a figure to a width: lines and markers shrink, text has PAPER_PT, labels POINT_PT."""
     from matplotlib.lines import Line2D
     from matplotlib.text import Annotation, Text
 

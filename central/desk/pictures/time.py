@@ -31,12 +31,12 @@ LOGARITHMIC_FROM = 12.0
 """NEES from which the axis is logarithmic."""
 
 
-def binned(
+def sum_in_bins(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
     """Sum each value over the BINS intervals of the run; empty intervals are omitted.
 
-    Returns interval middles [s] and sums; values outside the run count at its ends.
+    Returns interval middles [s] and sums.
     """
     edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
     at = np.searchsorted(edges, history.seconds(stamps_ns), "right")
@@ -86,7 +86,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         if robot.online is None or evaluation.arbitrary_frame:
             continue
         nees, ones = robot.online.nees / 3.0, np.ones(len(robot.online.nees))
-        centres, (sums, counts) = binned(history, robot.online.stamps_ns, nees, ones)
+        centres, (sums, counts) = sum_in_bins(history, robot.online.stamps_ns, nees, ones)
         axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=labels[name])
         largest = max(largest, float((sums / counts).max()))
     of_map = history.map_nees
@@ -105,7 +105,7 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     largest, lows, highs = 0.0, [], []
     colours, labels = robot_colours(evaluation.robots), robot_labels(history.innovations)
     for name, of in history.innovations.items():
-        centres, (squared, dof) = binned(
+        centres, (squared, dof) = sum_in_bins(
             history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
         )
         measured: Bool[np.ndarray, " b"] = dof > 0

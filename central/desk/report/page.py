@@ -1,4 +1,4 @@
-"""Write the report as a folder: a self-contained page, pictures, figures."""
+"""Write the report: a self-contained page, pictures, figures."""
 
 import base64
 import json
@@ -68,7 +68,7 @@ pre { overflow-x: auto; background: #f6f6f6; padding: .6rem; font-size: .85rem; 
 
 
 def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
-    """Draw a run's pictures; returns the non-empty ones by name."""
+    """Draw a run's pictures; return the non-empty ones by name."""
     evaluation, history = run.evaluation, run.history
     draw: dict[Picture, Callable[[Path], bool]] = {
         Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
@@ -82,10 +82,9 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
 
 
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
-    """Write report.html, report.json, pictures and trajectories; returns the files.
+    """Write report.html, report.json, pictures and trajectories; return the files.
 
-    figures: of the evaluation and the run. Empty pictures are omitted. Beside each picture lies the
-    vector picture of the page.
+    figures: of the evaluation and the run.
     """
     directory.mkdir(parents=True, exist_ok=True)
     pictures = write_pictures(run, directory, PAGE)
@@ -135,13 +134,12 @@ def _page(
     return (
         f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n{_made(run)}\n<nav>{links}</nav>\n"
+        f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n{_describe_origin(run)}\n<nav>{links}</nav>\n"
         f"{_table((), team_rows(evaluation), words=True)}\n{notes}\n{body}\n</html>\n"
     )
 
 
-def _made(run: Run) -> str:
-    """When and by which version the run was recorded; when and how the report was made."""
+def _describe_origin(run: Run) -> str:
     by = run.provenance.get("version.teamslam")
     at_ns = run.evaluation.recorded_ns
     recorded = "" if at_ns is None else f"Recorded on {_date(at_ns * 1e-9)}"
@@ -156,7 +154,6 @@ def _date(seconds: float) -> str:
 
 
 def _landmarks(run: Run) -> list[str]:
-    """Association scores, changes against saved maps, and decisions on unnamed landmarks."""
     evaluation = run.evaluation
     parts = [] if evaluation.association is None else [score_sheet(evaluation.association)]
     changes = () if evaluation.map is None else evaluation.map.changes
@@ -220,7 +217,6 @@ def _traffic(run: Run) -> list[str]:
 
 
 def _origin(run: Run) -> list[str]:
-    """Log metadata; long values are collapsed."""
     short = {k: v for k, v in run.provenance.items() if len(v) <= 80}
     first = [(k, short[k]) for k in _ORIGIN if k in short]
     rest = [(k, v) for k, v in sorted(short.items()) if k not in _ORIGIN]

@@ -1,7 +1,7 @@
 """Contents of a run's report, and its figures for JSON."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,8 @@ from teamslam.central.desk.paths import SmoothedPath
 class Run:
     """A run from its log.
 
-    provenance: log metadata. ledger: result of `verify-ledger`; None if not requested, or without
-    its inputs (`no_ledger`). taken_home: keyframe paths and counts, if requested. command: the
-    command line that made the report.
+    ledger: None if not requested, or without inputs (`no_ledger`). taken_home: keyframe paths and
+    counts.
     """
 
     evaluation: Evaluation
@@ -37,7 +36,7 @@ class Run:
         return {} if self.taken_home is None else self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
-        """Errors by robot and kind of path ("smoothed", "online"), where truth exists."""
+        """Errors by robot and kind of path ("smoothed", "online")."""
         found: dict[str, dict[str, TrajectoryErrors]] = {}
         for name, robot in self.evaluation.robots.items():
             for kind, path in (("smoothed", robot.smoothed_path), ("online", robot.online_path)):
@@ -55,7 +54,7 @@ def nis_line(history: History) -> str | None:
 
 
 def run_figures(run: Run) -> dict[str, Any]:
-    """Figures that a report adds to an evaluation; radians, seconds."""
+    """Figures that a report adds to an evaluation."""
     history, ledger = run.history, run.ledger
     span_s = (history.end_ns - history.start_ns) * 1e-9
     return {
@@ -74,7 +73,7 @@ def run_figures(run: Run) -> dict[str, Any]:
             for key, traffic in run.evaluation.channels.items()
         },
         "trajectories": {
-            robot: {kind: errors.to_json() for kind, errors in of.items()}
+            robot: {kind: asdict(errors) for kind, errors in of.items()}
             for robot, of in run.trajectories().items()
         },
         "events": [

@@ -38,7 +38,7 @@ class Sheet(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Column of figures: heading, path of attributes, format, factor to the unit shown, unit."""
+    """Column of figures: heading, path of attributes, format, factor to the shown unit."""
 
     heading: str
     path: str
@@ -51,14 +51,14 @@ DEGREES = degrees(1.0)
 
 
 def format_figure(value: float | str | None, form: str, unit: str = "", factor: float = 1) -> str:
-    """Format a number with its unit; a dash for None; text as it is."""
+    """Format a number with its unit; a dash for None."""
     if value is None or isinstance(value, str):
         return value or "–"
     return f"{factor * value:{form}}{unit}"
 
 
 def cells(of: object, columns: Sequence[Column]) -> tuple[str, ...]:
-    """Figures of an object in these columns."""
+    """Format figures of an object in these columns."""
     return tuple(format_figure(figure(of, c.path), c.form, c.unit, c.factor) for c in columns)
 
 
@@ -68,7 +68,7 @@ def headings(first: str, columns: Sequence[Column]) -> tuple[str, ...]:
 
 
 def comparable(evaluation: Evaluation, robot: RobotResult) -> RobotResult:
-    """Robot without the errors that an arbitrary frame makes meaningless."""
+    """Robot without the errors that are meaningless in an arbitrary frame."""
     return replace(robot, smoothed=None, online=None) if evaluation.arbitrary_frame else robot
 
 
@@ -87,7 +87,7 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def terminal_table(sheet: Sheet) -> Table:
-    """Compact table; long cells wrap, since a truncated number is wrong."""
+    """Compact table with wrapped cells."""
     table = Table(caption=sheet.note or None, box=box.SIMPLE, padding=(0, 1, 0, 0))
     for heading in sheet.headings:
         side: JustifyMethod = "left" if heading in LEFT else "right"
@@ -111,7 +111,7 @@ PEER_NOTE = (
 
 
 def peer_sheet(evaluation: Evaluation) -> Sheet:
-    """SHA-256 of each robot's final map, its part of the set, and traffic."""
+    """Each robot's final map, part of the set, and traffic."""
     rows = []
     for name, peer in evaluation.peers.items():
         star = format_figure(figure(evaluation.robots.get(name), "uplink_bytes"), ",.0f")
@@ -152,7 +152,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
         ]
         if not arbitrary:
             absurd = errors.nees_per_dof > ABSURD_NEES
-            nees = _absurd(evaluation) if absurd else in_words(errors, joint=fused.joint)
+            nees = _absurd(evaluation) if absurd else describe_nees(errors, joint=fused.joint)
             rows.append(("map NEES per dof", nees))
         shape = errors.shape
         if shape is not None:
@@ -190,7 +190,7 @@ def _without_truth(evaluation: Evaluation) -> str:
 
 
 def state_rows(evaluation: Evaluation) -> Rows:
-    """State of every robot in the final map; joined robots share a row."""
+    """State of every robot in the final map."""
     states = evaluation.states
     joined = [
         name for name, of in states.items() if of.state == "joined" and not name.startswith(MAP)
@@ -212,7 +212,7 @@ LISTED = 5
 
 
 def change_words(changes: Sequence[m.LandmarkChange]) -> str:
-    """Summarise what has changed since the saved maps: `1 moved (7: +0.50, -0.25 ± 0.02 m)`."""
+    """Summarise changes since the saved maps, such as `1 moved (7: +0.50, -0.25 ± 0.02 m)`."""
     parts = []
     for state in CHANGES:
         found = [each for each in changes if each.state == state]
@@ -231,7 +231,7 @@ def change_words(changes: Sequence[m.LandmarkChange]) -> str:
 
 
 def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
-    """Table of the landmarks that have changed since the saved maps."""
+    """Landmarks that have changed since the saved maps."""
     rows = [
         (str(each.landmark), each.state)
         + (
@@ -251,8 +251,8 @@ def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
     return Sheet(headings, rows, note)
 
 
-def in_words(errors: MapErrors, *, joint: bool) -> str:
-    """Map NEES and whether chance explains it; `joint`: of the joint covariance."""
+def describe_nees(errors: MapErrors, *, joint: bool) -> str:
+    """Describe the map NEES and whether chance explains it; joint: of the joint covariance."""
     kind = "joint" if joint else "blocks only"
     band = f"95 % of {errors.band_text} ({kind})"
     if errors.in_band:
@@ -266,7 +266,6 @@ def in_words(errors: MapErrors, *, joint: bool) -> str:
 
 
 def _association_rows(evaluation: Evaluation) -> Rows:
-    """Association scores of a run with unnamed landmarks, given labels or GPS."""
     found, gps_m = evaluation.association, evaluation.gps_median_m
     rows = [] if gps_m is None else [("distance from GPS", f"{gps_m:.2f} m, median of the paths")]
     if found is None:
@@ -298,7 +297,6 @@ def _association_rows(evaluation: Evaluation) -> Rows:
 
 
 def _absurd(evaluation: Evaluation) -> str:
-    """Text that replaces a very large NEES, with the probable cause."""
     scenario = evaluation.scenario
     again = scenario is not None and scenario.fusion in _COUNT_AGAIN
     why = " (measurements counted again)" if again else ""
@@ -319,11 +317,15 @@ def _robot_note(evaluation: Evaluation) -> str:
         if robot.consumption.not_used
     ]
     more = f"; … and {len(left_out) - NOTED} robots more" if len(left_out) > NOTED else ""
-    return words + "".join(f"; {each}" for each in left_out[:NOTED]) + more + _gated(evaluation)
+    return (
+        words
+        + "".join(f"; {each}" for each in left_out[:NOTED])
+        + more
+        + _describe_gated(evaluation)
+    )
 
 
-def _gated(evaluation: Evaluation) -> str:
-    """Count of the detections that windows rejected, and the robots with the most."""
+def _describe_gated(evaluation: Evaluation) -> str:
     counts = {name: robot.consumption.gated for name, robot in evaluation.robots.items()}
     most = sorted(filter(counts.get, counts), key=lambda name: -counts[name])
     listed = ", ".join(f"{name} {counts[name]:,}" for name in most[:NOTED])
@@ -333,7 +335,7 @@ def _gated(evaluation: Evaluation) -> str:
 
 
 NOTED = 5
-"""Most robots whose unused measurements are named below the table."""
+"""Most robots named below the table."""
 ROBOT_HEADINGS = (
     "robot", "steps", "measure-\nments\nused", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
@@ -341,7 +343,7 @@ ROBOT_HEADINGS = (
 
 
 def robot_sheet(evaluation: Evaluation) -> Sheet:
-    """Measurements and errors of each robot; in an arbitrary frame, aligned errors only."""
+    """Measurements and errors of each robot."""
     rows = []
     for name, robot in evaluation.robots.items():
         used, shown = robot.consumption, comparable(evaluation, robot)
@@ -380,9 +382,7 @@ PATH_NOTE = (
 
 
 def path_sheet(evaluation: Evaluation) -> Sheet:
-    """Position errors, NEES and coverage of smoothed and online paths; in an arbitrary frame,
-    aligned errors only.
-    """
+    """Errors, NEES and coverage of paths."""
     rows = []
     for name, robot in evaluation.robots.items():
         row = [name, *cells(comparable(evaluation, robot), _PATH)]
@@ -409,7 +409,7 @@ def is_unfused(evaluation: Evaluation) -> bool:
 
 
 def own_sheet(evaluation: Evaluation) -> Sheet:
-    """Errors, NEES with band, and coverage of every robot's own map."""
+    """Errors, NEES and coverage of every robot's own map."""
     rows = [(name, *cells(robot, _OWN)) for name, robot in evaluation.robots.items()]
     return Sheet(headings("robot", _OWN), rows, OWN_NOTE)
 
@@ -435,7 +435,7 @@ _ONLINE = (
 
 
 def consistency_sheet(run: Run) -> Sheet:
-    """Consistency of the covariances: NEES and coverage with truth, otherwise NIS and cost."""
+    """Consistency: NEES and coverage with truth, else NIS and cost."""
     evaluation, innovations = run.evaluation, run.history.innovations
     cost, scale = evaluation.cost_by_robot, evaluation.scale_by_robot
     rows = []
@@ -515,7 +515,7 @@ PSS_NOTE = (
 
 
 def process_sheet(processes: Mapping[str, Mapping[str, float | None]]) -> Sheet:
-    """Resources of each launched process, which are not in the log."""
+    """Resources of each launched process."""
     rows = [
         (
             name,
@@ -572,7 +572,7 @@ DECISIONS = 200
 
 
 def decision_sheet(decisions: Sequence[m.AssociationDecision]) -> Sheet:
-    """One row per closure and merge: accepted and undone ones, newest first, then pending ones."""
+    """Closures and merges: newest first, then pending ones."""
     made = [each for each in decisions if each.kind != "waits"]
     waits = [each for each in decisions if each.kind == "waits"]
     rows = [

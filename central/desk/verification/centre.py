@@ -1,8 +1,6 @@
 """Recompute the centre's messages: each recorded map from the inputs that it names.
 
-Submap maps come from the centre's own fold (`teamslam.central.submap_fold`) over a store with the
-named submaps. Centres of comparison methods recompute their own maps
-(`teamslam.sim.studies.rules`). Fields without a named input are copied from the recorded map.
+Centres of comparison methods recompute their own maps. Fields without a named input are copied.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,12 +24,12 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
 
-def recomputed_centre(log: Recorded) -> dict[Identity, m.Message]:
+def recompute_centre(log: Recorded) -> dict[Identity, m.Message]:
     """Recompute messages from the inputs of the recorded maps, by input names."""
     finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
     maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
     found: dict[Identity, m.Message] = {}
-    for out in _recomputed(log, maps, finals):
+    for out in _recompute(log, maps, finals):
         found.setdefault(identity(out.key, out.message), out.message)
     return found
 
@@ -44,7 +42,7 @@ _OF_A_PEER = {
 }
 
 
-def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+def recompute_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
     """Recompute a peer's own fold by the same rule."""
 
     def maps_on(channel: ch.Channel) -> list[m.FusedMap]:
@@ -53,17 +51,16 @@ def recomputed_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
         return [each for each in own if isinstance(each, m.FusedMap)]
 
     found: dict[Identity, m.Message] = {}
-    for out in _recomputed(log, maps_on(ch.TEAM_MAP), maps_on(ch.TEAM_FINAL)):
+    for out in _recompute(log, maps_on(ch.TEAM_MAP), maps_on(ch.TEAM_FINAL)):
         if out.channel.name in _OF_A_PEER and out.name in ("", robot):
             key = _OF_A_PEER[out.channel.name].key(robot)
             found.setdefault(identity(key, out.message), out.message)
     return found
 
 
-def _recomputed(
+def _recompute(
     log: Recorded, maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
 ) -> Iterator[Outgoing]:
-    """Messages from the inputs of these maps, in input order."""
     if not maps and not finals:
         return
     config, digest = log.central_config()
@@ -103,7 +100,6 @@ def _from_submaps(
 def _extends(
     store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
 ) -> bool:
-    """Whether a map's set contains the stored one."""
     return (
         store.withdrawals.keys() <= {*fused.withdrawn}
         and store.verdicts <= {*fused.verdicts}
@@ -112,7 +108,7 @@ def _extends(
 
 
 def recorded_map(log: Recorded, name: str) -> m.SavedMap:
-    """Make a saved map of a log's final map, solved again from the set that it names.
+    """Make a saved map of a log's final map, solved again from its set.
 
     Raises RerunError without a final map, NothingToSaveError.
     """
@@ -155,9 +151,7 @@ class _RecordedSet:
                 self._priors_of.setdefault(prior.digest, set()).add(stream)
 
     def chains(self, fused: m.FusedMap) -> Mapping[Stream, Sequence[m.Submap]] | None:
-        """Submaps that a map names; None if one, its initial pose or its inter-robot measurements
-        are missing.
-        """
+        """Submaps that a map names; None if one or its inputs are missing."""
         stored = self._store.chains
         named = (*fused.members, *fused.left_out)
         vector = {(x.robot, x.incarnation): x.sequence for x in named}
@@ -168,7 +162,6 @@ class _RecordedSet:
     def copy(
         self, store: SubmapStore, chains: Mapping[Stream, Sequence[m.Submap]], fused: m.FusedMap
     ) -> None:
-        """Copy members of a map's set that a store lacks."""
         for stream, chain in chains.items():
             if (saved := self._maps.get(stream[0])) is not None:
                 store.add(saved)

@@ -56,7 +56,7 @@ class FieldDifference:
 def first_difference(
     recorded: m.Message, recomputed: m.Message, *, exact: bool
 ) -> FieldDifference | None:
-    """First differing field in field order, within the tolerance unless `exact`; or None."""
+    """Find the first differing field, within the tolerance unless `exact`."""
     for name in recorded.__struct_fields__:
         a, b = getattr(recorded, name), getattr(recomputed, name)
         if a == b:

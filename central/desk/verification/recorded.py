@@ -1,7 +1,8 @@
 """Index a log by recorded inputs and recomputable outputs."""
 
+from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import TypeVar
@@ -10,7 +11,6 @@ import msgspec
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.names import in_order
-from teamslam.central.desk.verification.measurements import RecordedMeasurements
 from teamslam.team.config import RobotConfig
 from teamslam.team.former_names import with_current_names
 from teamslam.team.recording.reader import Log, LogError
@@ -26,7 +26,55 @@ Identity = tuple[object, ...]
 
 
 class RerunError(ValueError):
-    """Log that cannot be recomputed; the text names the missing input."""
+    """Log that cannot be recomputed, for want of the named input."""
+
+
+class RecordedMeasurements(Mapping[int, m.Measurement]):
+    """Measurements of one incarnation by number.
+
+    contradicted: numbers with two different contents; the first one counts.
+    """
+
+    def __init__(self) -> None:
+        self._messages: dict[int, m.Measurement] = {}
+        self._odometry: list[int] | None = None
+        self.contradicted: list[int] = []
+
+    def put(self, message: m.Measurement) -> None:
+        """Add a measurement unless its number is present."""
+        known = self._messages.setdefault(message.number, message)
+        if known is not message and known != message:
+            self.contradicted.append(message.number)
+        self._odometry = None
+
+    def __getitem__(self, number: int) -> m.Measurement:
+        return self._messages[number]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(sorted(self._messages))
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Least and greatest stamp."""
+        stamps = [each.stamp_ns for each in self._messages.values()]
+        return min(stamps), max(stamps)
+
+    def intervals(self, begin: int, end: int) -> int:
+        """Number of odometry intervals numbered begin … end − 1."""
+        if self._odometry is None:
+            numbers = (n for n, x in self._messages.items() if isinstance(x, m.AnyOdometry))
+            self._odometry = sorted(numbers)
+        return bisect_left(self._odometry, end) - bisect_left(self._odometry, begin)
+
+    def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
+        """Yield measurements begin … end − 1, up to the first gap."""
+        for number in range(begin, end):
+            if number not in self._messages:
+                return
+            yield self._messages[number]
 
 
 @dataclass(frozen=True)
@@ -42,11 +90,10 @@ class RecordedOutput:
 class Recorded:
     """All node inputs and outputs in a log; each measurement once.
 
-    measurements: by (robot, incarnation) and counter. configured: last announcement of each node.
-    outputs: recomputable messages in log order. reported: measurements consumed by the robot's
-    report. published: measurements announced by the source. known_map: prior map of
-    localisation-only robots. saved_maps: maps of earlier days, by author. withdrawals: first order
-    on each withdrawn robot. unsound: number of invalid samples.
+    configured: last announcement of each node. outputs: recomputable messages in log order.
+    reported: consumed by the robot's report. published: announced by the source. known_map: prior
+    map for localisation. saved_maps: by author. withdrawals: first order on each robot. unsound:
+    number of invalid samples.
     """
 
     measurements: dict[Stream, RecordedMeasurements] = field(
@@ -77,7 +124,7 @@ class Recorded:
         except WireError:
             self.unsound += 1
             return
-        if m.is_measurement(message):  # first: most messages are measurements
+        if m.is_measurement(message):  # most messages are measurements
             self.measurements[message.robot, message.incarnation].put(message)
             return
         match message:
@@ -123,13 +170,13 @@ class Recorded:
 
     @property
     def contradicted(self) -> list[m.Measurement]:
-        """First copies of measurements that the log has twice with different content."""
+        """First copies of measurements with two different contents."""
         streams = self.measurements.values()
         return [stream[number] for stream in streams for number in stream.contradicted]
 
     @property
     def robots(self) -> list[str]:
-        """Every robot with measurements or messages, by name."""
+        """Robots with measurements or messages, by name."""
         names = {robot for robot, _ in self.measurements}
         names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
         return in_order(names)
@@ -147,7 +194,7 @@ class Recorded:
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
-        """Recorded inter-robot measurements by (robot, incarnation, sequence) of their submap."""
+        """Inter-robot measurements by (robot, incarnation, sequence) of their submap."""
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
         for sighting in self.of(ch.SIGHTING_FACTOR):
             assert isinstance(sighting, m.SightingFactor)
@@ -187,7 +234,7 @@ _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG
 INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_CONFIGURING))
 
 
-def recorded(log: Log) -> Recorded:
+def index_log(log: Log) -> Recorded:
     """Index a log in one pass."""
     found = Recorded()
     for chunk in log.chunks(INPUTS):

@@ -5,8 +5,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
 from typing import Any
 
-from teamslam.central.desk.verification.measurements import RecordedMeasurements
-from teamslam.central.desk.verification.recorded import Identity, Recorded, identity
+from teamslam.central.desk.verification.recorded import (
+    Identity,
+    Recorded,
+    RecordedMeasurements,
+    identity,
+)
 from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.pairs import FEEDBACK
@@ -20,7 +24,7 @@ from teamslam.team.wire.bus import Outgoing
 LOCKSTEP = "teamslam.sim.studies.robots.lockstep:in_lockstep"
 """Recomputes a robot under a rule with feedback."""
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
-"""Priors named by the recorded poses, by (incarnation, stamp); None: a pose without prior."""
+"""Priors of the recorded poses, by (incarnation, stamp); None: a pose without prior."""
 WithdrawnAt = Collection[tuple[int, int]]
 """Own poses that were also published on team/pose, by (incarnation, stamp)."""
 
@@ -28,7 +32,7 @@ WithdrawnAt = Collection[tuple[int, int]]
 class RecordedPoses(RunningPoses):
     """Poses at the log's stamps, each with the prior that it names.
 
-    The prior of a running pose depends on arrival times, so the pose names it.
+    Priors depend on arrival times, which a log does not have.
     """
 
     def __init__(
@@ -39,7 +43,7 @@ class RecordedPoses(RunningPoses):
         self._withdrawn = withdrawn
 
     def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
-        """Poses of this stamp, with every prior named by a recorded one."""
+        """Poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
         incarnation = estimator.writer.incarnation
         for prior in self._recorded.get((incarnation, stamp_ns), ()):
@@ -51,10 +55,7 @@ class RecordedPoses(RunningPoses):
 
 
 class RecomputedRobot:
-    """Robot node over recorded messages, with poses at the recorded stamps.
-
-    The configuration keeps its announced digest. options: of `RobotNode`.
-    """
+    """Robot node over recorded messages, with poses at the recorded stamps."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class RecomputedRobot:
         self._boundary = Boundary(ch.robot_node(config.id))
 
     def given(self, message: m.Message) -> list[Outgoing]:
-        """Handle a message as the shell does, with exceptions contained."""
+        """Handle a message with exceptions contained."""
         return self._boundary.hand(self.node, message)
 
     def take_known_map(self, log: Recorded) -> None:
@@ -81,8 +82,8 @@ class RecomputedRobot:
 NewRobot = Callable[[], RecomputedRobot]
 
 
-def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """Recompute every message that follows from the robot's measurements, by input names."""
+def recompute_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
+    """Recompute the messages that follow from a robot's measurements, by input names."""
     config, digest = log.robot_config(robot)
     named, withdrawn = _priors_named(log, robot), _withdrawn_at(log, robot)
 
@@ -91,7 +92,7 @@ def recomputed_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
         robot.take_known_map(log)
         return robot
 
-    lives = _alone
+    lives = _run_incarnations
     if config.fusion in FEEDBACK:
         lives = load(LOCKSTEP, f"the fusion rule {config.fusion}")
     found: dict[Identity, m.Message] = {}
@@ -120,12 +121,11 @@ def _withdrawn_at(log: Recorded, robot: str) -> WithdrawnAt:
     return {(p.incarnation, p.stamp_ns) for p in own if not p.in_team_frame}
 
 
-def _alone(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
+def _run_incarnations(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
     """Messages without feedback: each incarnation and each ended process is independent.
 
-    A `Done` names the process that it closes: last measurement and number of steps. A process that
-    resumed after a submap is computed from there. After a missing measurement, the computation
-    continues after the next recorded submap.
+    A `Done` names the process that it closes. A process that resumed after a submap is computed
+    from there, as is the rest after a missing measurement.
     """
     for incarnation in log.incarnations(robot):
         measurements = log.measurements[(robot, incarnation)]
@@ -149,7 +149,6 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 
 
 def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
-    """First measurement of the process that this `Done` ends, from its steps."""
     last = min(done.measurements, max(measurements) + 1)
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in sorted((each for each in begins if each <= last), reverse=True):
@@ -165,7 +164,6 @@ def _life(
     first: int,
     until: int | None,
 ) -> Iterator[Outgoing]:
-    """Messages of a process from measurement `first`, up to `until` if it ended there."""
     start = measurements.get(0)
     if not isinstance(start, m.InitialPose):
         return
@@ -189,10 +187,10 @@ def _life(
 
 
 def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
-    """Run a robot's node over the measurements of an incarnation, without a centre, so that it
-    waits for no map; returns how many it consumed.
+    """Run a robot's node over an incarnation's measurements; return how many it consumed.
 
-    options: of `RobotNode`. Raises RerunError without its configuration.
+    The centre is absent, so the robot waits for no map. Raises RerunError without its
+    configuration.
     """
     node = RecomputedRobot(*log.robot_config(robot), {}, **options)
     node.take_known_map(log)
@@ -210,7 +208,7 @@ def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> in
 
 
 def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
-    """Disposition of each consumed measurement of an incarnation, as worded by the node."""
+    """Disposition of each consumed measurement of an incarnation."""
     disposition_of: dict[int, str] = {}
     consumed = run_alone(log, robot, incarnation, on_disposition=disposition_of.__setitem__)
     return {counter: disposition_of.get(counter, "lost") for counter in range(consumed)}

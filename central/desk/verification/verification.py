@@ -1,10 +1,9 @@
 """Recompute every recomputable message of a log and compare.
 
-A log has the recorder's order, not a node's, so each message is computed from the inputs that it
-names. Submaps, own maps and own poses follow from measurements and configuration; a team pose from
-the prior whose digest it names; fused and final maps, priors and trajectories from the recorded
-submaps of the map's version vector; the exchanges of a feedback rule from the round's recorded
-maps. So an error is located in one message; its successors are judged by its recorded bytes.
+Each message is computed from the inputs that it names, so an error appears in one message only:
+submaps, own maps and own poses from measurements and configuration; a team pose from its prior;
+maps, priors and trajectories from the submaps of the map's version vector; exchanges of a feedback
+rule from the round's recorded maps.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 
-from teamslam.central.desk.verification.centre import recomputed_centre, recomputed_peer
+from teamslam.central.desk.verification.centre import recompute_centre, recompute_peer
 from teamslam.central.desk.verification.differences import FieldDifference, first_difference
 from teamslam.central.desk.verification.recorded import (
     Identity,
@@ -22,9 +21,9 @@ from teamslam.central.desk.verification.recorded import (
     RecordedOutput,
     RerunError,
     identity,
-    recorded,
+    index_log,
 )
-from teamslam.central.desk.verification.robot import recomputed_robot
+from teamslam.central.desk.verification.robot import recompute_robot
 from teamslam.team.recording.own_log import OWN
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log
@@ -33,9 +32,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import encoded
 
 PLATFORM = ("core", "estimation", "arithmetic", "version.numpy", "version.scipy")
-"""Metadata that must be equal for equal bits; neither the processor's features nor the core's level
-are among them: docs/decisions/32.
-"""
+"""Metadata that must be equal for equal bits (docs/decisions/32)."""
 MAPS = (ch.FUSED_MAP, ch.FINAL_MAP, ch.TEAM_MAP, ch.TEAM_FINAL)
 CHECKED = (
     ch.SUBMAP, ch.ASSOCIATION, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE,
@@ -47,9 +44,9 @@ CHECKED = (
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Recorded message that differs from the recomputed one; `counter` is its publisher's.
+    """Recorded message that differs from the recomputed one.
 
-    lacks: an input missing from the log.
+    counter: its publisher's. lacks: an input is missing from the log.
     """
 
     key: str
@@ -72,8 +69,7 @@ class Difference:
 class ChannelResult:
     """One channel: number of messages, of bit-equal ones, and of those equal within tolerance.
 
-    first: first that differs, or else that cannot be judged. lacking: messages that cannot be
-    judged for want of an input. All others differ.
+    first: first that differs, or else that lacks an input. lacking: messages that lack an input.
     """
 
     channel: str
@@ -93,8 +89,8 @@ class ChannelResult:
 class Verification:
     """Result of recomputing a log.
 
-    other_platform: metadata in which this platform differs; if any, numbers are compared within a
-    tolerance. span_s: team time between first and last measurement.
+    other_platform: metadata in which this platform differs; if any, numbers have a tolerance.
+    span_s: team time between first and last measurement.
     """
 
     channels: tuple[ChannelResult, ...]
@@ -105,7 +101,7 @@ class Verification:
 
     @property
     def first(self) -> Difference | None:
-        """First difference, causes first; otherwise the first message that lacks an input."""
+        """First difference, causes first; else the first message that lacks an input."""
         found = [c.first for c in self.channels if c.first is not None]
         return min(found, key=lambda each: each.lacks, default=None)
 
@@ -120,21 +116,20 @@ Part = Callable[[], Mapping[Identity, m.Message]]
 
 
 def verify(log: Log, processes: int = 1) -> Verification:
-    """Recompute a log and compare; raises RerunError, LogError.
+    """Recompute a log and compare. Raises RerunError, LogError.
 
-    processes: most processes that recompute nodes at a time. More than one are forked, so this
-    process must have no other thread that holds a lock.
+    processes: most forked processes; with more than one this process may hold no lock in a thread.
     """
     here = provenance()
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
-    found = recorded(log)
+    found = index_log(log)
     recomputed: dict[Identity, m.Message] = {}
-    others = _others(log, found)
+    others = _teammates_of(log, found)
     own = [robot for robot in found.robots if robot not in others]
-    parts: list[Part] = [partial(recomputed_robot, found, robot) for robot in own]
-    parts.append(partial(recomputed_centre, found))
-    parts += [partial(recomputed_peer, found, robot) for robot in own]
-    for messages in _computed(parts, processes):
+    parts: list[Part] = [partial(recompute_robot, found, robot) for robot in own]
+    parts.append(partial(recompute_centre, found))
+    parts += [partial(recompute_peer, found, robot) for robot in own]
+    for messages in _compute_parts(parts, processes):
         recomputed |= messages
     results = []
     for channel in CHECKED:
@@ -148,14 +143,13 @@ def verify(log: Log, processes: int = 1) -> Verification:
     return Verification(tuple(results), other, count, span_s, found.unsound)
 
 
-def _computed(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Identity, m.Message]]:
-    """Messages of the parts, in their order; raises RerunError."""
+def _compute_parts(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Identity, m.Message]]:
     if processes == 1:
         yield from (part() for part in parts)
         return
     pool = ProcessPoolExecutor(processes, get_context("fork"), _inherit, (parts,))
     try:
-        # The last begins first: the centre takes longest.
+        # The centre, which is last, takes longest.
         begun = [pool.submit(_compute_part, number) for number in reversed(range(len(parts)))]
         yield from (each.result() for each in reversed(begun))
     except BrokenProcessPool:
@@ -179,8 +173,8 @@ def _compute_part(number: int) -> Mapping[Identity, m.Message]:
     return _inherited[number]()
 
 
-def _others(log: Log, found: Recorded) -> frozenset[str]:
-    """Teammates in a robot's own log, whose messages are inputs and are not verified."""
+def _teammates_of(log: Log, found: Recorded) -> frozenset[str]:
+    """Teammates in a robot's own log, which are not verified."""
     if OWN not in log.metadata:
         return frozenset()
     there = frozenset(r for r in found.robots if ch.robot_node(r) in found.configured)
@@ -215,7 +209,6 @@ def _compared(
 def _difference(
     output: RecordedOutput, recomputed: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
-    """Difference of a recorded message from the recomputed one; None within the tolerance."""
     lacks = None if recomputed is not None else _lacking(output.message, log)
     if recomputed is None:
         found = FieldDifference(
@@ -251,7 +244,6 @@ def _names(message: m.Message) -> str:
 
 
 def _lacking(message: m.Message, log: Recorded) -> str | None:
-    """Named input missing from the log, as text."""
     match message:
         case m.PoseEstimate() if any(message.map_digest):
             priors_of_all = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
@@ -266,7 +258,7 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
             fused = by_digest.get(message.digest)
             if fused is None:
                 return f"no map {message.digest.hex()} in the log"
-            return _lacking(fused, log)  # it came with that map, which lacks an input
+            return _lacking(fused, log)  # its map lacks an input
         case m.FusedMap():
             found = log.submaps()
             for each in message.members:
@@ -281,7 +273,6 @@ def _lacking(message: m.Message, log: Recorded) -> str | None:
 
 
 def _gap(log: Recorded, message: m.Message) -> str | None:
-    """First measurement before a message that is not in the log."""
     robot, incarnation = getattr(message, "robot", ""), getattr(message, "incarnation", None)
     for stream in sorted(log.measurements):
         if stream[0] != robot or incarnation not in {None, stream[1]}:

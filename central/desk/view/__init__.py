@@ -1,1 +1,1 @@
-"""Viewer: a team's messages as Foxglove views and as a browser page."""
+"""Viewer: Foxglove views and a browser page."""

@@ -1,4 +1,4 @@
-"""Drawable contents of a team's messages: landmarks and thinned paths."""
+"""Drawable contents of a team's messages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -31,9 +31,8 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
 
 
 def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
-    """Particle positions (ahead [m], left [m]) relative to their mean pose.
-
-    The cloud is drawn around the robot, since its poses have drifted from the team's frame.
+    """Particle positions (ahead [m], left [m]) relative to their mean pose, for drawing at the
+    robot.
     """
     poses = floats(cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
     weights = floats(cloud.weights, "weights").astype(np.float64)
@@ -48,7 +47,7 @@ def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
 def place_points(
     points: Float[np.ndarray, "P 2"], pose: Sequence[float]
 ) -> Float[np.ndarray, "P 2"]:
-    """Transform points from pose coordinates to the frame of the pose (x, y, theta)."""
+    """Transform points to the frame of the pose (x, y, theta)."""
     x, y, theta = pose
     c, s = np.cos(theta), np.sin(theta)
     return np.asarray(points @ np.array([[c, s], [-s, c]]) + (x, y))
@@ -63,7 +62,7 @@ class Track:
     spacing_ns: int = 100_000_000
 
     def take(self, stamp_ns: int, x: float, y: float) -> None:
-        """Append a point, unless too near to the last or out of order."""
+        """Append a point, unless too near to the last."""
         if self.stamps and stamp_ns < self.stamps[-1] + self.spacing_ns:
             return
         self.stamps.append(stamp_ns)

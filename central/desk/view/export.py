@@ -1,4 +1,4 @@
-"""Compute a recorded log's views as a viewer would have published them."""
+"""Compute a recorded log's views."""
 
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -19,7 +19,7 @@ VIEWED = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
 def for_viewer(
     sample: Sample, channels: Collection[str] = VIEWED
 ) -> tuple[ch.Channel, m.Message] | None:
-    """Channel and message of a sample of these channels; None for other or invalid samples."""
+    """Channel and message of a sample of these channels; None for others."""
     found = ch.channel_of(sample.key)
     if found is None or found[0].name not in channels:
         return None
@@ -28,14 +28,14 @@ def for_viewer(
 
 
 class Viewing:
-    """Viewer over samples: returns its node's views as samples."""
+    """Viewer node over samples."""
 
     def __init__(self) -> None:
         self.node = ViewerNode()
         self._counters: dict[str, int] = {}
 
     def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
-        """Views that follow from a sample's message, with their own counters."""
+        """Views of a sample's message, with their own counters."""
         out = []
         for shown in [] if input_ is None else self.node.handle(*input_):
             counter = self._counters.get(shown.key, 0)
@@ -45,7 +45,7 @@ class Viewing:
 
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
-    """Samples, each followed by its views; recorded views are omitted."""
+    """Yield samples, each followed by its views; recorded views are omitted."""
     viewing, centre = Viewing(), PeersAsCentre()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
@@ -55,7 +55,7 @@ def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
 
 
 class Drawn(NamedTuple):
-    """Numbers of the log's messages, of views drawn now, and of recorded views."""
+    """Numbers of messages, of new views, and of recorded views."""
 
     own: int
     views: int
@@ -72,9 +72,9 @@ class Drawn(NamedTuple):
 
 
 def export_views(log: Log, out: Path) -> Drawn:
-    """Write a log with its views, all redrawn, to a new log `out`.
+    """Write a log with its views, all redrawn, to a new log.
 
-    Raises `LogError` for a damaged log, `RecorderError` if `out` exists.
+    Raises LogError for a damaged log, RecorderError if `out` exists.
     """
     written, drawn, before = 0, 0, 0
     with Recorder(out, log.team, log.metadata) as recorder:

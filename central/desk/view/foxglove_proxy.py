@@ -1,7 +1,7 @@
 """Restrict the page and Foxglove's WebSocket to viewers of this machine and permitted origins.
 
-The SDK's server accepts any origin, so it listens at a random loopback address and port. Viewers
-connect to this proxy, which checks Host and Origin and forwards frames both ways.
+The SDK's server accepts any origin, so it listens at a random loopback address and port behind this
+proxy, which checks Host and Origin.
 """
 
 import asyncio
@@ -19,12 +19,12 @@ from websockets.typing import Subprotocol
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 VIEWERS = (*LOOPBACK, "https://app.foxglove.dev", "file://")
-"""Origins of viewers: this machine's hosts, Foxglove in a browser and on a desktop."""
+"""Origins of viewers: this machine's hosts and Foxglove."""
 PROTOCOLS = tuple(map(Subprotocol, ("foxglove.sdk.v1", "foxglove.websocket.v1")))
 
 
 def hidden_host() -> str:
-    """Loopback address that no page can guess, where the system has several."""
+    """Loopback address that no page can guess."""
     host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
     try:
         socket.create_server((host, 0)).close()
@@ -38,7 +38,7 @@ def refusal(
 ) -> str | None:
     """Reason to refuse a request for `host` from these origins, or None.
 
-    listening_at: own address; on loopback a request under another name is refused (DNS rebinding).
+    listening_at: own address; a loopback request under another name is refused (DNS rebinding).
     others: further permitted origins or hosts.
     """
     if listening_at in LOOPBACK and (urlsplit(f"//{host}").hostname or "") not in LOOPBACK:
@@ -77,7 +77,6 @@ async def proxy(host: str, port: int, behind: str) -> Server:
 
 
 async def _forward(viewer: ServerConnection, behind: str) -> None:
-    """Forward frames both ways until one side closes."""
     chosen = PROTOCOLS if viewer.subprotocol is None else (viewer.subprotocol,)
     async with connect(behind, subprotocols=chosen, compression=None, max_size=None) as server:
         ways = [

@@ -128,7 +128,7 @@ def true_robot_entity(
 def path_entity(
     stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, pixels: float
 ) -> SceneEntity:
-    """Path as a line of this width in pixels."""
+    """Path as a line; width in pixels."""
     return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
 
 
@@ -150,7 +150,7 @@ def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]
 
 
 def pose_in_map(stamp_ns: int, pose: Float[np.ndarray, "3"]) -> bytes:
-    """A pose in the frame of the map."""
+    """Pose in the frame of the map."""
     x, y, theta = (float(v) for v in pose)
     found = PoseInFrame(timestamp=stamp(stamp_ns), frame_id=MAP_FRAME, pose=_pose(x, y, theta))
     return _encode(found)
@@ -184,19 +184,17 @@ def cloud(
 
 
 def log_line(stamp_ns: int, name: str, text: str, *, warns: bool) -> bytes:
-    """A line of a log."""
+    """Line of a log."""
     level = Log.WARNING if warns else Log.INFO
     found = Log(timestamp=stamp(stamp_ns), level=level, message=text, name=name)
     return _encode(found)
 
 
 def _encode(message: Any) -> bytes:
-    """Encode a message of Protobuf, whose classes have no types."""
     return bytes(message.SerializeToString())
 
 
 def _entity(stamp_ns: int, name: str, **primitives: Any) -> SceneEntity:
-    """Entity in the frame of the map; primitives: lists, as `SceneEntity` names them."""
     at = stamp(stamp_ns)
     return SceneEntity(timestamp=at, frame_id=MAP_FRAME, id=name, **primitives)
 

@@ -1,9 +1,6 @@
-"""Foxglove WebSocket: views of a log or run in Foxglove or Lichtblick, by the SDK's server.
+"""Foxglove WebSocket: views of a log or run, by the SDK of the extra `foxglove`.
 
-The only module that needs the SDK, the extra `foxglove`.
-
-A new subscriber receives the newest view of its topic at once. To play a finished log, open its
-file there.
+A new subscriber receives the newest view of its topic at once.
 """
 
 import logging
@@ -20,7 +17,7 @@ from teamslam.team.wire.bus import Sample
 
 
 class FoxgloveServer(ServerListener):
-    """SDK server at a hidden loopback address; the team's views are its channels."""
+    """SDK server at a hidden loopback address."""
 
     def __init__(self) -> None:
         self.team = ""

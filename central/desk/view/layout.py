@@ -1,4 +1,4 @@
-"""Foxglove and Lichtblick layout: scene, events, errors with bounds, consistency."""
+"""Foxglove and Lichtblick layout."""
 
 import json
 from collections.abc import Sequence
@@ -73,7 +73,6 @@ def _scene(prefix: str, robots: Sequence[str]) -> dict[str, object]:
 
 
 def _errors(prefix: str, robots: Sequence[str], of: str, title: str) -> dict[str, object]:
-    """Each robot's error, with bounds of the first only, for readability."""
     lines = []
     for number, robot in enumerate(robots):
         topic = f"{prefix}/{views.ROBOT.key(robot)}"

@@ -1,7 +1,4 @@
-"""Viewer node: messages in, views out; no I/O, no clock.
-
-It receives the truth like an evaluator; no node of a team subscribes to a view.
-"""
+"""Viewer node: messages in, views out."""
 
 import math
 from collections import deque
@@ -42,11 +39,11 @@ TRAIL_NS = 15_000_000_000
 LAG_NS = 30_000_000_000
 """A robot further behind the fastest does not hold back the view."""
 MOST_PERIODS = 60
-"""Most views per message; the earlier part of a longer jump is omitted."""
+"""Most views per message."""
 FORGET_NS = 10_000_000_000
 """Time for which an estimate waits for its truth."""
 _MARKS_ACROSS = 45.0
-"""Number of drawn robots that fit across the known extent."""
+"""Drawn robots that fit across the known extent."""
 
 
 class Shown(NamedTuple):
@@ -79,12 +76,10 @@ class _Robot:
     status: dict[str, float] = field(default_factory=dict)
 
     def pose(self) -> Float[np.ndarray, "3"]:
-        """Pose (x [m], y [m], theta [rad]); needs an estimate."""
         assert self.estimate is not None
         return floats(self.estimate.pose, "pose").astype(np.float64)
 
     def covariance(self) -> Float[np.ndarray, "3 3"]:
-        """Pose covariance."""
         assert self.estimate is not None
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
@@ -110,7 +105,6 @@ class _Robot:
         self.errors.forget(now_ns - FORGET_NS)
 
     def note(self, errors: PoseErrors | None) -> None:
-        """Set the newest error."""
         if errors is not None:
             self.last_error = (errors.errors[-1], float(errors.nees[-1]) / 3.0)
 
@@ -118,8 +112,7 @@ class _Robot:
 class ViewerNode:
     """Viewer of a team: `handle` until `finished`.
 
-    View time is that of the slowest active robot, so all are shown at one time; a robot holds it
-    back by at most LAG_NS.
+    View time is that of the slowest active robot, at most LAG_NS behind the fastest.
     """
 
     listens = (
@@ -150,7 +143,7 @@ class ViewerNode:
         return 0 if self._now_ns is None else self._now_ns
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
-        """Process a message of a channel; returns the due views, one per period of team time."""
+        """Process a message of a channel; return the due views."""
         out = [_logged(event) for event in self._detector.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
@@ -244,7 +237,7 @@ class ViewerNode:
             )  # fmt: skip
 
     def _size_m(self) -> float:
-        """Drawn size of a robot: 1, 2 or 5 times a power of ten, so it rarely changes."""
+        """Drawn size of a robot: 1, 2 or 5 times a power of ten."""
         left, bottom, right, top = self._reach
         across = max(right - left, top - bottom) / _MARKS_ACROSS
         if not across > 0.0 or not math.isfinite(across):

@@ -1,19 +1,17 @@
 """Frames for the page: one JSON object per event, in log order.
 
 t: seconds of team time since the first measurement. Poses and errors are rows of numbers, maps and
-particles base64 of little-endian float32 and uint32. Frames, by `k`:
-
-hello: team, title, colours, live. now: team time of all active robots. pose: rows x, y, heading,
-xx, xy, yy, heading variance. outside: whether the robot is outside the team's map from now on; its
-poses are then not sent. frame: the robot's pose frame changes. err: rows of three errors, three 3σ
-bounds, NEES per degree of freedom. truth: rows x, y, heading. truth_map, map, cloud, path: as
-named; a map may have `changes` since the saved maps: of unchanged landmarks the number, of others
-landmark, state, place in the saved map, displacement, its sigma [m], χ², expected observations.
-align: x, y, theta of the truth's frame in a map frame that is not it, null while undetermined; map
-frame null: before the first map. sensor: range, field of view and mount. see: rows of a
-measurement: landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a submap (to) or
-a prior (from) `central`. fig: a node's figures. wait: the start-up states of a node. bytes: [key,
-t, messages, bytes] of one second. ev: event. eof: end of the log.
+particles base64 of little-endian float32 and uint32. Frames, by `k`: hello: team, title, colours,
+live. now: team time of all active robots. pose: rows x, y, heading, xx, xy, yy, heading variance.
+outside: whether the robot is outside the team's map; its poses are then not sent. frame: the
+robot's pose frame changes. err: rows of three errors, three 3σ bounds, NEES per degree of freedom.
+truth: rows x, y, heading. truth_map, map, cloud, path: as named; a map's `changes` since the saved
+maps: number of unchanged landmarks, then landmark, state, place in the saved map, displacement, its
+sigma [m], χ², expected observations. align: x, y, theta of the truth's frame in another map frame,
+null while undetermined. sensor: range, field of view and mount. see: rows of a measurement:
+landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a submap (to) or a prior
+(from) `central`. fig: a node's figures. wait: start-up states of a node. bytes: [key, t, messages,
+bytes] of one second. ev: event. eof: end of the log.
 """
 
 import base64
@@ -35,15 +33,15 @@ from teamslam.central.desk.view.drawn import (
     landmarks_of,
     place_points,
 )
-from teamslam.central.desk.view.landmark_sets import sets_of
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
+from teamslam.central.unnamed_landmarks import SHOWN, STEPS
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
 from teamslam.team.wire.bus import Sample
 
 SPACING_NS = 100_000_000
-"""Least time between poses sent to the page, estimated or true."""
+"""Least time between poses sent to the page."""
 MAP_SPACING_NS = 1_000_000_000
 """Least time between maps sent to the page."""
 SEEN_NS = 500_000_000
@@ -114,7 +112,7 @@ class PageFrames:
         self._add_frame("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def count(self, sample: Sample) -> None:
-        """Count a recorded sample as traffic, and show it where it links a robot and the centre."""
+        """Count a sample as traffic; emit a link for a submap or prior."""
         found = ch.channel_of(sample.key)
         channel, name = ("", "") if found is None else (found[0].name, found[1])
         if self._origin_ns is None and channel in _BEGIN:
@@ -131,7 +129,7 @@ class PageFrames:
             self._add_frame("link", t=t, a=link[0], b=link[1])
 
     def flush(self, now_ns: int | None = None) -> list[str]:
-        """Frames since the last call; now_ns: team time of the robots."""
+        """Return the frames since the last call; now_ns: team time of the robots."""
         for robot, stream in self._streams.items():
             self._add_errors(stream)
             for kind, (times, values) in stream.rows.items():
@@ -147,7 +145,7 @@ class PageFrames:
         return out
 
     def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
-        """Last frames; notes: log faults."""
+        """Return the last frames; notes: log faults."""
         out = self.flush(self._newest_ns)
         for note in notes:
             self._add_frame("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
@@ -158,7 +156,6 @@ class PageFrames:
         self._out.append(json.dumps({"k": kind, **fields}, separators=(",", ":")))
 
     def _t(self, stamp_ns: int) -> float:
-        """Seconds since the first measurement, at least 0."""
         if self._origin_ns is None:
             return 0.0
         return round(max(stamp_ns - self._origin_ns, 0) * 1e-9, 3)
@@ -255,7 +252,7 @@ class PageFrames:
     def _take_measurements(
         self, message: m.Observations | m.Points | m.Detections | m.Sightings
     ) -> None:
-        """Send measured places in the robot's frame, each landmark's at most each SEEN_NS."""
+        """Send measured places in the robot's frame, each landmark at most once in SEEN_NS."""
         stream, at = self._streams[message.robot], message.stamp_ns
         if isinstance(message, m.Points):
             places = floats(message.positions, "positions").reshape(-1, 2)
@@ -324,7 +321,6 @@ class PageFrames:
         return None if self._map is None else self._map.frame
 
     def _align(self) -> None:
-        """Send the place of the truth in the newest map's frame where it is new."""
         found = self._truth.map_from_truth(self._map)
         motion = None if found is None else [_short(v) for v in found.tolist()]
         if motion != self._aligned.get(self._frame(), [0.0, 0.0, 0.0]):
@@ -347,7 +343,6 @@ class PageFrames:
 
 
 def _changes_of(message: m.FusedMap, landmarks: Landmarks) -> dict[str, object] | None:
-    """Changes since the saved maps; None without saved maps."""
     if not message.changes:
         return None
     places = dict(zip(landmarks.ids.tolist(), landmarks.means.tolist(), strict=True))
@@ -363,9 +358,38 @@ def _changes_of(message: m.FusedMap, landmarks: Landmarks) -> dict[str, object] 
 
 
 def _short(value: float) -> float:
-    """Round to seven digits, the page's resolution."""
     return float(f"{value:.7g}")
 
 
 def _base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
+    """Number of submaps and members of each landmark, in a running map at most SHOWN.
+
+    A member such as `r1/1/12/7` is robot, incarnation, submap, local landmark.
+    """
+    found: dict[int, tuple[set[tuple[str, int, int]], list[str]]] = {}
+    for table in fused.memberships:
+        columns = zip(
+            ids(table.sequences, "sequences").tolist(),
+            ids(table.locals, "locals").tolist(),
+            ids(table.identities, "identities").tolist(),
+            table.steps,
+            floats(table.figures, "figures").reshape(-1, 3).tolist(),
+            strict=True,
+        )
+        for sequence, local, identity, step, (llr, rival, sd) in columns:
+            submaps, words = found.setdefault(identity, (set(), []))
+            submaps.add((table.robot, table.incarnation, sequence))
+            name = f"{table.robot}/{table.incarnation}/{sequence}/{local}"
+            if not 0 < step < len(STEPS):
+                words.append(name)
+                continue
+            against = f", its best rival {rival:.1f}" if rival > -1e299 else ", no rival"
+            words.append(
+                f"{name}: {STEPS[step]}, log-likelihood ratio {min(llr, 1e6):.1f}{against}, "
+                f"sd {sd:.2f} m"
+            )
+    return {number: (len(submaps), words[:SHOWN]) for number, (submaps, words) in found.items()}

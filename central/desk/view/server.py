@@ -1,7 +1,7 @@
 """Serve a log: page with a WebSocket stream of frames, and Foxglove's WebSocket.
 
-A new connection receives every frame of the log, then new ones. Pages of another origin, or under
-another name of this machine (DNS rebinding), are refused.
+A new connection receives every frame of the log, then new ones. Pages of another origin or host
+name (DNS rebinding) are refused.
 """
 
 import asyncio
@@ -81,7 +81,7 @@ class Feed:
     _greeted: bool = False
 
     def read_more(self, *, growing: bool) -> bool:
-        """Read new samples; returns whether there were any. A log that does not grow ends here."""
+        """Read new samples; return whether there were any. A finished log ends here."""
         try:
             samples = self.tail.more()
         except (LogError, OSError) as error:
@@ -124,7 +124,7 @@ class Feed:
 
 
 class PageServer:
-    """Server of one page; runs in its own event loop."""
+    """Server of one page in its own event loop."""
 
     def __init__(self, feed: Feed, host: str, *, growing: bool) -> None:
         self._feed = feed
@@ -214,7 +214,7 @@ def session(
 ) -> Iterator[Shown]:
     """Show a log until the context ends; raises ServerError for a taken port.
 
-    foxglove_port: None: only the page. growing: the recorder may still run, or not have begun.
+    foxglove_port: None: only the page. growing: the recorder may still run.
     """
     # The library logs every connection otherwise.
     logging.getLogger("websockets").setLevel(logging.WARNING)
@@ -225,7 +225,6 @@ def session(
 
 
 def _foxglove_server() -> "FoxgloveServer":
-    """Server of Foxglove's SDK, which is an extra."""
     from teamslam.central.desk.view.foxglove_server import FoxgloveServer
 
     return FoxgloveServer()
@@ -235,10 +234,7 @@ def _foxglove_server() -> "FoxgloveServer":
 def serving(
     feed: Feed, host: str, port: int, foxglove_port: int = 0, *, growing: bool
 ) -> Iterator[Shown]:
-    """Serve page and Foxglove on a thread until the context ends.
-
-    Raises ServerError.
-    """
+    """Serve page and Foxglove on a thread. Raises ServerError."""
     runner, stop = asyncio.Runner(), asyncio.Event()
     page = PageServer(feed, host, growing=growing)
     at = f"[{host}]" if ":" in host else host
@@ -287,7 +283,7 @@ def serving(
 
 
 def free_port(host: str, port: int) -> int:
-    """Return `port`, or 0 (any free one) where another program listens there."""
+    """Return `port`, or 0 (any free one) if it is taken."""
     try:
         socket.create_server((host, port), family=_family(host)).close()
     except OSError as error:
@@ -300,7 +296,7 @@ def _family(host: str) -> socket.AddressFamily:
 
 
 def _reason(error: OSError) -> str:
-    """The system's words for an error; those of asyncio repeat the address."""
+    """The system's text for an error; asyncio's repeats the address."""
     number = error.errno or 0
     return os.strerror(number) if number > 0 else error.strerror or str(error)
 

@@ -1,4 +1,4 @@
-"""Viewer process: a bus around the node; the recorder records its views."""
+"""Viewer process: a bus around the node."""
 
 import threading
 import time
@@ -19,10 +19,10 @@ NODE = "viewer"
 
 
 def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> int:
-    """Publish views until the final map is shown or `stop` is set; returns their number.
+    """Publish views until the final map is shown or `stop` is set; return their number.
 
-    peers: robots whose agreed map is the final one; without them, the centre's. Raises
-    FaultyRunError at the end if the map lacks a robot or something could not be drawn.
+    peers: robots whose agreed map is the final one. Raises FaultyRunError at the end if the map
+    lacks a robot or a message could not be drawn.
     """
     viewing = Viewing()
     centre = PeersAsCentre(peers)
@@ -35,7 +35,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
     boundary = Boundary(NODE)
     due = 0.0
     final: FusedMap | None = None
-    # After the end there is nothing to show, so the map does not finish the node.
+    # After the end no map finishes the node.
     while not (viewing.node.finished or final is not None or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S

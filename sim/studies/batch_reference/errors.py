@@ -1,17 +1,11 @@
 """Measurement factors of the batch MAP under the profile's noise: persistent errors are states.
 
 A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
-
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
     r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1), white,
-
 with the sensor's white shares w. e is a first-order Gauss-Markov process of unit variance for each
-robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ) with the sensor's correlation
-times, as in the simulator; the robots' windows take it as constant. The biases are three numbers
-per robot with the centre's priors. An inter-robot measurement is a factor between two poses of the
-same time, as the robots reduce them. A covariance that comes with a measurement is white and all of
-its noise. GTSAM has no such factor: it is a Python function of (pose, landmark, e, biases) with
-analytic derivatives.
+robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ). The three biases of a robot
+have the centre's priors. A measurement's own covariance is white and all of its noise.
 """
 
 import math
@@ -28,20 +22,20 @@ from teamslam.team.estimation.se2 import Point, wrapped
 from teamslam.team.shapes import Float
 
 BIASES = ("bearing", "range_offset", "range_scale")
-"""Sensor biases of the centre's model, in state order."""
+"""Sensor biases, in state order."""
 FORGOTTEN = 1e-3
 """Correlation below which the error process begins anew."""
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58
 PINNED_SIGMA = 1e-6
-"""Standard deviation [m, rad] between base and mounted sensor: the least that GTSAM handles."""
+"""Standard deviation [m, rad] between base and mounted sensor: the least for GTSAM."""
 
 
 class Look(NamedTuple):
-    """A landmark's measurement from a pose of a chain, with its error state.
+    """Landmark measurement `number` of a scan, and its error state.
 
-    before: error state of the landmark's measurement gap_s earlier. number: index in the scan.
+    before: error state gap_s earlier.
     """
 
     key: int
@@ -56,12 +50,12 @@ class Look(NamedTuple):
 
 
 def bias_key(chain: int) -> int:
-    """Key of a chain's biases (`BIASES`: bearing [rad], range offset [m], range scale)."""
+    """Key of a chain's biases (bearing [rad], range offset [m], range scale)."""
     return _BIASES + chain
 
 
 def detections_of(chains: Sequence[Chain]) -> list[Look]:
-    """All measurements in order."""
+    """List all measurements in order."""
     looks: list[Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
@@ -97,7 +91,7 @@ def profile_graph(
     robust_c: float | None,
     sigmas: BiasSigmas,
 ) -> Any:
-    """All factors. The range noise is that at the joined solution's range.
+    """Make all factors, with the range noise at the joined solution's range.
 
     The Cauchy loss of scale c is on √(χ²/2) of each measurement.
     """
@@ -186,7 +180,7 @@ def _measurement(
 
 
 def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
-    """e(t') − a e(t) ~ N(0, 1 − a²) of (bearing, range); the first of a process has no e(t)."""
+    """e(t') − a e(t) ~ N(0, 1 − a²) of (bearing, range); the first has no e(t)."""
     times = (sensor.bearing_correlation_s, sensor.range_correlation_s)
     a = np.array([math.exp(-look.gap_s / tau) if tau > 0.0 else 0.0 for tau in times])
     if look.before is None or a.max() < FORGOTTEN:
@@ -203,7 +197,6 @@ def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
 
 
 def _base_key(chain: Chain, number: int, pose: int) -> int:
-    """Key of the base's pose: the sensor's own unless mounted."""
     own = pose_key(number, pose)
     return _BASES + own if chain.config.sensor.is_mounted else own
 

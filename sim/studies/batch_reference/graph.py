@@ -1,7 +1,4 @@
-"""Factor graph of the batch MAP in GTSAM: keys, factors and values.
-
-GTSAM is a parameter: an optional extra. Poses are perturbed on the right.
-"""
+"""Factor graph of the batch MAP in GTSAM, an optional extra. Poses are perturbed on the right."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,8 +17,7 @@ from teamslam.team.shapes import Float
 Poses = Float[np.ndarray, "K 3"]
 _CHAIN = 2**32
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
-"""Added to each motion (forward [m], left [m], turn [rad]): its covariance is singular without slip
-and zero without motion.
+"""Added to each motion (forward [m], left [m], turn [rad]), since its covariance may be singular.
 """
 EXACT_SIGMA = 1e-5
 """Standard deviation of an exactly known initial pose [m, rad]."""
@@ -39,7 +35,7 @@ def load_gtsam() -> Any:
 
 
 def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
-    """Levenberg-Marquardt to the last digits that GTSAM's costs have."""
+    """Make a Levenberg-Marquardt optimiser that iterates to the last digits of the cost."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-13)
@@ -48,7 +44,7 @@ def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
 
 
 def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """A linear graph's Newton step, and its length in standard deviations."""
+    """Newton step of a linear graph, and its length in standard deviations."""
     step = linear.optimize()
     gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))
@@ -80,9 +76,9 @@ def factor_graph(
     landmarks: Mapping[int, Point],
     robust_c: float | None,
 ) -> Any:
-    """All factors. The range noise is that at the joined solution's range.
+    """Make all factors, with the range noise at the joined solution's range.
 
-    Without a known initial pose the first chain's is fixed to the joined solution's.
+    Without a known initial pose the first chain's is that of the joined solution.
     """
     graph = path_graph(gtsam, chains, poses)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
@@ -105,7 +101,7 @@ def factor_graph(
 
 
 def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
-    """Factors of the initial poses and of the odometry."""
+    """Make the factors of initial poses and odometry."""
     graph = gtsam.NonlinearFactorGraph()
     floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
@@ -122,7 +118,7 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
 
 
 def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
-    """Noise model with a Cauchy loss of this scale, if any."""
+    """Add a Cauchy loss of scale c, if any, to a noise model."""
     if c is None:
         return model
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)

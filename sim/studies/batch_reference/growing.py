@@ -1,10 +1,9 @@
 """Incremental batch MAP over all raw measurements of a team, solved by GTSAM.
 
-Minimises Σ rᵀP⁻¹r of the initial poses and of the odometry + Σ ρ(rᵀR⁻¹r) of the measurements over
-one pose per robot and keyframe and all landmarks (Dellaert & Kaess 2006, Square root SAM). ρ is the
-identity, or Cauchy's c² log(1 + χ²/c²). A measurement's noise is the sensor's at the range that the
-estimate predicts, and is not differentiated: the graph is rebuilt at each new estimate. Poses are
-perturbed on the right.
+Minimises Σ rᵀP⁻¹r of the initial poses and the odometry + Σ ρ(rᵀR⁻¹r) of the measurements over one
+pose per robot and keyframe and all landmarks (Dellaert & Kaess 2006, Square root SAM). ρ is the
+identity, or Cauchy's c² log(1 + χ²/c²). R is the sensor's at the predicted range, not
+differentiated: each new estimate has a new graph. Poses are perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +29,7 @@ from teamslam.team.estimation.se2 import Pose, compose, tangent
 from teamslam.team.shapes import Float, UInt32
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
-"""A robust solution begins with Cauchy's scale 8 c, which narrows to c: errors of dead reckoning
-are no outliers.
-"""
+"""A robust solution begins with Cauchy's scale 8 c, which narrows to c."""
 _POSES = 2**32
 """First key of a pose; a landmark's is its id < 2³²."""
 
@@ -45,9 +42,9 @@ class UnsolvableError(ValueError):
 class GrowingBatch:
     """Estimate of all poses and landmarks, in the map frame.
 
-    starts: initial poses with covariance in (x, y, θ); None: exact. steps: step k ends at pose
-    len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first. landmarks: [m], by id.
-    robust_c: Cauchy's scale on √χ² of a measurement (2 numbers); None: least squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. Step k ends at pose len(starts)
+    + k. poses: (x [m], y [m], θ [rad]), initial poses first. robust_c: Cauchy's scale on √χ² of a
+    measurement; None: least squares.
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]
@@ -62,7 +59,7 @@ class GrowingBatch:
         return np.array(sorted(self.landmarks), np.uint32)
 
     def places(self, robot: str) -> list[int]:
-        """Rows of a robot's poses, initial pose first; ValueError without one."""
+        """Rows of a robot's poses, initial pose first; raises ValueError without one."""
         robots = list(self.starts)
         if robot not in self.starts:
             raise ValueError(f"{robot} has no start")
@@ -71,19 +68,17 @@ class GrowingBatch:
 
     @property
     def cost(self) -> float:
-        """Σ of χ² of all factors, under the loss; about `dof` for correct models."""
+        """Σ of χ² of all factors, under the loss."""
         return 2.0 * float(self._graph.error(self.values))
 
     @property
     def dof(self) -> int:
-        """2 n − 2 L for n measurements and L landmarks: initial poses and motions are as many as
-        poses.
-        """
+        """Degrees of freedom 2 n − 2 L for n measurements and L landmarks."""
         return 2 * sum(len(step.ids) for step in self.steps) - 2 * len(self.landmarks)
 
     @cached_property
     def newton_decrement(self) -> float:
-        """√(gᵀH⁻¹g): length of the next Newton step in standard deviations."""
+        """√(gᵀH⁻¹g): length of the next Newton step."""
         try:
             return newton_step(load_gtsam(), self._graph.linearize(self.values))[1]
         except RuntimeError as error:
@@ -109,7 +104,7 @@ class GrowingBatch:
         return self.graph(self.robust_c)
 
     def graph(self, robust_c: float | None) -> Any:
-        """Factors, with measurement noise at the present estimate."""
+        """Make the factors, with measurement noise at the present estimate."""
         gtsam = load_gtsam()
         graph = gtsam.NonlinearFactorGraph()
         floor = np.diag(FLOOR_SIGMAS) ** 2
@@ -146,17 +141,16 @@ class GrowingBatch:
 def initial_state(
     starts: Mapping[str, tuple[Pose, Matrix | None]], robust_c: float | None
 ) -> GrowingBatch:
-    """Robots' initial poses alone; raises NotInstalledError."""
+    """Make a batch of initial poses; raises NotInstalledError."""
     load_gtsam()
     mean = np.array([pose for pose, _ in starts.values()]).reshape(-1, 3)
     return GrowingBatch(dict(starts), robust_c, (), mean, {})
 
 
-def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
-    """Append steps to the batch.
+def add_steps(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
+    """Append steps: dead-reckon new poses, place new landmarks by their first measurement.
 
-    A new pose is dead-reckoned, a new landmark placed by its first measurement. Raises ValueError
-    for a robot without an initial pose.
+    Raises ValueError for a robot without an initial pose.
     """
     newest = {robot: batch.poses[batch.places(robot)[-1]] for robot in batch.starts}
     poses, landmarks = [*batch.poses], dict(batch.landmarks)
@@ -176,8 +170,8 @@ def extended(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
     )
 
 
-def solved(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
-    """Iterate Levenberg-Marquardt until `converged` or the limit; raises `UnsolvableError`."""
+def solve(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
+    """Iterate Levenberg-Marquardt to convergence or the limit; raises `UnsolvableError`."""
     for scale in _scales(batch.robust_c):
         left = iterations
         while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
@@ -235,8 +229,9 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ); ValueError for an
-    unknown robot.
+    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
+
+    Raises ValueError for an unknown robot.
     """
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))

@@ -1,15 +1,10 @@
-"""Compute the batch reference: the MAP over all raw measurements of a log, by GTSAM (extra
-`batch-reference`).
+"""Batch reference: the MAP over all raw measurements of a log, by GTSAM.
 
-Each robot has one pose of its sensor per keyframe. Factors: the initial poses; the odometry, truth
-= mean ∘ Exp(ξ) with the tangent covariance of `increment_of` (GTSAM's `BetweenFactorPose2` with its
-logarithm); each accepted range and bearing, independent, with the sensor's noise or its own, under
-a Cauchy loss if the centre has `batch_robust_c`. Levenberg-Marquardt starts from the joined
-solution with the paths filled in three ways, so the result is never worse (noise `profile`: from
-the best of the three). With the noise `white` errors are independent and inter-robot measurements
-unused; with `profile` the sensor's errors persist, biases are estimated and inter-robot
-measurements are factors (`errors`). Not modelled: an odometry scale error at speeds outside the
-profile.
+One pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘
+Exp(ξ) with the tangent covariance of `increment_of`; each accepted range and bearing with the
+sensor's noise or its own, under a Cauchy loss if the centre has `batch_robust_c`.
+Levenberg-Marquardt starts from the joined solution with the paths filled in three ways. Noise
+`white`: independent errors, inter-robot measurements unused; `profile`: see `errors`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,9 +26,9 @@ from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
-    anchored,
+    anchor_chain,
     chains_of,
-    placed,
+    place_chains,
 )
 from teamslam.sim.studies.batch_reference.errors import (
     add_errors,
@@ -58,10 +53,7 @@ from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire.bus import Sample
 
 LARGEST_DECREMENT = 1e-3
-"""√(gᵀH⁻¹g) allowed at the optimum: length of the next Newton step in standard deviations.
-
-Iterated reweighting of a robust loss converges linearly.
-"""
+"""Allowed √(gᵀH⁻¹g) at the optimum; reweighting converges linearly."""
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
 NO_BIASES = (None, None, None)
@@ -69,12 +61,11 @@ NO_BIASES = (None, None, None)
 
 @dataclass(frozen=True)
 class BatchReference:
-    """The optimum. cost = Σ‖r‖² there, initial_cost at the best initial values.
+    """Optimum of the batch.
 
-    gradient_norm: of the cost, in state units; newton_decrement: √(gᵀH⁻¹g). paths: all poses;
-    final_pose_nees_per_dof and position_rmse_m where there is truth. left_out: robots without a
-    known place, with the reason. biases: (bearing [rad], range offset [m], range scale) by robot.
-    team: the run's own final map.
+    cost = Σ‖r‖², initial_cost: of the best initial values. gradient_norm: of the cost;
+    newton_decrement: √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases:
+    (bearing [rad], range offset [m], range scale) by robot. team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -145,7 +136,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
         raise BatchReferenceError(
             "the log has no scenario or no final map: record a run to its end"
         )
-    chains, anchors, left_out = placed(
+    chains, anchors, left_out = place_chains(
         chains_of(recorded, run.scenario, sightings=noise == "profile"), run
     )
     if not chains:
@@ -155,7 +146,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
         )
     robust_c = run.scenario.central.batch_robust_c
     fillings = list(
-        zip(*(anchored(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
+        zip(*(anchor_chain(c, a) for c, a in zip(chains, anchors, strict=True)), strict=True)
     )
     starts = [landmark_starts(chains, poses, run.map) for poses in fillings]
     if noise == "profile":
@@ -233,7 +224,7 @@ def _optimise(gtsam: Any, graph: Any, initial: Any) -> Any:
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
     """Gauss-Newton with halving of steps that do not lower the cost.
 
-    With Python factors, GTSAM's Levenberg-Marquardt takes five times as long.
+    With Python factors it is five times faster than GTSAM's Levenberg-Marquardt.
     """
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):

@@ -1,1 +1,1 @@
-"""Estimators of the sources, for comparison; the product does not use them."""
+"""Estimators of the sources, for comparison."""

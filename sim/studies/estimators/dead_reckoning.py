@@ -1,7 +1,6 @@
-"""Dead reckoning: odometry composed on SE(2).
+"""Dead reckoning: odometry composed on SE(2), pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k).
 
-pose_k = pose_{k−1} ∘ mean_k ∘ Exp(ξ_k): the error grows without bound. Thrun et al. 2005, chapter
-5; Ma & Ma, section VI-A, compare SLAM with it.
+Thrun et al. 2005, chapter 5; Ma & Ma, section VI-A.
 """
 
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ class DeadReckoning:
 
 
 def initial_state(pose: Pose) -> DeadReckoning:
-    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 

@@ -1,8 +1,7 @@
 """EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
 
-Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section 2.6 and
-experiment 1. Every measurement is linearised once, at the estimate of its time, so over a long run
-the covariance becomes too small (Julier and Uhlmann 2001).
+Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section 2.6. Over a
+long run the covariance becomes too small (Julier and Uhlmann 2001).
 """
 
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from teamslam.team.shapes import Float, UInt32
 class EkfSlam:
     """N(mean, covariance) of (pose, landmarks in order of first sight) in the map frame.
 
-    ids: in order of first sight. mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
+    mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -34,7 +33,7 @@ class EkfSlam:
 
 
 def initial_state(pose: Pose) -> EkfSlam:
-    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
@@ -48,8 +47,8 @@ def filter_step(
 ) -> EkfSlam:
     """Move, update by all measurements of known landmarks at once, then place the new ones.
 
-    ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it
-    after its placement. Raises NotACovarianceError.
+    ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it.
+    Raises NotACovarianceError.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)
@@ -81,7 +80,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """NIS of the measurements of mapped landmarks that `filter_step` would use."""
+    """NIS of the measurements that `filter_step` would use."""
     return joint_innovation(
         landmarks=state.ids,
         mean=state.mean,
@@ -106,7 +105,7 @@ def landmark_gaussian(state: EkfSlam) -> LandmarkGaussian:
 
 
 def local_map(state: EkfSlam) -> LocalMap:
-    """The whole Gaussian, landmarks by ascending id: a submap, if it began at pose zero."""
+    """The whole Gaussian, landmarks by ascending id."""
     order = np.argsort(state.ids)
     columns = (3 + 2 * order[:, None] + np.arange(2)).ravel()
     at = np.concatenate((np.arange(3), columns))

@@ -1,8 +1,8 @@
 """EKF-SLAM step: motion, measurements of known landmarks, new landmarks.
 
 The state is (x, y, theta, x₁, y₁, …); `mean` and `P` have room for the new landmarks and are
-written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²); range noise is at the
-predicted range. All sums have a fixed order, so the bits are the same on every processor.
+written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²). All sums have a fixed order,
+so the bits are the same on every processor.
 """
 
 import numpy as np
@@ -26,11 +26,10 @@ def step(
     measurements: Float[np.ndarray, "k 2"],
     sensor: Triple,
 ) -> bool:
-    """Perform one step; before it only the pose and the first `known` landmarks are in mean and P.
+    """Perform one step on the pose and the first `known` landmarks; False: invalid mean and P.
 
-    slots: landmark of each measurement in the state; first: first sight of it. Further measurements
-    of a new landmark update it after its placement. False where the innovation covariance is not
-    positive definite; mean and P are then invalid.
+    slots: landmark of each measurement in the state; first: first sight of it. Fails if the
+    innovation covariance is not positive definite.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
@@ -88,7 +87,7 @@ def _place(
     """Place a new landmark in the entries `at` and at + 1 of the state.
 
     g = (x, y) + r (cos, sin)(theta + b): with G_p = ∂g/∂pose its rows are P_l· = G_p P_p· and P_ll
-    = G_p P_pp G_pᵀ + G_z R G_zᵀ, so its error includes the pose's.
+    = G_p P_pp G_pᵀ + G_z R G_zᵀ.
     """
     noise = (sensor[0], sensor[1], 1.0, sensor[2], 1.0)
     (mean[at : at + 2],), (own,) = core.place(mean[:3], measurement[None], noise, NO_CLAIM)
@@ -132,7 +131,7 @@ def _condition(
 ) -> bool:
     """Update by measurements of the landmarks at `places`, all linearised at the state before them.
 
-    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`. False where S is not
+    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`. False if S is not
     positive definite.
     """
     m = 2 * len(places)
@@ -177,10 +176,7 @@ def _joseph(
 
 
 def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) -> bool:
-    """B ← S⁻¹ B by Cholesky, S = L Lᵀ; the lower triangle of S becomes L.
-
-    False where S is not positive definite.
-    """
+    """B ← S⁻¹ B by Cholesky, S = L Lᵀ, in place; False if S is not positive definite."""
     m = len(S)
     for k in range(m):
         if not S[k, k] > 0.0:

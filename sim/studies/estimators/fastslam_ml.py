@@ -1,8 +1,7 @@
 """FastSLAM 1.0 with maximum-likelihood data association in each particle.
 
-Montemerlo and Thrun 2003: each particle assigns a detection to its likeliest landmark, or to a new
-one where none reaches the likelihood at the gate's edge. Maps differ in size, so there is no common
-state; map and association are the heaviest particle's.
+Montemerlo and Thrun 2003: a detection belongs to the likeliest landmark, or to a new one if none
+reaches the likelihood at the gate's edge. The map is the heaviest particle's.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ class FastSlamMl:
 
 
 def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
-    """Particles without landmarks; logs: of the weights."""
+    """Make particles without landmarks; logs: of the weights."""
     particles = len(poses)
     return FastSlamMl(
         poses=poses,
@@ -73,7 +72,7 @@ def filter_step(
 
 
 class _Scan:
-    """A scan in progress: the state's arrays, and the landmarks already used."""
+    """Scan in progress: the state's arrays, and the used landmarks."""
 
     def __init__(self, state: FastSlamMl) -> None:
         self._state = state
@@ -152,7 +151,6 @@ class _Scan:
         self._counts[at] += 1
 
     def state(self) -> FastSlamMl:
-        """Particles after the scan."""
         took = self._state.took
         if self._took:
             took = np.column_stack((took, *self._took))
@@ -203,7 +201,7 @@ def _resample(state: FastSlamMl, below: float, generator: np.random.Generator) -
     )
 
 
-def taken(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
+def slots_of_detections(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
     """Landmark of each detection in the heaviest particle."""
     numbers: Int64[np.ndarray, " N"] = UNNAMED + state.took[int(np.argmax(state.logs))]
     return numbers
@@ -220,7 +218,7 @@ def pose_gaussian(state: FastSlamMl) -> PoseGaussian:
 
 
 def landmark_gaussian(state: FastSlamMl) -> LandmarkGaussian:
-    """Map of the heaviest particle; its landmarks are independent given its path."""
+    """Map of the heaviest particle."""
     best = int(np.argmax(state.logs))
     count = int(state.counts[best])
     if not count:

@@ -1,4 +1,4 @@
-"""Feedback: a fused map replaces the landmarks of a robot's own map, and is counted twice."""
+"""Feedback: a fused map replaces a robot's landmarks, and is counted twice."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float, Int64, UInt32
 
 
-def carried_along(
+def carry_along(
     mean: Vector,
     covariance: Matrix,
     shared: Int64[np.ndarray, " k"],
@@ -17,13 +17,11 @@ def carried_along(
     new_covariance: Float[np.ndarray, "m m"],
     in_new: Int64[np.ndarray, " k"],
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-    """The joint Gaussian of (own others o, everything new) after the shared part s was replaced.
+    """Joint Gaussian of (own others o, everything new) after the shared part s was replaced.
 
-    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new Gaussian
-    N(m, C), which replaces their marginal. The conditional of o given s stays (Jeffrey's rule):
-    with the regression K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s),
-    P_oo − K P_so + K C_ss Kᵀ, and K C_s· with everything new. Nothing shared: both stay as they
-    are, independent.
+    The entries `shared` of N(mean, covariance) are the entries `in_new` of the new N(m, C). The
+    conditional of o given s stays (Jeffrey's rule): with K = P_os P_ss⁻¹ the others have x_o + K
+    (m_s − x_s), P_oo − K P_so + K C_ss Kᵀ, and K C_s· with everything new.
     """
     others = np.setdiff1d(np.arange(len(mean)), shared)
     own = information(covariance[np.ix_(shared, shared)], "the part to be replaced")
@@ -45,14 +43,12 @@ def absorb_fused_map(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """Replace the marginal of the landmarks by the fused map; update pose and other landmarks by
-    regression (`carried_along`).
+    """Replace the marginal of the landmarks by the fused map; update the rest by `carry_along`.
 
-    Unknown landmarks are added. The fused map contains this robot's own measurements: they are
-    counted twice if the result is sent for fusion.
+    Unknown landmarks are added.
     """
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
-    mean, joint = carried_along(
+    mean, joint = carry_along(
         whole.mean,
         whole.covariance,
         3 + _points(in_whole),

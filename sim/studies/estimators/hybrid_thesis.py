@@ -1,9 +1,9 @@
 """Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
-W. Xu, sections 4.2 and 4.3. The reset discards the correlation of pose and landmarks and all pose
-uncertainty but the last step's, so the covariances are far too small; `window` avoids this. Two
-corrections: the initial covariance of a landmark follows from the measurement (thesis: 30 m), and
-the weights start anew with each step, as in the text, not the program.
+W. Xu, sections 4.2 and 4.3. The reset discards correlations and all pose uncertainty but the last
+step's, so covariances are far too small; `window` avoids this. Two corrections: a landmark's
+initial covariance follows from the measurement (thesis: 30 m), and weights start anew with each
+step.
 """
 
 from dataclasses import dataclass
@@ -35,8 +35,8 @@ class ThesisState:
     covariances: Float[np.ndarray, "L 2 2"]
 
 
-def started(pose: Pose) -> ThesisState:
-    """An exact pose without landmarks."""
+def initial_state(pose: Pose) -> ThesisState:
+    """Start at an exact pose without landmarks."""
     return ThesisState(
         pose, np.zeros((3, 3)), np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 2, 2))
     )
@@ -68,7 +68,7 @@ def filter_step(
     )
     mean, P = moments(after.poses, core.exp(after.log_weights), after.means, after.covariances, 1.0)
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
-    return absorbed(
+    return absorb_map(
         ThesisState(mean[:3], P[:3, :3], state.ids, state.landmarks, state.covariances),
         after.ids,
         mean[3:].reshape(-1, 2),
@@ -77,7 +77,7 @@ def filter_step(
 
 
 def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> Particles:
-    """Particles at the mean with these landmarks, without correlations or pose covariance."""
+    """Particles at the mean, without correlations or pose covariance."""
     observed = np.isin(state.ids, ids)
     blocks = state.covariances[observed]
     triangles = np.stack((blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]), axis=1)
@@ -90,17 +90,13 @@ def reset(state: ThesisState, ids: UInt32[np.ndarray, " n"], particles: int) -> 
     )
 
 
-def absorbed(
+def absorb_map(
     state: ThesisState,
     ids: UInt32[np.ndarray, " n"],
     landmarks: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
 ) -> ThesisState:
-    """Replace the state's landmarks of the same id; add unknown ones.
-
-    The feedback of the thesis' fused map (section 5.2): fusing the result again counts measurements
-    again.
-    """
+    """Replace the landmarks of the same id; add unknown ones (section 5.2)."""
     others = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[others], ids))
     order = np.argsort(merged)

@@ -1,10 +1,9 @@
 """Hybrid-SLAM as in the appendix of W. Xu's thesis, where its program differs from its text.
 
-Poses and landmarks become their weighted mean after each step, as in the text (`hybrid_thesis`);
-but the weights carry over (`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without
-resampling: soon a few particles carry all the weight. Each particle keeps its own landmark
-covariances: those of eq. 4.6 are computed and not used. A new landmark begins with 15 m and 17.8°,
-rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
+Poses and landmarks become their weighted mean after each step, but weights carry over
+(`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without resampling. Each particle
+keeps its own landmark covariances; those of eq. 4.6 are unused. A new landmark begins with 15 m and
+17.8°, rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
 """
 
 import math
@@ -29,18 +28,14 @@ FIRST_BEARING_VAR = 10.0 * math.pi / 18.0**2
 
 @dataclass(frozen=True)
 class CodedState:
-    """The particles before and after they were set to their mean.
-
-    drawn: the last step's particles, whose pose and map are reported. particles: at the mean, with
-    own weights and covariances.
-    """
+    """Particles before (`drawn`, reported) and after they were set to their mean."""
 
     drawn: Particles
     particles: Particles
 
 
-def started(pose: Pose, particles: int) -> CodedState:
-    """An exact pose without landmarks."""
+def initial_state(pose: Pose, particles: int) -> CodedState:
+    """Start at an exact pose without landmarks."""
     at = fastslam.at_poses(np.tile(pose, (particles, 1)))
     return CodedState(at, at)
 
@@ -95,7 +90,7 @@ def _at_first(
 
 
 def pose_gaussian(state: CodedState) -> PoseGaussian:
-    """Moments of the last step's particles: the only stored uncertainty of a pose."""
+    """Moments of the last step's particles."""
     return pose_moments(state.drawn)
 
 
@@ -106,13 +101,13 @@ def landmark_gaussian(state: CodedState) -> LandmarkGaussian:
     return LandmarkGaussian(found.ids, found.means, found.covariance * blocks)
 
 
-def absorbed(
+def absorb_map(
     state: CodedState,
     ids: UInt32[np.ndarray, " n"],
     landmarks: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
 ) -> CodedState:
-    """Replace these landmarks and covariances in every particle (`recieve_information`)."""
+    """Replace these landmarks in every particle (`recieve_information`)."""
     old, count = state.particles, len(state.particles.poses)
     others = ~np.isin(old.ids, ids)
     triangles = np.stack((covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]), axis=1)

@@ -1,4 +1,4 @@
-"""The innovations of a keyframe's measurements, for estimators whose window does not compute them.
+"""Innovations of a keyframe's measurements, for estimators without a window.
 
 Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2.
 """
@@ -28,20 +28,14 @@ def innovation(
     bearings: Float[np.ndarray, " n"],
     own: Own | None = None,
 ) -> Innovation:
-    """ν = z − ẑ of one keyframe's measurements in the metric of their joint predictive covariance
-    S.
+    """ν = z − ẑ of one keyframe's measurements in the metric of their joint predictive covariance.
 
-    The particles of the keyframe before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of all measurements of
+    The particles of the keyframe before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of measurements of
     landmarks that they know; ẑ and S are its moments, bearings on the circle:
-
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
         S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
-
-    It is the prediction before the measurements: FastSLAM 2.0 draws its particles from a proposal
-    that has seen them, so after that step there is no innovation left to judge. A first sight has a
-    flat prior and is left out. ranges [m] and bearings [rad] are accepted and corrected by the
-    calibration, own are the noises that they claim. R is white, as in the particles' weights.
-    Raises NotACovarianceError if S is not positive definite.
+    First sights are left out. ranges [m] and bearings [rad] are accepted and calibrated; own: their
+    noises. R is white. Raises NotACovarianceError if S is not positive definite.
     """
     noises = unclaimed(len(ids)) if own is None else own
     with CoreErrors():
@@ -49,7 +43,7 @@ def innovation(
         squared, error, S = window.innovation(
             increment.mean, increment.covariance, ids, ranges, bearings, noises
         )
-    return _judged(squared, error, S) if len(error) else NOTHING
+    return _innovation_of(squared, error, S) if len(error) else NOTHING
 
 
 def joint_innovation(
@@ -62,12 +56,11 @@ def joint_innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """As `innovation`, of one Gaussian over the pose and the landmarks, such as that of an EKF.
+    """As `innovation`, of one Gaussian over pose and landmarks, such as an EKF's.
 
         S = A P Aᵀ + Hₓ Q Hₓᵀ + R,  A = (Hₓ Gᵀ F, Hₗ),
-
-    F = ∂(pose ∘ mean)/∂pose, and G = blkdiag(R(θ'), 1) turns the tangent of the predicted pose into
-    (x, y, θ). mean: (x, y, θ) and the position of each of `landmarks`, N = 3 + 2 L.
+    F = ∂(pose ∘ mean)/∂pose; G = blkdiag(R(θ'), 1). mean: (x, y, θ) and the position of each of
+    `landmarks`, N = 3 + 2 L.
     """
     _, at, _ = slots_of(landmarks, ids)
     known = at < len(landmarks)
@@ -97,13 +90,13 @@ def joint_innovation(
         + dense.product(dense.product(H, increment.covariance), H.T)
         + np.diag(R)
     )
-    return _judged(core.normalised_square(error, S), error, S)
+    return _innovation_of(core.normalised_square(error, S), error, S)
 
 
 def slots_of(
     known: UInt32[np.ndarray, " L"], observed: UInt32[np.ndarray, " n"]
 ) -> tuple[UInt32[np.ndarray, " K"], Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Find the ids after the measurements, the slot of each of them, and which are first sights."""
+    """Ids after the measurements, their slots, and a mask of first sights."""
     slot = {each: k for k, each in enumerate(known.tolist())}
     slots, first = np.empty(len(observed), np.int64), np.zeros(len(observed), np.bool_)
     for k, each in enumerate(observed.tolist()):
@@ -112,10 +105,9 @@ def slots_of(
     return np.array(list(slot), np.uint32), slots, first
 
 
-def _judged(
+def _innovation_of(
     squared: float, error: Float[np.ndarray, " m"], S: Float[np.ndarray, "m m"]
 ) -> Innovation:
-    """The core's square, unless it found none: rank and finiteness are judged here."""
     if not math.isfinite(squared):
         white = dense.forward(cholesky_factor(S, "the prediction of measurements"), error)
         squared = float(dense.product(white, white))

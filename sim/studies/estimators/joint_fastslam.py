@@ -1,8 +1,7 @@
 """Multi-robot FastSLAM: a particle is a path of every robot and one map.
 
 p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for any
-number of robots at known start poses. The particles must cover the product of all paths, so
-over-confidence comes sooner than with one robot (`plain_fastslam`).
+number of robots at known start poses. Over-confidence comes sooner than with one robot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,9 +23,9 @@ from teamslam.team.shapes import Float, UInt32
 class JointFastSlam:
     """M particles (x¹, …, xᴿ, m, w).
 
-    poses: (x [m], y [m], theta [rad]) by robot and particle, in the map frame. log_weights, ids,
-    means, covariances: as in `fastslam.Particles`. resample_below: relative effective sample size
-    below which a step begins with a resampling; 1: always, as in algorithm 1.
+    poses: (x [m], y [m], theta [rad]) by robot and particle, in the map frame. Others as in
+    `fastslam.Particles`. resample_below: relative effective sample size below which a step begins
+    with a resampling; 1: always, as in algorithm 1.
     """
 
     robots: tuple[str, ...]
@@ -42,7 +41,7 @@ class JointFastSlam:
 def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
-    """Exact poses; for an uncertain one a first turn by Increment(0, covariance)."""
+    """Start at exact poses; for an uncertain one begin with a turn by Increment(0, covariance)."""
     none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
         robots=tuple(poses),
@@ -61,10 +60,8 @@ def filter_step(
 ) -> JointFastSlam:
     """Resample if the particles are thin, then process the robots' turns in order.
 
-    Each turn multiplies the weights by its own p(zʳ | …); with the 2.0 proposal a pose is drawn
-    given its measurements and the map after the earlier turns. A step may be one robot's turn, so
-    robots need not be synchronous. Draws one uniform number if it resamples and M × 3 normal ones
-    per turn. Raises ValueError for an unknown robot.
+    Each turn multiplies the weights by p(zʳ | …). A step may be one robot's turn. Draws one uniform
+    number if it resamples and M × 3 normal ones per turn. Raises ValueError for an unknown robot.
     """
     thin = state.resample_below * len(state.log_weights)
     if fastslam.effective_sample_size(state.log_weights) < thin:
@@ -103,7 +100,7 @@ def filter_step(
 
 
 def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
-    """Mean and covariance of one robot's poses; raises ValueError for an unknown robot."""
+    """Mean and covariance of one robot's poses; raises ValueError for an unknown one."""
     return pose_moments(_particles_of(state, state.robots.index(robot)))
 
 

@@ -1,8 +1,7 @@
 """Monte Carlo localisation: a cloud of weighted poses on an exactly known map.
 
 p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1 (eq. 3.23 to
-3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The cloud may have many modes, so the
-start may be unknown.
+3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The start may be unknown.
 """
 
 import math
@@ -30,8 +29,7 @@ class Localisation:
     """Weighted poses and their map.
 
     cloud: particles without landmarks, in the map frame. ids, landmarks: the map, ids strictly
-    ascending, [m]. resample_below: relative effective sample size below which a step resamples; Xu:
-    0.5.
+    ascending, [m]. resample_below: relative effective sample size below which a step resamples.
     """
 
     cloud: Particles
@@ -46,7 +44,7 @@ def initial_state(
     ids: UInt32[np.ndarray, " L"],
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
-    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
@@ -58,10 +56,7 @@ def initial_state_anywhere(
     landmarks: Float[np.ndarray, "L 2"],
     generator: np.random.Generator,
 ) -> Localisation:
-    """Uniform over a rectangle [m] and all headings (Xu, figure 3.5a).
-
-    The particles must be dense enough for some to fit the first measurements.
-    """
+    """Draw poses uniformly over a rectangle [m] and all headings (Xu, figure 3.5a)."""
     low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
     poses = high - (high - low) * generator.random((particles, 3))
     return Localisation(fastslam.at_poses(poses), ids, landmarks)
@@ -106,10 +101,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Innovation of the measurements that `filter_step` would use, on an exact map.
-
-    Uninformative for a cloud of several modes.
-    """
+    """Innovation of the measurements that `filter_step` would use; for one mode only."""
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())
     on_map = replace(
@@ -122,7 +114,7 @@ def innovation(
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:
-    """Mean and covariance of the cloud; uninformative for several modes."""
+    """Mean and covariance of the cloud."""
     return pose_moments(state.cloud)
 
 

@@ -1,8 +1,7 @@
 """EKF-SLAM over the whole run with nearest-neighbour data association.
 
-Smith, Self and Cheeseman 1990 with individual compatibility and nearest neighbour (Neira and Tardós
-2001, section II): the best pair of a scan first, each detection and landmark once; beyond the gate
-a landmark is new. A wrong pair is never undone.
+Smith, Self and Cheeseman 1990 with individual compatibility (Neira and Tardós 2001, section II):
+the best pair of a scan first, each detection and landmark once; beyond the gate a landmark is new.
 """
 
 from dataclasses import dataclass, replace
@@ -24,14 +23,14 @@ from teamslam.team.shapes import Float, Int64, UInt32
 
 @dataclass(frozen=True)
 class NearestNeighbour:
-    """The filter, and the landmark of each detection so far."""
+    """Filter, and the landmark of each detection so far."""
 
     slam: EkfSlam
     took: tuple[Int64[np.ndarray, " _"], ...] = ()
 
 
 def initial_state(pose: Pose) -> NearestNeighbour:
-    """Exact pose."""
+    """Start at an exact pose."""
     return NearestNeighbour(ekf_slam.initial_state(pose))
 
 
@@ -62,9 +61,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Innovation of the measurements that `filter_step` would use, after association: ids from
-    UNNAMED on are rows of a scan.
-    """
+    """Innovation of the measurements that `filter_step` would use."""
     if (ids >= UNNAMED).any():
         _, ids = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, GATE)
     return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)
@@ -93,7 +90,6 @@ def _associate(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> UInt32[np.ndarray, " n"]:
-    """Landmark number of each detection; new ones continue from the last."""
     known = np.flatnonzero(slam.ids >= UNNAMED)
     predicted, spread = predictions(slam, known)
     R = np.zeros((len(ranges), 2, 2))

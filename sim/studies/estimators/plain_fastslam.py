@@ -1,8 +1,7 @@
 """FastSLAM over the whole run: one set of particles from start to end.
 
-Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Resampling discards paths for
-good: after a long run all particles share their early path, so the landmarks' covariance is far too
-small, unlike that of `window`.
+Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. After a long run the particles
+share their early path, so the landmarks' covariance is far too small.
 """
 
 from dataclasses import dataclass, replace
@@ -25,8 +24,8 @@ from teamslam.team.shapes import Float, UInt32
 class PlainFastSlam:
     """Weighted particles in the map frame, with their proposal and resampling.
 
-    resample_below: relative effective sample size below which a step resamples (Xu, eq. 3.24-3.25:
-    0.5); 1: always, as Ma & Ma and Montemerlo do.
+    resample_below: relative effective sample size below which a step resamples (Xu: 0.5); 1: always
+    (Ma & Ma, Montemerlo).
     """
 
     particles: Particles
@@ -37,7 +36,7 @@ class PlainFastSlam:
 def initial_state(
     pose: Pose, particles: int, proposal: Proposal, resample_below: float
 ) -> PlainFastSlam:
-    """Exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 
@@ -52,7 +51,7 @@ def filter_step(
     generator: np.random.Generator,
     own: Own | None = None,
 ) -> PlainFastSlam:
-    """Resample if the particles are thin, move, and update (`propagated_and_updated`)."""
+    """Resample if the particles are thin, move, and update."""
     particles, _ = fastslam.propagated_and_updated(
         particles=state.particles,
         increment=increment,
@@ -79,7 +78,7 @@ def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
 
 
 def pose_moments(particles: Particles) -> PoseGaussian:
-    """Moments of the weighted poses; singular where fewer than four of them differ."""
+    """Moments of the weighted poses; singular below four different ones."""
     none = particles.means[:, :0], particles.covariances[:, :0]
     weights = core.exp(particles.log_weights)
     return PoseGaussian(*moments(particles.poses, weights, *none, 1.0))

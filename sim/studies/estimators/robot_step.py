@@ -14,16 +14,13 @@ from teamslam.team.estimation.se2 import Pose, tangent
 from teamslam.team.shapes import Float, UInt32
 
 POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
-"""Added to a running pose's covariance [m², m², rad²], singular for an exact start, motion without
-lateral noise, or fewer than four different particles.
-"""
+"""Added to a pose's covariance [m², m², rad²], which may be singular."""
 
 
 class RobotStep(NamedTuple):
-    """A robot's motion since its last turn, then its measurements at the end of it.
+    """Motion of a robot since its last turn, then measurements at the end of it.
 
-    ranges [m] and bearings [rad] are calibrated; own: their covariances
-    (`teamslam.team.estimation.scans`), or no rows.
+    ranges [m] and bearings [rad] are calibrated; own: their covariances, or no rows.
     """
 
     robot: str
@@ -47,7 +44,7 @@ class RobotStep(NamedTuple):
 
 
 def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
-    """A motion by nothing with the noise of an initial pose N(pose, covariance).
+    """Zero motion with the noise of an initial pose N(pose, covariance).
 
     In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
     """
@@ -57,7 +54,7 @@ def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
 
 
 def variances(sensor: Sensor) -> tuple[float, float, float]:
-    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²]), the kernels' form of a sensor."""
+    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²])."""
     return (
         core.squared(sensor.range_sigma),
         core.squared(sensor.range_sigma_per_m),

@@ -1,4 +1,4 @@
-"""Distance and direction of landmarks, elementwise on arrays of any shape that broadcast."""
+"""Distance and direction of landmarks, elementwise."""
 
 import numpy as np
 

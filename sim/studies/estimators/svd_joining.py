@@ -1,9 +1,8 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
-Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1) with their means only: P is
-the identity, so a radian of heading counts as a metre (sections 3.2 and 4.3). Robots that measure
-each other exchange maps, rotate one into the other's frame by a singular value decomposition and
-join the landmarks alone (section 4.3 and appendix II). The minimiser is that of `joining`.
+Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1) with P the identity: a radian
+counts as a metre (sections 3.2 and 4.3). Robots that measure each other exchange maps, rotate one
+into the other's frame by SVD and join the landmarks alone (section 4.3, appendix II).
 """
 
 from collections.abc import Mapping
@@ -39,12 +38,11 @@ class TooFewPointsError(ValueError):
         self.points = points
 
 
-def weighted(local: LocalMap, weighting: Weighting) -> LocalMap:
-    """The submap with the covariance for the join.
+def reweight(local: LocalMap, weighting: Weighting) -> LocalMap:
+    """Replace a submap's covariance for the join.
 
     "identity": I. "spherical": a position and every landmark get half the trace of their block
-    times I, a heading keeps its variance, correlations are dropped (each block commutes with
-    rotations, as Huang's count of minima requires). "full": unchanged.
+    times I, a heading keeps its variance, correlations are dropped. "full": unchanged.
     """
     if weighting == "full":
         return local
@@ -67,7 +65,7 @@ class SubmapJoining:
 
 
 def initial_state(poses: Mapping[str, Pose], weighting: Weighting = "identity") -> SubmapJoining:
-    """No submaps; start poses are exact."""
+    """Begin without submaps; start poses are exact."""
     fold = EMPTY_FOLD
     for robot, pose in poses.items():
         fold = joining.add_start(fold, InitialPoseFactor(robot, 0, pose))
@@ -78,20 +76,19 @@ def filter_step(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoin
     """Add a robot's next submap and iterate."""
     count = len(state.fold.contributions)
     sequence = state.fold.next_sequence((robot, 0))
-    taken = Contribution(robot, 0, sequence, count, weighted(local, state.weighting))
+    taken = Contribution(robot, 0, sequence, count, reweight(local, state.weighting))
     return replace(state, fold=joining.fold_submaps(state.fold, [taken], SETTINGS))
 
 
-def solved(state: SubmapJoining) -> SubmapJoining:
+def solve(state: SubmapJoining) -> SubmapJoining:
     """The full least-squares solution."""
     return replace(state, fold=joining.solve_fold(state.fold, SETTINGS))
 
 
 def variance_factor(state: SubmapJoining) -> float:
-    """Variance factor σ̂² that scales the covariance of the solution.
+    """Variance factor σ̂² of the solution's covariance.
 
-    With the identity the residuals determine the size of the errors: σ̂² = Σ‖r‖²/(residuals −
-    unknowns), the variance of unit weight (1 without redundancy). Else 1.
+    With the identity Σ‖r‖²/(residuals − unknowns), 1 without redundancy; else 1.
     """
     island = state.fold.main
     redundancy = int(island.graph.dimensions.sum()) - island.graph.unknowns
@@ -120,7 +117,7 @@ NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)))
 
 
 class ExchangedMap(NamedTuple):
-    """The union of two maps, and the second's pose in the first."""
+    """Union of two maps, and the second's pose in the first."""
 
     landmarks: LandmarkGaussian
     a_from_b: PoseGaussian
@@ -134,31 +131,24 @@ def mutual_sighting(
     range_to_a: float,
     bearing_to_a: float,
 ) -> PointPairs:
-    """The positions of two robots that measure each other, as points in both maps.
-
-    Each is at its own map's pose and, in the other map, at its measured position; these replace
-    shared poses (Downs, chapter 3).
-    """
+    """Positions of two robots that measure each other in both maps (Downs, chapter 3)."""
     return PointPairs(
         np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
         np.stack((located(pose_b, range_to_a, bearing_to_a), pose_b[:2])),
     )
 
 
-def exchanged(
+def exchange_maps(
     a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS
 ) -> ExchangedMap:
     """Join two maps in the frame of a, by their common landmarks and the robots' positions.
 
-    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): given (R, t), each common
-    xᵢ is the middle of its two points, and the remaining ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised in
-    closed form by singular values (`procrustes`). So first rotating and then joining gives the
-    whole minimum.
-
-    With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have
-    σ̂² D + E Σ_T Eᵀ: D = 1 and E = 0 for those of a alone, 1 and G for those of b alone, 1/2 and
-    G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances, and with them
-    their drift, are discarded. Raises TooFewPointsError for n < 2.
+    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): each common xᵢ is the
+    middle of its two points, and ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised by singular values
+    (`procrustes`). With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the
+    landmarks have σ̂² D + E Σ_T Eᵀ: D = 1, E = 0 for those of a alone, 1 and G for those of b
+    alone, 1/2 and G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances
+    are discarded. Raises TooFewPointsError for n < 2.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -206,13 +196,11 @@ STANDS_STILL = 1e-9
 """Largest change of a coordinate [m, rad] in the last step."""
 
 
-def exchanged_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
+def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
     """Join two independent maps in the frame of a, each with its own covariance.
 
-    argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over the points x and (t, θ), from the
-    motion of `exchanged`; the covariance is (JᵀWJ)⁻¹. This is Downs' exchange with the maps' own
-    covariances, which include their drift. Raises TooFewPointsError for fewer than two common
-    landmarks, NotACovarianceError.
+    argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over x and (t, θ); covariance (JᵀWJ)⁻¹.
+    Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError.
     """
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     if len(in_a) < NEEDED:
@@ -252,7 +240,7 @@ def columns_of(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
 def _express_from(
     state: Float[np.ndarray, " n"], columns: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"]]:
-    """Rᵀ(x − t) of the points in these columns, and its derivative by the whole (t, θ, x)."""
+    """Rᵀ(x − t) of the points in these columns, and its derivative by (t, θ, x)."""
     s, c = core.sin_and_cos(state[2])
     back = np.array([[c, s], [-s, c]])
     offsets = state[columns].reshape(-1, 2) - state[:2]

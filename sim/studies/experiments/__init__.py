@@ -4,12 +4,10 @@ To add an experiment:
 
 1. Write a module here with two functions. `tasks(options)` lists the runs: each `Task` names a
 function of this package with JSON parameters and a JSON result. A team's run is
-`team_runs.team_task(scenario)`; shared runs are computed once.
-2. `outcome(options, results)` makes an `Outcome`: figures, tables, pictures, goals, and remarks on
-differences from the source. `results.of(task)` is None for a failed run; `Outcome.missing` lists
-figures that need a data set.
+`team_runs.team_task(scenario)`.
+2. `outcome(options, results)` makes an `Outcome`. `results.of(task)` is None for a failed run;
+`Outcome.missing` lists figures that need a data set.
 3. Add an entry to `catalogue.py`.
 
-A result is stored in the output folder under its task and the digest of the imported sources: a
-repeated command computes only missing or outdated results.
+A result is stored in the output folder under its task and the digest of the imported sources.
 """

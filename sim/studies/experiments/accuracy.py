@@ -12,7 +12,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
-    combined,
+    combine_outcomes,
 )
 from teamslam.sim.studies.experiments.task import Task
 
@@ -32,7 +32,7 @@ _CHANCE = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Runs of all parts, each once."""
+    """List the runs of all parts, each once."""
     found = {task.name: task for part in PARTS for task in part.tasks(options)}
     return list(found.values())
 
@@ -42,4 +42,4 @@ def outcome(options: Options, results: Results) -> Outcome:
     parts = [part.outcome(options, results) for part in PARTS]
     few = len(options.seeds) < ENOUGH_SEEDS
     title = "accuracy and consistency of the fused map"
-    return combined(title, [Outcome(title, {}, remarks=(_CHANCE,) if few else ()), *parts])
+    return combine_outcomes(title, [Outcome(title, {}, remarks=(_CHANCE,) if few else ()), *parts])

@@ -1,11 +1,9 @@
 """Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
-A map is wrong in another minimum of the cost than the truth (`true_minimum`); its submaps exclude
-the truth where the cost there exceeds the 99.9 % quantile. A map is beyond its ellipsoid where its
-shape (without the rigid part), or the first pose of a robot that joined, is outside the 99.9 %
-region of its own covariance; in a curved valley of the cost this is more frequent, even in the
-right minimum. A wrong map without a warning is silent. An alarm is a warning of a right map about
-more than a large or nonlinear covariance.
+A map is wrong in another minimum of the cost than the truth (`true_minimum`), silent if no warning
+says so. Submaps exclude the truth if the cost there exceeds the 99.9 % quantile. A map is beyond
+its ellipsoid if its shape, or the first pose of a robot that joined, is outside its 99.9 % region.
+An alarm is a warning of a right map about more than a large or nonlinear covariance.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -29,7 +27,7 @@ COUNTS = (3, 4, 5)
 SEEN_EVERY_S = 5.0
 """Spacing [s] of the pose nodes for inter-robot measurements."""
 WIDE = ("is placed weakly", "farther off than its covariance")
-"""Parts of warnings about a map's covariances, not its minimum."""
+"""Parts of warnings about covariances, not minima."""
 SHOWN: Shown = (
     ("rmse_aligned", "aligned [m]", "{:.3f}"),
     ("aligned_median", "median [m]", "{:.3f}"),
@@ -46,7 +44,7 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Worlds by number of landmarks, with and without inter-robot measurements."""
+    """List the worlds by number of landmarks, and inter-robot measurements."""
     return [task for case in _cases(options).values() for task in case]
 
 
@@ -81,7 +79,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def few_figures(runs: list[Figures]) -> Figures:
-    """Figures over the seeds of one case, with counts of wrong and silent maps."""
+    """Figures over the seeds of one case."""
     figures = over_seeds(runs)
     if not runs:
         return figures
@@ -113,7 +111,7 @@ def _alarmed(run: Figures) -> bool:
 
 
 def is_beyond(run: Figures) -> bool:
-    """Whether the shape or a joined robot's first pose is beyond its 99.9 % ellipsoid."""
+    """Whether the shape or a first pose is beyond its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]
     if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:

@@ -1,7 +1,6 @@
-"""Compare maps with 30 % outliers with maps without them.
+"""Compare maps with 30 % outliers with maps without them, of equally many inliers.
 
-The clean run of the same seed leaves out the measurements that become outliers, so it has as many
-inliers. An outlier has a uniform range and bearing, or the identity of another landmark.
+An outlier has a uniform range and bearing, or the identity of another landmark.
 """
 
 import msgspec
@@ -28,9 +27,7 @@ from teamslam.sim.world.config import OutlierKind
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
 LANDMARK_SUBMAPS = 2
-"""Least number of submaps of a landmark, also in clean runs: a landmark of one submap may be an
-outlier.
-"""
+"""Least number of submaps of a landmark."""
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
 NAMES = {"drop": "clean", "measurement": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30
@@ -86,13 +83,12 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 def _tasks(world: str, kind: OutlierKind, options: Options) -> list[Task]:
     return [
-        team_task(_spoilt(with_options(load(world), seed=seed), kind), note=NAMES[kind])
+        team_task(_add_outliers(with_options(load(world), seed=seed), kind), note=NAMES[kind])
         for seed in options.seeds[:MOST_SEEDS]
     ]
 
 
-def _spoilt(scenario: Scenario, kind: OutlierKind) -> Scenario:
-    """The scenario with outliers, and a centre that requires two submaps of a landmark."""
+def _add_outliers(scenario: Scenario, kind: OutlierKind) -> Scenario:
     central = msgspec.structs.replace(scenario.central, landmark_submaps=LANDMARK_SUBMAPS)
     spoilt = with_world(scenario, outlier_share=SHARE, outlier_kind=kind)
     return msgspec.structs.replace(spoilt, central=central)

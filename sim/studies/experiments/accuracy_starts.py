@@ -1,7 +1,6 @@
 """Unknown initial poses: all robots but the first must be placed in the team's map.
 
-A merge is wrong where the first pose of a robot that joined lies outside its own 99.9 % ellipsoid.
-After a right merge only the map's position is undetermined, so maps are compared after alignment.
+A merge is wrong if the first pose of a robot that joined lies outside its own 99.9 % ellipsoid.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -30,7 +29,7 @@ SHOWN: Shown = (
 
 
 def is_wrong(chi2: float) -> bool:
-    """Whether χ² of a first pose exceeds the 99.9 % quantile (3 degrees of freedom)."""
+    """Whether χ² of a first pose exceeds the 99.9 % quantile."""
     return chi2 > chi2_limit(3, 0.001)
 
 
@@ -84,7 +83,7 @@ def _pairs(world: str, options: Options) -> list[tuple[Task, Task]]:
 
 
 def unknown_starts(scenario: Scenario) -> Scenario:
-    """The scenario with the first robot's initial pose only."""
+    """Keep the first robot's initial pose only."""
     return with_world(scenario, unknown_starts=tuple(robot.id for robot in scenario.robots[1:]))
 
 

@@ -1,8 +1,7 @@
 """Real data: every given UTIAS set, five robots, one fixed profile.
 
-The raw map lies according to the initial poses; `shape` is the error that no rigid motion explains,
-its NEES is per landmark: 2 for a correct covariance. The difference from the batch optimum under
-the same noise is the cost of the submaps.
+`shape` is the error that no rigid motion explains; its NEES per landmark is 2 for a correct
+covariance.
 """
 
 from collections.abc import Mapping
@@ -21,9 +20,7 @@ from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, Shown, table_of, team_task
 
 NORMAL_SCALE = (0.8, 1.25)
-"""Bounds of the monitor's covariance scale without truth, in units of the profile's
-`normal_scale`.
-"""
+"""Bounds of the monitor's covariance scale without truth, in units of `normal_scale`."""
 MOST_ALIGNED_M = {"1": 0.027, "2": 0.022, "6": 0.024}
 """Largest aligned error [m] by the data set's number."""
 MOST_RAW_TRAJECTORY_M = {"1": 0.035, "2": 0.070, "6": 0.116}

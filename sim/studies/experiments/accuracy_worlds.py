@@ -1,7 +1,4 @@
-"""Simulated worlds under every pair of estimator and rule, with the batch MAP.
-
-NEES is per degree of freedom: 1 for a correct covariance.
-"""
+"""Simulated worlds under every pair of estimator and rule, with the batch MAP."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -20,8 +17,8 @@ from teamslam.sim.studies.experiments.team_runs import (
     OURS,
     Figures,
     Shown,
-    named,
     over_seeds,
+    pair_name,
     table_of,
     team_task,
 )
@@ -29,9 +26,9 @@ from teamslam.team.pairs import PAIRS
 
 
 class World(NamedTuple):
-    """A world: its scenario, its most seeds, and the goals of the default pair.
+    """World: its scenario, its most seeds, and the goals of the default pair.
 
-    rules: every valid pair runs, not only the default. batch: with the batch MAP.
+    rules: every valid pair runs. batch: with the batch MAP.
     """
 
     scenario: str
@@ -89,8 +86,8 @@ def outcome(options: Options, results: Results) -> Outcome:
         runs = {rule: results.of_all(cell) for rule, cell in cells[world.scenario].items()}
         figures = world_figures(runs)
         worlds[world.scenario] = figures
-        goals += _goals(world, figures.get(named(*OURS), {}))
-        seeds = seed_count(figures.get(named(*OURS), {}).get("seeds", 0))
+        goals += _goals(world, figures.get(pair_name(*OURS), {}))
+        seeds = seed_count(figures.get(pair_name(*OURS), {}).get("seeds", 0))
         tables.append(table_of(f"{world.scenario}, {seeds}", "rule", figures, SHOWN))
     return Outcome("simulated worlds", {"worlds": worlds}, tuple(tables), goals=tuple(goals))
 
@@ -98,10 +95,12 @@ def outcome(options: Options, results: Results) -> Outcome:
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
     """Figures over the seeds of each rule of one world, and of the batch.
 
-    ratio: of the RMS landmark errors to the batch's.
+    ratio: RMS landmark error over the batch's.
     """
     figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
-    batches = {run["seed"]: run["batch"] for run in runs.get(named(*OURS), []) if "batch" in run}
+    batches = {
+        run["seed"]: run["batch"] for run in runs.get(pair_name(*OURS), []) if "batch" in run
+    }
     if batches:
         figures["batch"] = over_seeds(list(batches.values())) | {"ratio": 1.0}
     for rule, of_rule in runs.items():
@@ -123,7 +122,7 @@ def _worlds(options: Options) -> list[World]:
 def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
     return {
         world.scenario: {
-            named(estimator, fusion): [
+            pair_name(estimator, fusion): [
                 team_task(
                     with_options(
                         load(world.scenario), seed=seed, estimator=estimator, fusion=fusion

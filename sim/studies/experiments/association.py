@@ -1,9 +1,4 @@
-"""Accuracy of data association over landmark spacing, clutter and missed detections.
-
-One simulated place, four systems: ours without and with identities, an EKF over the whole run with
-nearest neighbour, and FastSLAM with maximum-likelihood association per particle. The sensors differ
-only in their noise; one parameter is varied at a time.
-"""
+"""Accuracy of data association over landmark spacing, clutter and missed detections."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +11,7 @@ from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.experiments.drawing import figure, ruled
+from teamslam.sim.studies.experiments.drawing import add_grid, figure
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
@@ -28,12 +23,12 @@ from teamslam.sim.studies.experiments.team_runs import (
 )
 from teamslam.team.config import Estimator, FusionRule
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.figure import Figure
 
 SIZE_M, LANDMARKS, VIEW_M, STEPS = 60.0, 40, 12.0, 150
 SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5
-"""Mean distance of a landmark from its nearest neighbour, for uniform landmarks."""
+"""Mean distance of a landmark from its nearest neighbour."""
 RATIOS = (4.0, 6.0, 10.0, 20.0, 40.0)
 CLUTTER = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 MISSED = (0.0, 0.1, 0.2, 0.3, 0.5)
@@ -75,7 +70,7 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """Each axis, value, system and seed; common runs once."""
+    """List each axis, value, system and seed; common runs once."""
     runs = [
         task
         for axis in AXES
@@ -123,7 +118,7 @@ def association_run(
     missed: float,
     seed: int,
 ) -> dict[str, Any]:
-    """Figures of one run; baselines have one robot, since they do not merge maps."""
+    """Figures of one run; baselines have one robot."""
     alone = fusion == "alone"
     scenario = load("waypoints")
     error_m = SPACING_M / ratio
@@ -202,12 +197,12 @@ def _means(runs: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> Picture:
     def draw(path: Path) -> None:
-        drawn(axis, of_axis).savefig(path, dpi=120)
+        draw_curves(axis, of_axis).savefig(path, dpi=120)
 
     return Picture(axis.replace(" / ", "-"), f"Association over {axis}.", draw)
 
 
-def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
+def draw_curves(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
     """Six panels, with one colour per system."""
     shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
     made = figure(12.0, 6.0)
@@ -233,7 +228,7 @@ def drawn(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> 
             axes.yaxis.set_minor_formatter("{x:g}")
         if name in ("duplicates", "merges_wrong"):
             axes.set_ylim(0.0, max(1.0, axes.get_ylim()[1]))
-        ruled(axes)
+        add_grid(axes)
     order = [system.name for system in SYSTEMS if system.name in curves]
     made.legend(
         [curves[name] for name in order],

@@ -1,4 +1,4 @@
-"""Compute cases in parallel and store their results on disk, with joblib's workers and memory.
+"""Compute cases in parallel and store their results, with joblib's workers and memory.
 
 A case that fails or dies loses only itself.
 """
@@ -52,12 +52,13 @@ class Cases:
         return result
 
     def run(self, tasks: Sequence[Task], jobs: int) -> Iterator[Done]:
-        """Compute the cases, `jobs` at a time; yields each as it is done, in no fixed order.
+        """Compute the cases, `jobs` at a time, the longest first; yield each as it is done.
 
-        Long cases begin first. Leaving the iterator ends the workers.
+        Leaving the iterator ends the workers.
         """
-        # An idle worker may end just as it gets a case; joblib warns and starts another. With
-        # warnings as errors joblib's thread would end instead.
+        # An idle worker may end just as it gets a case; joblib warns and starts another. As an
+        # error
+        # the warning would end joblib's thread.
         warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
         waiting = {task.name: task for task in sorted(tasks, key=lambda task: -task.cost)}
         with parallel_config("loky", inner_max_num_threads=1, idle_worker_timeout=IDLE_S):
@@ -93,11 +94,7 @@ class Cases:
 
 @contextmanager
 def _cancelling() -> Iterator[None]:
-    """Suppress the pool's message about a cancelled case.
-
-    Loky kills the workers first; its thread then fails with a KeyError on a case being handed over
-    (joblib/loky, pull request 663).
-    """
+    """Suppress the pool's message about a cancelled case (joblib/loky, pull request 663)."""
     previous = threading.excepthook
 
     def hook(error: threading.ExceptHookArgs) -> None:
@@ -134,5 +131,5 @@ def _arguments(task: Task) -> dict[str, Any]:
 def _result(
     work: str, parameters: dict[str, Any], program: str, local: dict[str, str]
 ) -> dict[str, Any]:
-    """Compute a case. program: digest of the sources, part of the key of the stored result."""
+    """Compute a case. program: part of the key of the stored result."""
     return Task(work, parameters, "", local=local).run()

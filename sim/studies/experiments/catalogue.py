@@ -1,13 +1,13 @@
-"""The experiments by name; light to import, for the command line."""
+"""The experiments by name."""
 
 from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """An experiment: its command, its module, a summary.
+    """Experiment: command, module, summary.
 
-    module: has `tasks` and `outcome`; or `module:object` of an object with them. seeds: by default,
-    with --quick, and at most in `all`.
+    module: has `tasks` and `outcome`, or `module:object`. seeds: by default, with --quick, and at
+    most in `all`.
     """
 
     name: str
@@ -45,9 +45,6 @@ ENTRIES = (
     Entry("ma-5", "ma_maps:FIGURE_5", "Ma & Ma: paths of three and of five robots.", 1, 1),
     Entry("ma-6a", "ma_errors:FIGURE_6A", "Ma & Ma: path, one robot against many.", 10, 1, 5),
     Entry("ma-6b", "ma_errors:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 10, 1, 5),
-    Entry(
-        "survey", "survey", "All estimators and rules on the same measurements; tables 2.1, 2.2."
-    ),
     Entry("xu-3.5", "xu_localisation", "Thesis: particle-filter localisation on a known map."),
     Entry("xu-4.1", "xu_maps:FIGURE_4_1", "Thesis: the map of EKF-SLAM."),
     Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM."),
@@ -63,5 +60,4 @@ ENTRIES = (
     Entry("downs-5.3", "downs:TABLE_5_3", "Downs: joined maps of one robot, t-test."),
     Entry("downs-5.4", "downs:TABLE_5_4", "Downs: smoothed paths of one robot."),
     Entry("downs-5.5", "downs:TABLE_5_5", "Downs: joined maps of five robots, t-test."),
-    Entry("downs-minima", "downs_minima", "Downs: has the shared map one minimum?", 3, 1),
 )

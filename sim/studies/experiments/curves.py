@@ -1,7 +1,6 @@
-"""Compute a run's errors over team time: online poses, and one landmark of the map.
+"""Compute a run's errors over team time: online poses, and the first landmark of robot 1.
 
-The landmark is the first robot's first. Its error and sigma are those of the newest map at each
-time: the fused one, or else the robot's own.
+The landmark is that of the newest fused map, or else of the robot's own.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +15,7 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.scenarios.scenario import Scenario, loads
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, named
+from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, pair_name
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
@@ -43,8 +42,8 @@ def curves_task(
 ) -> Task:
     """Make the task of the curves of one run.
 
-    team_scenario: the team's scenario if it differs from the world's. late: measurements are those
-    of the step before. shots: steps whose maps and paths are stored.
+    team_scenario: if it differs from the world's. late: measurements are those of the step before.
+    shots: steps whose maps and paths are stored.
     """
     return Task(
         "teamslam.sim.studies.experiments.curves:curves_run",
@@ -53,7 +52,7 @@ def curves_task(
         | ({"late": True} if late else {})
         | ({"shots": list(shots)} if shots else {}),
         f"{'maps of ' if shots else ''}{label or scenario.name}, "
-        f"{named(scenario.estimator, scenario.fusion)}, seed {scenario.seed}",
+        f"{pair_name(scenario.estimator, scenario.fusion)}, seed {scenario.seed}",
         expected_s(scenario),
     )
 
@@ -64,7 +63,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """Curves of the poses and of the first landmark, the map's error, and the map at `shots`."""
+    """Curves of poses and first landmark, the map's error, and the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -125,9 +124,7 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """Keys of a robot's online poses: the centre's if it estimates them; else the robot's own, then
-    the team map's.
-    """
+    """Keys of a robot's online poses; a later key has precedence."""
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
     return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))

@@ -1,8 +1,7 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has the printed figures, his protocol (`downs_joined`) and ours (`utias`), all with the
-profile's sensor and odometry models. His paired t-tests are recomputed on the printed and on the
-computed figures.
+Each has the printed figures, his protocol (`downs_joined`) and ours (`utias`), with the profile's
+models.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,8 +11,9 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from scipy.stats import ttest_rel
 
-from teamslam.central.desk.drawing import BLUE, ORANGE, SKY, VERMILION
+from teamslam.central.desk.drawing import BLUE, ORANGE, RED, SKY, TRUTH_COLOUR, VERMILION
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import downs_printed
 from teamslam.sim.studies.experiments.accuracy_utias import team_on
@@ -22,18 +22,7 @@ from teamslam.sim.studies.experiments.downs_joined import (
     spherical_task,
     whole_run_task,
 )
-from teamslam.sim.studies.experiments.downs_simulated import (
-    SIMULATED_5_1,
-    SIMULATED_5_2,
-    SIMULATED_5_3,
-    SIMULATED_5_4,
-    SIMULATED_5_5,
-    SimulatedTable,
-    paired_test,
-    sample_picture,
-    t_test_table,
-)
-from teamslam.sim.studies.experiments.drawing import figure, ruled
+from teamslam.sim.studies.experiments.drawing import add_grid, as_map, draw_map, figure
 from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Options,
@@ -41,20 +30,19 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
-    combined,
     without_datasets,
 )
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, team_task, with_world
+from teamslam.sim.studies.experiments.team_runs import Figures, table_of, team_task, with_world
 
 Row = tuple[float | None, ...]
-"""Errors [m] of robots 1 … 5, or of the team alone."""
+"""Errors [m] of robots 1 … 5, or of the team."""
 QUICK_S = 300.0
 TEAM = "team"
 
 
 class Method(NamedTuple):
-    """A row of a table: name, runs, and a figure per robot (or of the team)."""
+    """Row of a table: name, runs, and a figure per robot or of the team."""
 
     name: str
     tasks: Callable[[Options, Dataset], list[Task]]
@@ -76,9 +64,9 @@ class Compared(NamedTuple):
 
 
 class PrintedTable(NamedTuple):
-    """A table of the thesis. printed: by the set's number, a figure for each column.
+    """Table of the thesis. printed: by the set's number, a figure for each column.
 
-    sample: the run whose map on the first set is drawn, as in figure 5.1.
+    sample: run whose map on the first set is drawn, as in figure 5.1.
     """
 
     title: str
@@ -86,14 +74,12 @@ class PrintedTable(NamedTuple):
     printed: Mapping[str, Sequence[float]]
     methods: tuple[Method, ...]
     remarks: tuple[str, ...]
-    simulated: SimulatedTable
     compared: Compared | None = None
     sample: Callable[[Options, Dataset], Task] | None = None
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of every method, on sets and simulator."""
-        found = self.simulated.tasks(options)
-        found += [
+        """Runs of every method."""
+        found = [
             task
             for dataset in options.datasets
             for tasks in self._sources()
@@ -102,11 +88,7 @@ class PrintedTable(NamedTuple):
         return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Rows and pictures of sets and simulator, the t-tests."""
-        simulated = self.simulated.outcome(self.title, options, results)
-        return combined(self.title, (self._of_sets(options, results), simulated))
-
-    def _of_sets(self, options: Options, results: Results) -> Outcome:
+        """Rows and pictures of the sets, and the t-tests."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         sets = {dataset.name: self._set(options, dataset, results) for dataset in options.datasets}
@@ -132,7 +114,7 @@ class PrintedTable(NamedTuple):
             for dataset in options.datasets[:1]:
                 run = results.of(self.sample(options, dataset))
                 if run is not None:
-                    pictures.append(sample_picture("sample-real", dataset.name, run["sample"]))
+                    pictures.append(_sample_picture(dataset.name, run["sample"]))
         figures: Figures = {"sets": sets, "t_tests": tests}
         remarks = self.remarks
         if options.quick:
@@ -155,7 +137,6 @@ class PrintedTable(NamedTuple):
         return rows | {m.name: m.row(options, dataset, results) for m in self.methods}
 
     def _tests(self, options: Options, results: Results) -> dict[str, Figures]:
-        """Paired two-sided t-tests over the robots of sets, or over the sets' means."""
         if self.compared is None:
             return {}
         one = len(self.columns) == 1
@@ -204,7 +185,7 @@ class PrintedTable(NamedTuple):
         )
         axis.set_title(self.title, fontsize=11)
         axis.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        ruled(axis)
+        add_grid(axis)
         picture.savefig(path, dpi=120)
 
 
@@ -285,7 +266,6 @@ def _cells(row: Row) -> list[str]:
 def _paired(
     before: Sequence[float | None], after: Sequence[float | None], one: bool
 ) -> list[tuple[float, float]]:
-    """Pairs of one set; one: the mean of the robots against the team."""
     if one:
         known, team = _known(before), _known(after)
         return [(float(np.mean(known)), team[0])] if known and team else []
@@ -293,17 +273,54 @@ def _paired(
 
 
 def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
-    return paired_test([pair for pairs in pairs_of_sets for pair in pairs])
+    """Paired two-sided t-test of figures before and after; p None below two pairs."""
+    both = np.array([pair for pairs in pairs_of_sets for pair in pairs]).reshape(-1, 2)
+    return {
+        "pairs": len(both),
+        "mean_before_m": float(both[:, 0].mean()) if len(both) else None,
+        "mean_after_m": float(both[:, 1].mean()) if len(both) else None,
+        "p": float(ttest_rel(both[:, 0], both[:, 1]).pvalue) if len(both) > 1 else None,
+    }
 
 
 def _test_table(compared: Compared | None, tests: Mapping[str, Figures]) -> Table:
     text, printed = ("", 0.0) if compared is None else (compared.text, compared.printed_p)
-    return t_test_table(
-        f"paired t-test, {text}",
-        "figures",
-        tests,
-        f"the text prints p = {printed:g}; two-sided, scipy.stats.ttest_rel",
+    shown = (
+        ("pairs", "pairs", "{}"),
+        ("mean_before_m", "mean before [m]", "{:.3g}"),
+        ("mean_after_m", "mean after [m]", "{:.3g}"),
+        ("p", "p", "{:.3g}"),
     )
+    note = f"the text prints p = {printed:g}; two-sided, scipy.stats.ttest_rel"
+    return table_of(f"paired t-test, {text}", "figures", tests, shown, note)
+
+
+def _sample_picture(title: str, sample: Figures) -> Picture:
+    return Picture(
+        "sample-real",
+        f"As figure 5.1, a map of the EKF: {title}, {sample['robot']}. Ellipses: 95 % of "
+        "the map's covariances; crosses are the true landmarks, grey the true path.",
+        partial(_draw_sample, title, sample),
+    )
+
+
+def _draw_sample(title: str, sample: Figures, path: Path) -> None:
+    picture = figure(7.5, 7.5)
+    axis = picture.add_subplot()
+    for key, colour, label in (
+        ("truth", TRUTH_COLOUR, "true path"),
+        ("online", VERMILION, f"{sample['robot']}, online"),
+    ):
+        axis.plot(*np.array(sample[key]).reshape(-1, 2).T, color=colour, linewidth=1.0, label=label)
+    axis.plot(
+        *np.array(sample["landmarks"]).reshape(-1, 2).T, linestyle="", marker="x",
+        color=RED, label="true landmarks",
+    )  # fmt: skip
+    draw_map(axis, sample["means"], sample["blocks"], label="map, 95 %")
+    as_map(axis, adjustable="datalim")
+    axis.set_title(f"EKF: {title}", fontsize=11)
+    picture.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    picture.savefig(path, dpi=110)
 
 
 HIS, OURS = "his protocol", "ours"
@@ -349,7 +366,6 @@ TABLE_5_1 = PrintedTable(
         "his errors by linearisation; most of the error is a rotation of the whole map, which "
         "alignment removes: the start heading and the first metres of odometry determine it.",
     ),
-    SIMULATED_5_1,
     sample=_HIS_EKF,
 )
 TABLE_5_2 = PrintedTable(
@@ -368,7 +384,6 @@ TABLE_5_2 = PrintedTable(
         "with, in one frame; the source does not explain how a path can be right within 0.04 m in "
         "a map that is wrong by 0.3 m. Rows 3 and 8 of the printed table are equal.",
     ),
-    SIMULATED_5_2,
 )
 _JOINED = (
     _each(_spherical),
@@ -391,7 +406,6 @@ TABLE_5_3 = PrintedTable(
         "and 7 of the printed table are equal: these figures are not verified. The t-test of the "
         "45 printed pairs gives another p than the text.",
     ),
-    SIMULATED_5_3,
     Compared(
         "EKF maps (table 5.1) against joined maps (table 5.3)",
         downs_printed.P_EKF_JOINED,
@@ -410,7 +424,6 @@ TABLE_5_4 = PrintedTable(
         "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's accuracy of a "
         "millimetre, so it cannot be a measured distance to the truth.",
     ),
-    SIMULATED_5_4,
 )
 
 
@@ -429,7 +442,6 @@ TABLE_5_5 = PrintedTable(
         "by singular values over the common landmarks and the robots' own positions at every "
         "mutual sighting. Ours joins all submaps in one frame, with inter-robot measurements.",
     ),
-    SIMULATED_5_5,
     Compared(
         "the mean of single joined maps (table 5.3) against the team's (table 5.5)",
         downs_printed.P_JOINED_TEAM,

@@ -1,9 +1,9 @@
 """Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
-His protocol: measurements sampled to one second, a submap per step, of which only the mean is used.
-Each robot's submaps are joined by least squares with the identity as covariance, and the maps are
-aligned by singular values (`svd-join-spherical`). A submap here is a window of one step of the
-hybrid estimator; his is a step of an EKF without earlier landmarks.
+Measurements are sampled to one second, with a submap per step, of which only the mean is used. Each
+robot's submaps are joined with the identity as covariance, and the maps aligned by singular values
+(`svd-join-spherical`). A submap here is a window of the hybrid estimator; his is a step of an EKF
+without earlier landmarks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from teamslam.sim.studies.estimators.svd_joining import (
     PointPairs,
     SubmapJoining,
     mutual_sighting,
-    weighted,
+    reweight,
 )
 from teamslam.sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
 from teamslam.sim.studies.experiments.experiment import Dataset
@@ -37,7 +37,7 @@ from teamslam.sim.studies.experiments.team_runs import (
     with_robots,
     with_world,
 )
-from teamslam.sim.studies.rules.svd_rule import tied
+from teamslam.sim.studies.rules.svd_rule import align_maps
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
 from teamslam.team.config import Sensor
@@ -56,9 +56,7 @@ DRAWN_POINTS = 1000
 
 
 def final_maps_only(scenario: Scenario) -> Scenario:
-    """The scenario without running poses, maps and broadcasts, which do not influence the final map
-    and the smoothed paths.
-    """
+    """Leave out running poses, maps and broadcasts."""
     change = msgspec.structs.replace
     robots = tuple(change(robot, pose_s=NEVER_S) for robot in scenario.robots)
     central = change(scenario.central, broadcast_s=NEVER_S)
@@ -66,9 +64,7 @@ def final_maps_only(scenario: Scenario) -> Scenario:
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """The scenario with measurements and submaps of one second, exact initial poses, no loss,
-    factor or error states.
-    """
+    """Set measurements and submaps of one second, exact initial poses, no loss or factor."""
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
     if isinstance(scenario.world, UtiasWorld):
@@ -80,12 +76,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
 
 
 def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
-    """Task of every robot's own map and path, such as those of `ekf-slam`."""
+    """Make the task of every robot's own map and path."""
     return _task("whole_run", scenario, dataset, note)
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Task of his method under his protocol."""
+    """Make the task of his method under his protocol."""
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
 
@@ -97,7 +93,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """Errors of the robots' last own maps and online paths; the map of one."""
+    """Errors of the robots' last own maps and online paths; one map."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -133,7 +129,7 @@ def _thin(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """By robot, errors of its joined map and smoothed path, and the map; the team's errors.
+    """Errors of each robot's joined map and smoothed path, and of the team.
 
     with_covariances: the same submaps joined with their covariances.
     """
@@ -153,11 +149,6 @@ def spherical_run(
         robots[name] = _map_figures(_errors(found, truth)) | {
             "position_rmse": _path_error(evaluation, name, paths[name]),
             "submaps": len(submaps),
-            "map": {
-                "ids": found.ids.tolist(),
-                "means": found.means.tolist(),
-                "covariance": found.covariance.tolist(),
-            },
         }
     if not maps:
         return {"robots": {}, "team": _map_figures(None), "reasons": []}
@@ -165,7 +156,7 @@ def spherical_run(
         robot["id"]: msgspec.convert(robot["sensor"], Sensor) for robot in scenario["robots"]
     }
     sightings = _mutual(samples, sensors, paths)
-    team, reasons = tied(min(maps), maps, full=False, sightings=sightings)
+    team, reasons = align_maps(min(maps), maps, full=False, sightings=sightings)
     return {
         "robots": robots,
         "team": _map_figures(_errors(team, truth)),
@@ -197,13 +188,13 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
 
 
 def _join(robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]) -> SubmapJoining:
-    """All submaps joined at once: the limit of joining one by one."""
+    """Join all submaps at once: the limit of joining one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [
-        Contribution(robot, 0, k, k, weighted(translate.local_map_of(s).without_nodes, "identity"))
+        Contribution(robot, 0, k, k, reweight(translate.local_map_of(s).without_nodes, "identity"))
         for k, s in enumerate(submaps)
     ]
-    return svd_joining.solved(
+    return svd_joining.solve(
         replace(
             initial_state, fold=joining.fold_submaps(initial_state.fold, contributions, SETTINGS)
         )
@@ -226,9 +217,7 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """Positions, in both maps, of two robots that measured each other in one step, a pair per
-    step.
-    """
+    """Positions in both maps of two robots that measured each other in one step."""
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
     for a in sorted(paths):
@@ -268,7 +257,6 @@ def _looks(
 
 
 def _at(path: Path, step: int) -> int | None:
-    """Index of the pose at a step; None beyond half a step."""
     stamp_ns = round(step * STEP_S * 1e9)
     nearest = int(np.argmin(np.abs(path.stamps_ns - stamp_ns)))
     near = abs(int(path.stamps_ns[nearest]) - stamp_ns) <= 0.5e9 * STEP_S

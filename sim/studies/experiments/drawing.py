@@ -9,7 +9,7 @@ import numpy as np
 from teamslam.central.desk.drawing import MAP_COLOUR, draw_ellipses
 from teamslam.team.shapes import Float
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -40,8 +40,8 @@ class Curves:
         nees = [float(np.mean(run["nees"])) for run in runs if "nees" in run]
         return cls(
             times_s,
-            np.array([sampled(times_s, run, "error_m", stepwise=stepwise) for run in runs]),
-            np.array([sampled(times_s, run, "sigma_m", stepwise=stepwise) for run in runs]),
+            np.array([sample_curve(times_s, run, "error_m", stepwise=stepwise) for run in runs]),
+            np.array([sample_curve(times_s, run, "sigma_m", stepwise=stepwise) for run in runs]),
             np.array(nees) if nees else None,
         )
 
@@ -58,7 +58,7 @@ class Curves:
         return means
 
 
-def sampled(
+def sample_curve(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
     """Sample a curve at these times; stepwise: hold values instead of linear interpolation."""
@@ -80,7 +80,7 @@ def spread(values: Float[np.ndarray, " S"]) -> dict[str, float]:
 
 
 def figure(width: float, height: float) -> "Figure":
-    """A figure on Agg without pyplot's global state."""
+    """Create a figure on Agg without pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -103,14 +103,14 @@ def draw_map(
 
 
 def as_map(axis: "Axes", **equal: Any) -> None:
-    """Axes in metres with equal scales; equal: further options of them."""
+    """Set axes in metres with equal scales; equal: further options of them."""
     axis.set_aspect("equal", **equal)
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
-    ruled(axis)
+    add_grid(axis)
 
 
-def ruled(axis: "Axes") -> None:
+def add_grid(axis: "Axes") -> None:
     """Draw a grid behind the curves."""
     axis.grid(color="#e4e4e4", linewidth=0.6)
     axis.set_axisbelow(True)

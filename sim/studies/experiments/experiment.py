@@ -97,8 +97,8 @@ class Goal:
 class Outcome:
     """Result of an experiment.
 
-    figures: for machines. remarks: differences from the source, with the reason. missing: figures
-    that need more data, with the remedy.
+    remarks: differences from the source, with the reason. missing: figures that need more data,
+    with the remedy.
     """
 
     title: str
@@ -121,7 +121,7 @@ class Experiment(Protocol):
         """The outcome of the results."""
 
 
-def combined(title: str, parts: Sequence[Outcome]) -> Outcome:
+def combine_outcomes(title: str, parts: Sequence[Outcome]) -> Outcome:
     """Combine several outcomes with different figures."""
     return Outcome(
         title,

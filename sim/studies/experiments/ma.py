@@ -1,8 +1,8 @@
 """Common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
 
-Parameters and set are only in its program (the repository of its appendix): the initial pose of
-robot 1 is that of set 2, α₁ … α₆ are 0.1 for intervals of 0.02 s, the variances of range and
-bearing 0.0167 m² and 0.000737 rad². The logged odometry is not calibrated.
+Parameters are those of its program: the initial pose of robot 1 is that of set 2, α₁ … α₆ are 0.1
+for intervals of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². The
+odometry is not calibrated.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ from teamslam.sim.studies.experiments.curves import (
 )
 from teamslam.sim.studies.experiments.experiment import Dataset
 from teamslam.sim.studies.experiments.task import Task
-from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, named, scenario_task
+from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, pair_name, scenario_task
 from teamslam.sim.studies.experiments.xu import Method, with_particles
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
@@ -56,9 +56,9 @@ _LINE_POINTS = 1400
 
 
 def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
-    """Run of one method on the first 1400 frames of a set."""
+    """Make the run of one method on the first 1400 frames of a set."""
     scenario = _scenario(method, seed)
-    pair = named(method.estimator, method.fusion)
+    pair = pair_name(method.estimator, method.fusion)
     label = f"{dataset.name}, {method.robots} robots, {pair}, seed {seed}"
     return scenario_task("ma:ma_run", scenario, label, _COST_S * method.robots, dataset)
 
@@ -87,7 +87,7 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """The program's models: separate measurements, resampling at each step, a map each second."""
+    """Set the program's models: separate measurements, resampling and a map at each step."""
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()
@@ -96,10 +96,7 @@ def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
 
 
 def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
-    """Errors over frames of every robot's path and of the map, the lines and the last map.
-
-    sha256: of the data set at `path`.
-    """
+    """Errors over frames of every robot's path and of the map, the lines and the last map."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     samples = list(TimedRun().samples(resolved))
     evaluation = evaluate(samples)

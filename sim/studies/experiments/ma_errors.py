@@ -1,4 +1,4 @@
-"""Figures 4 and 6 of Ma & Ma's report: errors of robot 1's path and of the map over 1400 frames."""
+"""Figures 4 and 6 of Ma & Ma's report: errors of path and map over 1400 frames."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -109,7 +109,6 @@ class ErrorFigure(NamedTuple):
 
 
 def _runs(dataset: Dataset, method: Method, options: Options) -> list[Task]:
-    """One run per seed; of our estimator the first only: it takes longest."""
     seeds = options.seeds[:1] if method == OURS else options.seeds
     return [ma_task(dataset, method, seed) for seed in seeds]
 

@@ -22,7 +22,7 @@ from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import Method
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
 CLOUD_COLOUR = SKY

@@ -1,4 +1,4 @@
-"""Write an experiment's outcome: tables in the terminal, JSON, pictures, and one page."""
+"""Write an experiment's outcome: tables, JSON, pictures, and a page."""
 
 import base64
 import json
@@ -33,7 +33,7 @@ _WORDS = {True: "passed", False: "MISSED", None: "not computed"}
 _COLOURS = {True: "green", False: "red", None: "yellow"}
 
 
-def printed(concluded: Concluded) -> list[RenderableType]:
+def render_outcome(concluded: Concluded) -> list[RenderableType]:
     """Render the outcome for a terminal."""
     outcome = concluded.outcome
     parts: list[RenderableType] = [Text(outcome.title, style="bold")]
@@ -84,7 +84,7 @@ def to_json(concluded: Concluded, provenance: Mapping[str, str]) -> dict[str, An
 def write(
     all_concluded: Sequence[Concluded], folder: Path, page: str, provenance: Mapping[str, str]
 ) -> Path:
-    """Write JSON, pictures and a common page; returns the page's path."""
+    """Write JSON, pictures and a common page; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     sections = []
     for concluded in all_concluded:

@@ -1,4 +1,4 @@
-"""Describe the parameters of the runs by their differences from a built-in scenario."""
+"""Describe the parameters of runs by their differences from a built-in scenario."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +16,7 @@ COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central
 
 
 def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
-    """Label, number and parameters of the runs that differ in their seed only."""
+    """Label, number and parameters of runs that differ in their seed only."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label
@@ -36,7 +36,6 @@ def _parameters(task: Task) -> Iterator[str]:
 
 
 def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
-    """`path = value` of each field that differs from the built-in scenario of the same name."""
     before = _built_in(scenario["name"], len(scenario["robots"]))
     for path, value in _flat(scenario, ""):
         if path not in IN_THE_LABEL | COPIES and before.get(path) != value:
@@ -49,7 +48,7 @@ def _built_in(name: str, robots: int) -> Mapping[str, str]:
 
 
 def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Leaves by their dotted paths; those of the robots as one if all are equal."""
+    """Leaves by their dotted paths; equal ones of the robots once."""
     if isinstance(value, Mapping):
         for name, each in value.items():
             yield from _flat(each, f"{path}.{name}" if path else name)

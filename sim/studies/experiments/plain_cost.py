@@ -1,13 +1,9 @@
-"""Independent implementation of the joined map's cost: plain arrays, and a solver of SciPy's.
-
-A reference for the team's map joining, without shared code. The same formulas
+"""Independent implementation of the joined map's cost, without code of the team's map joining.
 
     Σ ‖L_k⁻¹ (R(θ_s)ᵀ(p − p_s) …, θ_e − θ_s …; minus the submap's mean)‖², L_k L_kᵀ = f P_k
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
-
-are implemented with complex numbers and solved by Levenberg-Marquardt steps (damping as in Nielsen
-1999) through SuperLU, where the map joining has kernels, its own factorisation and Gauss-Newton
-steps. The graph provides measurements and state indices.
+with complex numbers, solved by Levenberg-Marquardt steps (damping as in Nielsen 1999) through
+SuperLU.
 """
 
 from collections import defaultdict
@@ -28,11 +24,11 @@ Blocks = Float[np.ndarray, "K r m"]
 Indices = Int64[np.ndarray, " _"]
 
 AT_REST = 1e-9
-"""Expected decrease of χ² by an undamped step below which a state is converged."""
+"""Expected decrease of χ² by an undamped step of a converged state."""
 SMALL = 1e-5
-"""Expected decrease of χ² by a damped step below which convergence is tested."""
+"""Expected decrease of χ² by a damped step before a test of convergence."""
 STEPS = 2000
-"""Most steps of a solution: a long curved valley takes many."""
+"""Most steps of a solution."""
 UNDAMPED = 1e-12
 """Least damping: undetermined coordinates keep their values."""
 DAMPING = 1e-3
@@ -48,7 +44,7 @@ class Solution(NamedTuple):
 
 
 class Whitened(NamedTuple):
-    """Whitened residuals of K terms of one kind and size, their Jacobians and state indices."""
+    """Whitened residuals of K terms of one kind, their Jacobians and state indices."""
 
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
@@ -56,7 +52,7 @@ class Whitened(NamedTuple):
 
 
 class PlainCost:
-    """Cost of a graph's states. fixed: coordinates that are not solved for."""
+    """Cost of a graph's states, without the fixed coordinates."""
 
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
@@ -131,7 +127,7 @@ class PlainCost:
 
 
 class _Sum:
-    """Sums the terms' normal equations, whose sparsity is the same at every state."""
+    """Sum of the terms' normal equations, of constant sparsity."""
 
     def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
         keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
@@ -155,8 +151,10 @@ class _Sum:
 
 
 class _Submaps(NamedTuple):
-    """K submaps of equal size. at: state indices of each one's start, poses and landmarks; points:
-    the first ones of the latter two.
+    """K submaps of equal size.
+
+    at: state indices of each one's start, poses and landmarks; points: the first ones of the latter
+    two.
     """
 
     whitening: Float[np.ndarray, "K n n"]
@@ -166,7 +164,6 @@ class _Submaps(NamedTuple):
     poses: int
 
     def whitened(self, state: Values) -> Whitened:
-        """Predicted less measured submaps."""
         poses, count = self.poses, self.points.shape[1]
         x = np.concatenate([3 * np.arange(poses), 3 * poses + 2 * np.arange(count - poses)])
         y, heading = x + 1, 3 * np.arange(poses) + 2
@@ -194,7 +191,6 @@ class _Sightings(NamedTuple):
     at: Int64[np.ndarray, "K 6"]
 
     def whitened(self, state: Values) -> Whitened:
-        """Predicted less measured range and bearing."""
         pose = state[self.at]
         x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
         distance = np.hypot(x, y)
@@ -208,14 +204,13 @@ class _Sightings(NamedTuple):
 
 
 class _Priors(NamedTuple):
-    """K Gaussians of coordinates of the state; the third, if any, is a heading."""
+    """K Gaussians of coordinates; the third, if any, is a heading."""
 
     whitening: Float[np.ndarray, "K n n"]
     means: Float[np.ndarray, "K n"]
     at: Int64[np.ndarray, "K n"]
 
     def whitened(self, state: Values) -> Whitened:
-        """Coordinates less their means."""
         r = state[self.at] - self.means
         r[:, 2:] = _around(r[:, 2:])
         return _whiten(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))

@@ -1,4 +1,4 @@
-"""Show the progress of the runs: a bar, or plain lines outside a terminal."""
+"""Show the progress of the runs: a bar, or lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,8 +14,8 @@ LINE_S = 10.0
 
 
 @contextmanager
-def shown(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
-    """Yields a function to call with every finished task."""
+def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
+    """Yield a function to call with every finished task."""
     console = Console(stderr=True)
     of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
     # The bar advances by expected cost, which differs widely between runs.

@@ -1,4 +1,4 @@
-"""Run an experiment: load the stored results, compute the others, and conclude."""
+"""Run an experiment: load stored results, compute the others, conclude."""
 
 import hashlib
 import os
@@ -57,7 +57,7 @@ task.
 """
 
 
-def planned(entry: Entry, options: Options) -> Plan:
+def plan_runs(entry: Entry, options: Options) -> Plan:
     """List the experiment's tasks; raises ScenarioError, DatasetError."""
     name, _, attribute = entry.module.partition(":")
     module = import_module(f"teamslam.sim.studies.experiments.{name}")
@@ -65,7 +65,7 @@ def planned(entry: Entry, options: Options) -> Plan:
     return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
 
 
-def computed(
+def compute_outcomes(
     plans: Sequence[Plan],
     folder: Path,
     jobs: int,
@@ -87,7 +87,7 @@ def compute_runs(
     jobs: int,
     progress: Progress,
 ) -> tuple[Results, Mapping[str, Done]]:
-    """Results of these tasks, stored or computed now, and the failed ones."""
+    """Results of these tasks, and the failed ones."""
     folder.mkdir(parents=True, exist_ok=True)
     cases = Cases(folder)
     cached = {name: cases.found(task) for name, task in tasks.items()}
@@ -120,7 +120,7 @@ def _write_failures(path: Path, failures: Sequence[Done]) -> None:
 
 
 def dataset(path: Path) -> Dataset:
-    """A data set with its checksum; raises DatasetError."""
+    """Open a data set with its checksum; raises DatasetError."""
     with open_data_set(str(path), "Barcodes.dat"):
         pass
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())

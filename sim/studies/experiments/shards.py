@@ -1,4 +1,4 @@
-"""Shards of a study: each computes a part of its runs; merging collects the stored results."""
+"""Shards of a study, and their merge."""
 
 import json
 import re
@@ -12,11 +12,11 @@ from teamslam.sim.studies.experiments.cases import FOLDER
 from teamslam.sim.studies.experiments.task import Task
 
 DESCRIPTION = "shard.json"
-"""File in a shard's folder: the study, the shard's number, and the digests of its program."""
+"""File in a shard's folder: study, number, and digests of its program."""
 
 
 class ShardError(ValueError):
-    """Shards that are not one study; the text names what is missing or differs."""
+    """Shards that are not one study."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def parsed_shard(text: str) -> Shard:
 
 
 def tasks_of(tasks: Mapping[str, Task], shard: Shard) -> dict[str, Task]:
-    """Every N-th task by falling cost, so that shards take about equally long."""
+    """Every N-th task by falling cost, for shards of about equal time."""
     order = sorted(tasks.values(), key=lambda task: (-task.cost, task.name))
     return {task.name: task for task in order[shard.number - 1 :: shard.of]}
 
@@ -72,8 +72,8 @@ def write_shard(folder: Path, shard: Shard, study: Study, programs: Mapping[str,
     (folder / DESCRIPTION).write_text(json.dumps(content, indent=1) + "\n", "utf-8")
 
 
-def described_study(folders: Sequence[Path]) -> tuple[Study, dict[str, str]]:
-    """Study of these shards and its program; raises ShardError unless all shards are here."""
+def study_of(folders: Sequence[Path]) -> tuple[Study, dict[str, str]]:
+    """Study of these shards and its program; raises ShardError unless complete."""
     described = {folder: _description(folder) for folder in folders}
     numbers = {folder: int(each.pop("shard")) for folder, each in described.items()}
     first, common = next(iter(described.items()))

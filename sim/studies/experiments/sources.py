@@ -1,4 +1,4 @@
-"""The sources of ours that a module depends on, and hence its results."""
+"""Sources that a module of ours depends on."""
 
 import ast
 import re
@@ -12,7 +12,7 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 
 
 def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
-    """The text of a module and of every module of these packages that it imports, transitively.
+    """Text of a module and of every module of these packages that it imports, transitively.
 
     Names in tables (`teamslam.team.registry`) count as imports.
     """
@@ -33,7 +33,7 @@ def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
 
 @lru_cache
 def _imported(source: bytes) -> tuple[str, ...]:
-    """Modules that a source may use: `from a import b` may mean a.b, a text `a.b:c` means a.b."""
+    """Modules that a source may use: `from a import b` or a text `a.b:c`."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -47,7 +47,6 @@ def _imported(source: bytes) -> tuple[str, ...]:
 
 @lru_cache
 def _path(module: str) -> Path | None:
-    """The source of a module; None if the name is no module's, or the module is a library."""
     if not module:
         return None
     loaded = sys.modules.get(module)

@@ -1,4 +1,4 @@
-"""A run as a task: a function by name with JSON parameters, and the digest of its program."""
+"""A run as a task: a function with JSON parameters, and the digest of its program."""
 
 import hashlib
 import importlib
@@ -22,8 +22,8 @@ LIBRARIES = ("numpy", "scipy", "gtsam")
 class Task:
     """One run. work: `module:function`, from the parameters to a JSON object.
 
-    local: further arguments without influence on the result, such as the path of a data set whose
-    checksum is a parameter. cost: estimated run time [s].
+    local: arguments without influence on the result, such as a data set's path. cost: estimated run
+    time [s].
     """
 
     work: str
@@ -52,7 +52,7 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of library versions, of all sources that a module imports, and of the native core."""
+    """Digest of library versions, of imported sources, and of the native core."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:

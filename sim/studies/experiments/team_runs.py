@@ -1,4 +1,4 @@
-"""Run a team in memory and compare it with the truth and the batch optimum."""
+"""Run a team in memory and compare it with truth and batch optimum."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -48,11 +48,11 @@ def team_task(
     note: str = "",
     noise: NoiseKind = "white",
 ) -> Task:
-    """Make the task of a team's run. batch: with the batch MAP.
+    """Make the task of a team's run.
 
-    minimum: with `true_minimum`. note: appended to the scenario's name. noise: the batch's.
+    batch: with the batch MAP of this noise. minimum: with `true_minimum`. note: part of the label.
     """
-    pair = named(scenario.estimator, scenario.fusion)
+    pair = pair_name(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
     place += f", {note}" if note else ""
     return scenario_task(
@@ -89,9 +89,7 @@ def scenario_task(
     dataset: Dataset | None = None,
     **parameters: Any,
 ) -> Task:
-    """Make the task of a scenario, on a data set if given. work: `module:function` of the
-    experiments; parameters: further ones.
-    """
+    """Make the task of a scenario, on a data set if given. work: `module:function`."""
     return Task(
         f"teamslam.sim.studies.experiments.{work}",
         {"scenario": msgspec.to_builtins(scenario)}
@@ -110,7 +108,7 @@ def with_world(scenario: Scenario, **changes: Any) -> Scenario:
 
 
 def with_robots(scenario: Scenario, part: str, **changes: Any) -> Scenario:
-    """Change values of a part of every robot's configuration, as `front_end` or `sensor`."""
+    """Change a part of every robot's configuration, as `front_end`."""
     replace = msgspec.structs.replace
     robots = (
         replace(robot, **{part: replace(getattr(robot, part), **changes)})
@@ -119,7 +117,7 @@ def with_robots(scenario: Scenario, part: str, **changes: Any) -> Scenario:
     return replace(scenario, robots=tuple(robots))
 
 
-def named(estimator: str, fusion: str) -> str:
+def pair_name(estimator: str, fusion: str) -> str:
     """Name of a pair in tables."""
     return f"{estimator} + {fusion}"
 
@@ -132,10 +130,7 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """Figures of one run; `batch`, `minimum`: with those of the batch MAP and of `true_minimum`.
-
-    sha256: of the data set at `path`.
-    """
+    """Figures of one run, with `batch` and `minimum` those of the batch MAP and `true_minimum`."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     run = TimedRun()
     # Provisional maps and priors are the bulk of a large team's log and not used here.
@@ -157,7 +152,7 @@ def team_run(
 
 
 class TimedRun:
-    """A team in memory, and its robots' and centre's CPU time [s]."""
+    """A team in memory, and the CPU time [s] of its robots and centre."""
 
     def __init__(self) -> None:
         self._robots = _Watch()
@@ -166,7 +161,7 @@ class TimedRun:
         self._fusions = 0
 
     def samples(self, scenario: Scenario, streams: WorldStreams | None = None) -> Iterator[Sample]:
-        """Run the team; yields the samples of its log. streams: default: the scenario's."""
+        """Run the team; yield the samples of its log."""
         measurements = streams_of(scenario) if streams is None else streams
         odometry = {ch.ODOMETRY.key(robot.id) for robot in scenario.robots}
         for sample in run_team(scenario, measurements, *self._nodes(scenario.central)):
@@ -209,7 +204,7 @@ class TimedRun:
 
 
 class _Watch:
-    """Measure the CPU time [s] that this process spends inside."""
+    """CPU time [s] that this process spends inside."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -224,7 +219,7 @@ class _Watch:
 def team_figures(evaluation: Evaluation) -> Figures:
     """Figures of a run, averaged over the robots; None without truth.
 
-    Without a fused map the robots' own maps count.
+    Without a fused map those of the robots' own maps.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
@@ -264,7 +259,6 @@ def team_figures(evaluation: Evaluation) -> Figures:
 
 
 def _robot_figures(robot: RobotResult) -> Figures:
-    """One robot's errors [m]; first_pose_chi2: 3 degrees of freedom."""
     smoothed, online = robot.smoothed, robot.online
     return {
         "position_rmse": None if smoothed is None else smoothed.position_rmse_m,
@@ -320,9 +314,7 @@ OVER_SEEDS = (
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """Figures over several runs, with their number: errors as the root mean square, all else as
-    the mean, NEES as the median, too.
-    """
+    """Figures over several runs: errors as root mean square, others as mean."""
     figures: Figures = {"seeds": len(runs)}
     for name in OVER_SEEDS:
         if any(name in run for run in runs):
@@ -336,7 +328,7 @@ def over_seeds(runs: Sequence[Figures]) -> Figures:
 def table_of(
     title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
 ) -> Table:
-    """Table with a row for each named set of figures; first: heading of the names."""
+    """Table with a row for each named set of figures; first: heading of names."""
     rows = tuple((name, *cells_of(of_row, shown)) for name, of_row in figures.items())
     return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
 

@@ -1,11 +1,8 @@
 """Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
 
-An ellipsoid is exceeded in any curved valley of the cost, even in the right minimum. Three tests
-use the final map's own cost: whether a solution from the truth has less cost, whether it ends in
-another place that is about as likely, and by how much the cost rises with the truth fixed (the
-likelihood ratio: χ² of the fixed coordinates, for any parametrisation). Cost and minima are those
-of `plain_cost`, which shares no code with the map joining: a map whose state has not converged is
-wrong, too.
+The tests use the final map's own cost (`plain_cost`): whether a solution from the truth has less
+cost, whether it ends in another place that is about as likely, and by how much the cost rises with
+the truth fixed (likelihood ratio, χ² of the fixed coordinates).
 """
 
 from collections.abc import Iterable, Mapping
@@ -35,16 +32,16 @@ LIKELY = 0.999
 NEARBY = 3
 """Number of initial states near the truth, besides the truth."""
 NEARBY_RAD = 0.1
-"""Standard deviation [rad] of these states' headings about the true ones."""
+"""Standard deviation [rad] of these states' headings about the truth."""
 Values = Float[np.ndarray, " _"]
 
 
 class TrueMinimum(NamedTuple):
     """The map's minimum compared with that of a solution from the truth.
 
-    lower: how much less the latter's cost is. other_minimum: it ends outside the map's 99.9 %
-    ellipsoid, at a cost that does not exclude it. rise: increase of the cost with the landmarks and
-    the end of each robot's first submap fixed at the truth; dof: number of fixed coordinates.
+    lower: by how much the latter's cost is less. other_minimum: it ends outside the map's 99.9 %
+    ellipsoid, at a cost that does not exclude it. rise: of the cost with the landmarks and the end
+    of each robot's first submap fixed at the truth; dof: number of fixed coordinates.
     """
 
     lower: float
@@ -71,15 +68,15 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
     landmarks = dict(
         zip(run.map.ids[run.map.known].tolist(), run.map.truth[run.map.known], strict=True)
     )
-    return judged(fold.main, landmarks, {name: each.truth for name, each in run.robots.items()})
+    return compare_minima(
+        fold.main, landmarks, {name: each.truth for name, each in run.robots.items()}
+    )
 
 
 def final_fold(
     samples: Iterable[Sample], *, is_robust: bool = False, has_biases: bool = False
 ) -> Fold:
-    """Recompute the centre's final fold from a log, by default with plain squares and without
-    biases.
-    """
+    """Recompute the centre's final fold, by default with plain squares and no biases."""
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -101,12 +98,12 @@ def _without_biases(submap: m.Submap) -> m.Submap:
     return msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
 
 
-def judged(
+def compare_minima(
     island: Island,
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """Figures of an island in the truth's frame, with plain squares and without biases."""
+    """Figures of an island in the truth's frame, with plain squares and no biases."""
     graph, settings = island.graph, island.settings
     if settings.robust:
         raise NotImplementedError("this cost has plain squares, without a robust loss")

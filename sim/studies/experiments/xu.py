@@ -15,13 +15,13 @@ import numpy as np
 from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, PURPLE, VERMILION
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.curves import curves_task
-from teamslam.sim.studies.experiments.drawing import BAND, Curves, figure, ruled, spread
+from teamslam.sim.studies.experiments.drawing import BAND, Curves, add_grid, figure, spread
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, with_robots, with_world
 from teamslam.team.config import MotionNoise
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
 PARTICLES = 50
@@ -63,9 +63,9 @@ Reading = Literal["stated", "exact", "coded"]
 class Panel(NamedTuple):
     """One world of a figure, its methods, and the thesis' figures in metres.
 
-    noise: of the odometry, (m, rad) in a step; None: the scenario's. reading: "stated": the thesis'
-    text; "exact": the same with exact odometry, while the filters assume noise; "coded": its
-    appendix' program (`as_coded`). printed: by method, the largest error in text or picture.
+    noise: of the odometry, (m, rad) in a step. reading: "stated": the text; "exact": the same with
+    exact odometry, while the filters assume noise; "coded": the appendix' program (`as_coded`).
+    printed: by method, the largest error in text or picture.
     """
 
     name: str
@@ -141,7 +141,7 @@ class ErrorFigure(NamedTuple):
 
 
 def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -> Task:
-    """Run of a method in a panel's world; shots: steps whose maps are drawn."""
+    """Make the run of a method; shots: steps whose maps are drawn."""
     scenario = with_options(
         load("thesis"),
         seed=seed,
@@ -164,20 +164,19 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 
 def _tell_every_step(scenario: Scenario) -> Scenario:
-    """The scenario with a map at every step of a filter without windows."""
+    """Publish a map at every step of a filter without windows."""
     central = msgspec.structs.replace(scenario.central, broadcast_s=STEP_S)
     scenario = with_robots(scenario, "front_end", window_s=STEP_S)
     return msgspec.structs.replace(scenario, central=central)
 
 
 def as_coded(scenario: Scenario) -> Scenario:
-    """Inputs of the appendix' program where they differ from section 4.4.2.
+    """Set the inputs of the appendix' program where they differ from section 4.4.2.
 
-    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` multiply a normal number in `add_control_noise`:
-    variances taken for standard deviations, 2.5 mm and 0.16° instead of 5 cm and 3°. `R(2,2) =
-    pi/18^2` is a variance: 5.6°, not 10°. Landmarks are detected at any distance below 20 m.
-    `get_observations(xtrue(:,i), …)` measures from the pose before the motion; so the world
-    measures at its start.
+    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` in `add_control_noise` are variances taken for
+    standard deviations: 2.5 mm and 0.16° instead of 5 cm and 3°. `R(2,2) = pi/18^2` is a variance:
+    5.6°, not 10°. Landmarks are detected at any distance below 20 m. `get_observations(xtrue(:,i),
+    …)` measures from the pose before the motion.
     """
     coded = with_world(scenario, visible_from_m=0.0, observe_at_start=True)
     return with_noise(with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE)
@@ -269,7 +268,7 @@ def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], uni
     middle = max(float(np.nanmax(curves.quantile(0.5))) for curves in found.values())
     above.set_ylim(0, 1.05 * min(largest, 2.0 * middle))
     picture.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=10)
-    ruled(above)
+    add_grid(above)
     for column, method in enumerate(methods):
         below = picture.add_subplot(grid[1, column])
         _draw_run(below, method, found[method.name], panel.printed.get(method.name))
@@ -290,4 +289,4 @@ def _draw_run(axis: "Axes", method: Method, curves: Curves, printed: float | Non
     axis.set_ylim(0, 1.15 * max(most, min(float(np.nanquantile(bound, 0.9)), 3.0 * most)))
     axis.set_xlim(0, curves.times_s[-1])
     axis.set_title(method.name, fontsize=10)
-    ruled(axis)
+    add_grid(axis)

@@ -1,4 +1,4 @@
-"""Figures 4.4, 4.5, 4.6, 5.2 and 5.3 of W. Xu's thesis: errors of poses and of a landmark."""
+"""Figures 4.4 to 4.6, 5.2 and 5.3 of W. Xu's thesis: errors of poses and of a landmark."""
 
 from math import radians
 

@@ -1,8 +1,7 @@
 """Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
-Its figures 3.2 to 3.5 are those of Fox et al. 2000, without numbers. Here they are on the thesis'
-world: the three steps of the filter after a stretch without measurements, and a start anywhere. The
-filter is `teamslam.sim.studies.estimators.localisation`; keyframes are those of a robot's node.
+Its figures 3.2 to 3.5 are those of Fox et al. 2000. Here they are on the thesis' world: the three
+steps of the filter after a stretch without measurements, and a start anywhere.
 """
 
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
-    combined,
+    combine_outcomes,
 )
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, with_world
@@ -47,11 +46,11 @@ from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
 STRETCH = ((28.715, 33.276), (51.298, 53.539), (64.3, 67.3))
-"""Part of robot 1's path, from the lower left to the upper right, as in figure 3.2."""
+"""Part of robot 1's path, as in figure 3.2."""
 STRETCH_STEPS = 49
 BLIND_CLOUDS = 6
 PARTICLES = 1000
@@ -137,7 +136,9 @@ def outcome(options: Options, results: Results) -> Outcome:
         tuple(pictures),
         remarks=remarks,
     )
-    return combined(first.title, (first, replace(errors, figures={"errors": errors.figures})))
+    return combine_outcomes(
+        first.title, (first, replace(errors, figures={"errors": errors.figures}))
+    )
 
 
 def _stages_task(options: Options, seed: int) -> Task:
@@ -154,7 +155,6 @@ def _anywhere_task(options: Options, seed: int) -> Task:
 
 
 def _cut_first_leg(world: SimulatedWorld) -> tuple[tuple[float, float], ...]:
-    """The first leg of robot 1, cut to a metre a step."""
     (x, y), (to_x, to_y) = world.paths[0][:2]
     part = ANYWHERE_STEPS[-1] / float(np.hypot(to_x - x, to_y - y))
     return (x, y), (x + part * (to_x - x), y + part * (to_y - y))
@@ -216,7 +216,7 @@ def _run_of(world: Mapping[str, Any]) -> _Run:
 
 
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Predict over the stretch, weigh by one measurement, resample; a summary of each cloud."""
+    """Predict over the stretch, weigh by one measurement, resample."""
     run = _run_of(world)
     sensor = run.scenario.robots[0].sensor
     random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
@@ -387,7 +387,6 @@ def _draw_stage(run: Figures, name: str, path: Path) -> None:
 
 
 def _scatter(axis: "Axes", cloud: Figures, label: str | None) -> None:
-    """Darker for higher weights, the darkest on top."""
     points, weights = np.array(cloud["points"]), np.array(cloud["weights"])
     order = np.argsort(weights)
     shades = np.column_stack(

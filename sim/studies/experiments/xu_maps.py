@@ -1,4 +1,4 @@
-"""Figures 4.1 to 4.3 and 5.1 of W. Xu's thesis: maps of one run, with the paths so far."""
+"""Figures 4.1 to 4.3 and 5.1 of W. Xu's thesis: maps of one run."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -13,7 +13,7 @@ from teamslam.sim.studies.experiments.drawing import (
     as_map,
     draw_map,
     figure,
-    sampled,
+    sample_curve,
     spread,
 )
 from teamslam.sim.studies.experiments.experiment import (
@@ -22,7 +22,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
-    combined,
+    combine_outcomes,
 )
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
@@ -43,7 +43,7 @@ from teamslam.sim.studies.experiments.xu import (
 )
 from teamslam.sim.studies.experiments.xu import task as curves_of
 
-if TYPE_CHECKING:  # Matplotlib takes half a second to import
+if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
 
@@ -84,7 +84,9 @@ class MapFigure(NamedTuple):
             runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             curves = [each["map"] for each in runs if each["map"]["time_s"]]
             times = STEP_S * np.array(self.steps, dtype=np.float64)
-            errors = np.array([sampled(times, each, "error_m", stepwise=True) for each in curves])
+            errors = np.array(
+                [sample_curve(times, each, "error_m", stepwise=True) for each in curves]
+            )
             errors = errors.reshape(-1, len(times))
             figures[label] = {
                 str(shot["step"]): {"run_m": shot["rmse_m"]}
@@ -171,7 +173,7 @@ def _draw_paths(axis: "Axes", shot: Figures) -> None:
 
 
 class PathFigure(NamedTuple):
-    """Figure 4.5: paths of one run, without landmarks, beside the errors."""
+    """Figure 4.5: paths of one run, beside the errors."""
 
     errors: ErrorFigure
 
@@ -201,7 +203,9 @@ class PathFigure(NamedTuple):
                     Picture(name, caption, partial(_draw_side_by_side, panel.name, drawn))
                 )
         errors = self.errors.outcome(options, results)
-        return combined(errors.title, (Outcome(errors.title, {}, pictures=tuple(pictures)), errors))
+        return combine_outcomes(
+            errors.title, (Outcome(errors.title, {}, pictures=tuple(pictures)), errors)
+        )
 
     def _run(self, panel: Panel, method: Method, options: Options) -> Task:
         return curves_of(panel, method, options.seeds[0], (STEPS,))

@@ -1,1 +1,1 @@
-"""Robots with the sources' estimators, for comparison; the product runs without them."""
+"""Robots with the sources' estimators, for comparison."""

@@ -1,4 +1,4 @@
-"""Interface between a comparison robot and its estimator over a whole stream."""
+"""Interface between a comparison robot and its estimator."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -20,7 +20,7 @@ from teamslam.team.shapes import Float, UInt32
 
 
 class KnownMap(NamedTuple):
-    """Prior map of a localisation-only robot: ids ascending, positions [m] in the team's frame."""
+    """Prior map of a localising robot: ids ascending, positions [m] in the team's frame."""
 
     ids: UInt32[np.ndarray, " L"]
     landmarks: Float[np.ndarray, "L 2"]
@@ -32,9 +32,8 @@ NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """Results of an odometry interval: stamps of a new running pose and map.
 
-    cloud: returns the particles, if any, until the next interval. judged: the innovation since its
-    last report, and its time. became: outcomes of all detections without identities, at the end of
-    the stream.
+    cloud: the particles. judged: the innovation since its last report, and its time. became:
+    outcomes of all detections without identities, at the end of the stream.
     """
 
     pose_ns: int | None = None
@@ -49,11 +48,10 @@ NOTHING_NEW = Estimates()
 
 @runtime_checkable
 class RobotEstimator(Protocol):
-    """An estimator on one incarnation of a robot's stream: measurements in, running poses and maps
-    out.
+    """Estimator on one incarnation of a robot's stream.
 
-    sequence: number of its running poses and maps. used: disposition of its measurements. joint:
-    the map has a joint covariance. innovation: of all predicted measurements.
+    sequence: number of its poses and maps. used: disposition of its measurements. joint: the map
+    has a joint covariance. innovation: of all predicted measurements.
     """
 
     @property
@@ -66,24 +64,24 @@ class RobotEstimator(Protocol):
     def innovation(self) -> Innovation: ...  # noqa: D102
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Process a scan of landmarks; returns the reason of a rejection."""
+        """Process a scan of landmarks; return the reason of a rejection."""
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Process one odometry interval, or only its duration (not measured)."""
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; returns the last results, and the number of scans without odometry."""
+        """End the stream; return the last results, and the number of scans without odometry."""
 
     def own_pose(self) -> PoseGaussian:
         """Running pose from own measurements alone."""
 
     def own_map(self) -> LandmarkGaussian:
-        """Running map from own measurements (and what was absorbed)."""
+        """Running map from own measurements and absorbed maps."""
 
 
 @runtime_checkable
 class Associates(Protocol):
-    """An estimator that accepts scans of landmarks without identities: numbers from 2³¹ on."""
+    """Estimator that accepts scans without identities: numbers from 2³¹ on."""
 
     associates: bool
 

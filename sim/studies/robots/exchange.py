@@ -1,7 +1,7 @@
 """Exchange whole maps between a robot and a centre that fuses them.
 
-A map with its joint covariance is sent every `exchange_s`. Under a rule with feedback the robot
-waits for the answer (lockstep) and absorbs it.
+A map is sent every `exchange_s`. Under a rule with feedback the robot waits for the answer
+(lockstep) and absorbs it.
 """
 
 from collections import deque
@@ -13,14 +13,14 @@ from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000
-"""Landmarks beyond which a map has only 2 × 2 covariances: a message has at most 64 MiB."""
+"""Landmarks beyond which a map has only 2 × 2 covariances."""
 
 
 class MapExchange:
     """Rounds of one robot.
 
-    exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered: last
-    answered round; awaited: round of the last sent map. last: its sequence; −1: none.
+    exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered, awaited:
+    last answered round, and that of the last sent map. last: its sequence; −1: none.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
@@ -39,14 +39,14 @@ class MapExchange:
         return self.lockstep and self.awaited > self.answered
 
     def take_answer(self, round_: int) -> bool:
-        """Record the answer of a round; returns whether it is new."""
+        """Record the answer of a round; return whether it is new."""
         if not self.lockstep or round_ <= self.answered:
             return False
         self.answered = round_
         return True
 
     def is_sent(self, stamp_ns: int) -> bool:
-        """Record a new map; returns whether to send it, for viewers or a due round."""
+        """Record a new map; return whether to send it."""
         self._map_ns = stamp_ns
         since = None if self._sent_ns is None else stamp_ns - self._sent_ns
         return not self.exchanges or since is None or since >= self._every_ns

@@ -28,11 +28,11 @@ Judged = Callable[
 
 
 class Filter(NamedTuple):
-    """A recursive estimator over its own state.
+    """Recursive estimator over its own state.
 
-    looks: accepts landmarks; claims: with covariances of their own; maps: has a map. joint: with
-    covariances between landmarks. absorbed: the state with the given landmarks. particles: of a
-    state, for viewers. innovation: of a step's measurements, predicted by the state before.
+    looks: accepts landmarks; claims: with covariances; maps: has a map; joint: with covariances
+    between landmarks. absorbed: state with the given landmarks. particles: of a state, for viewers.
+    innovation: of a step's measurements, predicted by the state before.
     """
 
     initial_state: InitialState

@@ -64,8 +64,7 @@ def _exact(
 def _thesis_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> hybrid_thesis.ThesisState:
-    """The thesis assumes an exact start."""
-    return hybrid_thesis.started(np.zeros(3) if initial.pose is None else initial.pose)
+    return hybrid_thesis.initial_state(np.zeros(3) if initial.pose is None else initial.pose)
 
 
 def _thesis_step(
@@ -86,7 +85,6 @@ def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
 
 
 def _without_claims(judged: Callable[..., Innovation]) -> Judged:
-    """Innovation of an estimator that ignores measurements' own covariances."""
     return lambda state, *measurements: judged(state, *measurements[:-1])
 
 
@@ -100,20 +98,20 @@ def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
 def _thesis_absorbed(
     state: hybrid_thesis.ThesisState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
 ) -> hybrid_thesis.ThesisState:
-    return hybrid_thesis.absorbed(state, ids, means, translate.blocks_of(covariance))
+    return hybrid_thesis.absorb_map(state, ids, means, translate.blocks_of(covariance))
 
 
 def _coded_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> CodedState:
     pose = np.zeros(3) if initial.pose is None else initial.pose
-    return hybrid_thesis_coded.started(pose, config.front_end.particles)
+    return hybrid_thesis_coded.initial_state(pose, config.front_end.particles)
 
 
 def _absorb_coded(
     state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
 ) -> CodedState:
-    return hybrid_thesis_coded.absorbed(state, ids, means, translate.blocks_of(covariance))
+    return hybrid_thesis_coded.absorb_map(state, ids, means, translate.blocks_of(covariance))
 
 
 S = TypeVar("S")
@@ -125,7 +123,6 @@ def _with_start(
     initial: InitialPose,
     *generator: np.random.Generator,
 ) -> S:
-    """The state at a start N(pose, covariance)."""
     at = np.zeros(3) if initial.pose is None else initial.pose
     state = initial_state(at)
     if initial.covariance is None:
@@ -144,8 +141,6 @@ def _plain_step(
 
 
 def _plain(proposal: Proposal) -> Filter:
-    """FastSLAM over the whole stream; the front end's own proposal is ignored."""
-
     def initial_state(
         config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
     ) -> PlainFastSlam:
@@ -172,7 +167,7 @@ def _plain(proposal: Proposal) -> Filter:
 def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
-    """An unknown initial pose is uniform where the sensor may detect a landmark of the known map.
+    """Draw an unknown initial pose where the sensor may detect a landmark of the known map.
 
     That is the map's box widened by the sensor's reach, at most by half its longer side.
     """

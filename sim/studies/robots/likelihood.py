@@ -1,4 +1,4 @@
-"""FastSLAM 1.0 with data association from its first detection without an identity on."""
+"""FastSLAM 1.0 with data association from its first detection without identity on."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 
 
 def with_association(plain: Filter) -> Filter:
-    """The filter with identities until the first scan without; later scans ignore identities.
+    """Use identities until the first scan without; ignore them in later scans.
 
     Particles keep their poses; landmarks mapped by identity are dropped.
     """
@@ -58,7 +58,7 @@ def with_association(plain: Filter) -> Filter:
 
     def took(state: Any) -> np.ndarray:
         known = isinstance(state, FastSlamMl)
-        return fastslam_ml.taken(state) if known else np.empty(0, np.int64)
+        return fastslam_ml.slots_of_detections(state) if known else np.empty(0, np.int64)
 
     return plain._replace(
         filter_step=filter_step,

@@ -10,7 +10,7 @@ from teamslam.team.wire.bus import Outgoing
 
 
 def in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Messages under a feedback rule, where a robot waits for each round's map: the recorded one.
+    """Messages under a feedback rule, where a robot waits for each round's recorded map.
 
     Without a recorded map the robot continued without a centre.
     """

@@ -1,6 +1,4 @@
-"""Mappers of comparison robots: Hybrid-SLAM that exchanges its own map, and whole-stream
-estimators.
-"""
+"""Mappers of comparison robots."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -50,7 +48,7 @@ class ExchangingMapper(Mapper):
         self.exchange.last = -1
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a map is published or may be exchanged at the end of this window."""
+        """Whether to publish or exchange a map at the end of this window."""
         return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:
@@ -179,7 +177,7 @@ class StreamMapper(ExchangingMapper):
         """Repeat nothing: there is no window."""
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Process a scan of landmarks; returns the reason of a rejection."""
+        """Process a scan of landmarks; return the reason of a rejection."""
         return self.estimator.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:

@@ -1,4 +1,4 @@
-"""The node of a comparison robot: its centre fuses whole maps or raw measurements.
+"""Node of a comparison robot: its centre fuses whole maps or raw measurements.
 
 Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot waits
 for the fused map of each exchange and absorbs it.
@@ -45,7 +45,6 @@ class ExchangingRobot(RobotNode):
                 super().receive(message)
 
     def _absorb(self, fused: m.FusedMap) -> None:
-        """Absorb the answer of an exchange, under a rule with feedback."""
         if not self.mapper.exchange.take_answer(fused.exchange):
             return
         ids, means = translate.landmarks_of(fused)
@@ -59,17 +58,13 @@ class ExchangingRobot(RobotNode):
     def is_held(self) -> bool:
         """Whether the robot waits for a known map, or for a centre that is present.
 
-        A centre that was never present may still answer: lockstep does not depend on the order of
-        tokens.
+        A centre that was never present may still answer.
         """
         waits = self.mapper.exchange.waits and not self._centre_is_away
         return self.mapper.waits_for_map or waits
 
     def consume(self) -> None:
-        """Consume the measurements in order; a waiting robot reports those received.
-
-        Otherwise the world would wait for it, and a teammate for the world.
-        """
+        """Consume the measurements in order; a waiting robot reports those received."""
         super().consume()
         if not self.mapper.exchange.lockstep or not self.is_held:
             return
@@ -79,7 +74,7 @@ class ExchangingRobot(RobotNode):
             self.report_progress()
 
     def progress(self) -> m.Progress:
-        """Number of measurements consumed or reported ahead, and the time passed."""
+        """Number of measurements consumed or reported ahead, and the time."""
         progress = super().progress()
         incarnation, reported = self._reported
         ahead = reported if incarnation == progress.incarnation else 0

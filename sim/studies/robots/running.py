@@ -34,11 +34,11 @@ from teamslam.team.robot.maps import Cloud, InitialPose, thin_out
 
 
 class RunningEstimator:
-    """The state after every keyframe; its map is published once per window, or at every keyframe.
+    """State after every keyframe; its map is published once per window, or at every keyframe.
 
-    Without submaps it cannot be resumed: a restarted robot processes its stream from the beginning
-    and publishes the same messages again. sequence: number of keyframes. associates: accepts scans
-    without identities; their outcomes are reported at the end.
+    A restarted robot processes its stream from the beginning and publishes the same messages.
+    sequence: number of keyframes. associates: accepts scans without identities, whose outcomes are
+    reported at the end.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class RunningEstimator:
         return self._innovation.plus(self._unsaid)
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Process a scan (ids, ranges, bearings); returns the reason of a rejection."""
+        """Process a scan (ids, ranges, bearings); return the reason of a rejection."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
         unnamed = bool((scan.ids >= UNNAMED).any())
@@ -105,7 +105,6 @@ class RunningEstimator:
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
-        """Results since `before` keyframes; the map if due, or unpublished at the end."""
         now_ns = self.last_keyframe_ns
         if now_ns is None or self._map_ns is None:
             return Estimates()
@@ -128,7 +127,6 @@ class RunningEstimator:
         return partial(thin_out, self._filter.particles(self._state), np.zeros(3))
 
     def _take(self, keyframe: Keyframe) -> None:
-        """Process a keyframe: scans without identities one by one, then all other observations."""
         for look in keyframe.looks:
             self._looks.append(look)
             seen = look.ids, look.ranges, look.bearings, look.own
@@ -182,7 +180,6 @@ class RunningEstimator:
         self.last_keyframe_ns = stamp_ns
 
     def _after(self, step: Step) -> tuple[Any, Innovation] | None:
-        """State after a step and its innovation; None without a finite pose."""
         increment, *scan = step
         judged = NOTHING
         with np.errstate(all="ignore"):
@@ -197,7 +194,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; returns the last keyframe and map, and the scans without odometry."""
+        """End the stream; return the last keyframe and map, and the scans without odometry."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:

@@ -1,1 +1,1 @@
-"""Fusion rules of the sources, for comparison; the product runs without them."""
+"""Fusion rules of the sources, for comparison."""

@@ -1,4 +1,4 @@
-"""The rule `batch`: the batch MAP over all robots' raw measurements, updated as they arrive."""
+"""Rule `batch`: the batch MAP over all robots' raw measurements."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -22,18 +22,16 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
-"""Most iterations of a broadcast's map from the last solution, and the Newton step in σ that ends
-them.
-"""
+"""Most iterations of a broadcast's map, and the Newton step in σ that ends them."""
 FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
-"""The same for the final map, which has a warning without convergence."""
+"""The same for the final map."""
 
 
 class BatchCentre(MeasurementCentre):
     """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
 
-    The robots' newest poses are published with the map, whole paths with the final map. Persistent
-    sensor errors and biases are treated as white noise, with a warning.
+    The newest poses are published with the map, whole paths with the final map. Persistent sensor
+    errors and biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch
@@ -90,13 +88,12 @@ class BatchCentre(MeasurementCentre):
         return MapContent(landmarks, self._batch.cost, self._batch.dof, outgoing)
 
     def _grow(self) -> None:
-        """Add the waiting steps; without a solution drop their measurements, or all."""
         turns, self._waiting = self._waiting, []
         blind = [turn.blind for turn in turns]
         for some in (turns, blind):
             with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
-                grown = batch.extended(self._batch, some)
-                _ = batch.solved(grown, 1, RUNNING_DECREMENT).marginals
+                grown = batch.add_steps(self._batch, some)
+                _ = batch.solve(grown, 1, RUNNING_DECREMENT).marginals
                 self._batch = grown
                 return
             self._findings.append(
@@ -106,7 +103,7 @@ class BatchCentre(MeasurementCentre):
 
     def _solved(self, grown: GrowingBatch, iterations: int, decrement: float) -> GrowingBatch:
         with suppress(UnsolvableError, ArithmeticError), np.errstate(all="ignore"):
-            solution = batch.solved(grown, iterations, decrement)
+            solution = batch.solve(grown, iterations, decrement)
             _ = solution.marginals
             return solution
         self._findings.append("the batch has no full solution")

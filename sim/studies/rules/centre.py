@@ -1,8 +1,4 @@
-"""Common part of the comparison centres without submaps.
-
-Attendance, the end of the streams and the conclusion are the product's
-(`teamslam.central.node.CentralNode`), inputs and maps their own.
-"""
+"""Common part of the comparison centres without submaps."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING

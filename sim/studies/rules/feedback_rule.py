@@ -1,8 +1,7 @@
 """Rules that fuse whole maps which the robots absorb, in lockstep.
 
-The fused map of a round replaces the robots' own landmarks, so the next round's maps contain it:
-under `kalman` and `kalman-per-axis` measurements are counted repeatedly, and the covariance has no
-meaning.
+The fused map replaces the robots' own landmarks, so under `kalman` and `kalman-per-axis`
+measurements are counted repeatedly, and the covariance has no meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ from teamslam.central.fused_map import fused_message
 from teamslam.sim.studies.rules.centre import ComparisonCentre, recorded_maps
 from teamslam.sim.studies.rules.map_fusion import (
     covariance_intersection,
-    fused_totally,
+    fuse_maps,
     kalman,
     kalman_per_axis,
 )
@@ -38,7 +37,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 
 
 class RoundsCentre(ComparisonCentre):
-    """Fuses the maps of each round in the order of the robots' names; a round names those before.
+    """Fusion of the maps of each round in the order of the robots' names.
 
     Stores the robots' submaps for their next processes.
     """
@@ -63,7 +62,7 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """Map of every round complete but for robots that send no more.
+        """Make the map of every round complete but for robots that send no more.
 
         A restarted centre continues with the present round.
         """
@@ -106,7 +105,7 @@ class RoundsCentre(ComparisonCentre):
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
         values = {x.robot: value_of(x) for x in maps}
-        value, refused = fused_totally(
+        value, refused = fuse_maps(
             RULES[self.config.fusion], values, self.config.bounds.coordinate_m
         )
         payload = b"".join(x.ids + x.means + x.covariance for x in maps)

@@ -1,4 +1,4 @@
-"""The rule `joint-fastslam`: multi-robot FastSLAM at the centre (Ma & Ma, section IV-D)."""
+"""Rule `joint-fastslam`: multi-robot FastSLAM at the centre (Ma & Ma, section IV-D)."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,10 +23,7 @@ RESAMPLE_BELOW = 1.0
 
 
 class JointFastSlamCentre(MeasurementCentre):
-    """One particle filter over all robots' paths and one map.
-
-    The proposal is that of FastSLAM 1.0.
-    """
+    """One particle filter over all robots' paths and one map, by FastSLAM 1.0."""
 
     _state: JointFastSlam
 

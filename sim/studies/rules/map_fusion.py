@@ -1,8 +1,7 @@
 """Fusion of whole maps that the robots then absorb, for comparison.
 
-`kalman_per_axis` and `kalman` treat the maps as independent. Once a robot has absorbed a fused map
-they are not: every exchange counts measurements again, and the covariance loses its meaning.
-Covariance intersection is consistent for any correlation, at the price of independent information.
+`kalman_per_axis` and `kalman` treat the maps as independent, which they are not after an exchange.
+Covariance intersection is consistent for any correlation.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from teamslam.sim.studies.estimators.feedback import carried_along
+from teamslam.sim.studies.estimators.feedback import carry_along
 from teamslam.sim.studies.estimators.svd_joining import columns_of
 from teamslam.team import core
 from teamslam.team.estimation import dense
@@ -29,14 +28,14 @@ SEARCH_STEPS = 60
 
 
 SMALLEST_VARIANCE = 1e-12
-"""Least variance [m²]: absorbing halves the variance in every round, and it must stay positive."""
+"""Least variance [m²]: absorbing halves the variance in every round."""
 
 
 def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """Full-covariance Kalman fusion in the given order, as if the maps were independent.
 
-    K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's further landmarks follow
-    by regression on c. Counts measurements again when its result is absorbed.
+    K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's others by regression on
+    c.
     """
     return _one_by_one(_kalman_pair, maps)
 
@@ -45,7 +44,7 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
 
     TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and S =
-    S^A S^B/(S^A + S^B). Counts measurements again, as `kalman` does.
+    S^A S^B/(S^A + S^B).
     """
     return _one_by_one(_per_axis_pair, maps)
 
@@ -56,8 +55,7 @@ def covariance_intersection(
     """Fusion that is consistent for any correlation between the maps (Julier & Uhlmann 1997).
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
-    of the least trace or determinant of C. The landmarks of one map alone follow by regression on
-    the common ones in that map; its residual counts as that map's own information.
+    of the least trace or determinant of C. The others follow by regression in their own map.
     """
 
     def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
@@ -78,15 +76,14 @@ def _one_by_one(
     return fused
 
 
-def fused_totally(
+def fuse_maps(
     rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian],
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Fuse the robots' maps; returns the result and the rejected maps, with reasons.
+    """Fuse the robots' maps; return the result and the rejected maps, with reasons.
 
-    Rejected maps exceed the bounds, or the rule has no result with them: then maps are fused one by
-    one in order.
+    Maps are rejected beyond the bounds, or if the rule has no result with them.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []
@@ -112,7 +109,6 @@ def fused_totally(
 def _apply_rule(
     rule: Callable[[Sequence[LandmarkGaussian]], LandmarkGaussian], maps: Sequence[LandmarkGaussian]
 ) -> LandmarkGaussian | None:
-    """The rule's result; None without a finite one."""
     try:
         with np.errstate(all="ignore"):
             fused = rule(maps)
@@ -128,9 +124,8 @@ def _find_shared(a: LandmarkGaussian, b: LandmarkGaussian) -> tuple[Int64[np.nda
 
 
 def _carry(a: LandmarkGaussian, fused: LandmarkGaussian) -> LandmarkGaussian:
-    """Add the landmarks of `a` that `fused` lacks, by regression on the others."""
     in_a, in_fused = _find_shared(a, fused)
-    mean, covariance = carried_along(
+    mean, covariance = carry_along(
         a.means.ravel(), a.covariance, in_a, fused.means.ravel(), fused.covariance, in_fused
     )
     ids = np.concatenate([np.setdiff1d(a.ids, fused.ids), fused.ids])

@@ -8,7 +8,7 @@ import msgspec
 from teamslam.central.config import CentralConfig
 from teamslam.central.fused_map import fused_message
 from teamslam.sim.studies.rules.centre import ComparisonCentre, recorded_maps
-from teamslam.sim.studies.rules.map_fusion import fused_totally, kalman
+from teamslam.sim.studies.rules.map_fusion import fuse_maps, kalman
 from teamslam.team import translate
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.store import Stream
@@ -25,7 +25,7 @@ Starts = Mapping[Stream, m.InitialPose]
 
 
 class NewestMapsCentre(ComparisonCentre):
-    """Stores the newest map of every robot, and the streams' initial poses.
+    """Newest map of every robot, and the streams' initial poses.
 
     names_inputs: a map follows from its named maps alone.
     """
@@ -80,7 +80,7 @@ class NewestMapsCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute each map from its named recorded maps; the reasons name others, too."""
+        """Recompute each map from its named recorded maps."""
         firsts = {stream: measurements.get(0) for stream, measurements in log.measurements.items()}
         starts = {s: start for s, start in firsts.items() if isinstance(start, m.InitialPose)}
         for channel, recorded in ((ch.FUSED_MAP, maps), (ch.FINAL_MAP, finals)):
@@ -93,10 +93,9 @@ class NewestMapsCentre(ComparisonCentre):
 
 
 class LatestCentre(NewestMapsCentre):
-    """The latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
+    """Latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
 
-    Each map uses its own robot's measurements alone, so the result is as consistent as the maps. A
-    robot with an unknown initial pose is left out.
+    A robot with an unknown initial pose is left out.
     """
 
     names_inputs = False
@@ -129,7 +128,7 @@ class LatestCentre(NewestMapsCentre):
         """Fuse the maps in the team's frame."""
         placed = [each for each in maps if is_placed(each, starts)]
         values = {x.robot: value_of(x) for x in placed}
-        value, refused = fused_totally(kalman, values, self.config.bounds.coordinate_m)
+        value, refused = fuse_maps(kalman, values, self.config.bounds.coordinate_m)
         away = sorted({x.robot for x in maps} - {x.robot for x in placed})
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
         self.landmarks = len(value.ids)

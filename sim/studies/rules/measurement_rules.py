@@ -1,4 +1,4 @@
-"""Common part of centres on raw measurements: keyframes of the team in, poses and map out."""
+"""Common part of centres on raw measurements."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MapContent:
-    """Contents of a map: the landmarks and the joint cost, if any.
-
-    before: messages that precede it.
-    """
+    """Landmarks of a map and the joint cost, if any. before: messages that precede it."""
 
     landmarks: LandmarkGaussian = NO_LANDMARKS
     chi2: float = 0.0
@@ -42,11 +39,11 @@ class MapContent:
 
 
 class MeasurementCentre(ComparisonCentre):
-    """An estimate over all robots' raw measurements at the centre.
+    """Estimate over all robots' raw measurements at the centre.
 
-    The keyframes of one team time are one step, the clock of the maps. The robots announce their
-    models. A robot with an unknown initial pose is left out; if none is known the first robot's is
-    the frame. A map's members name each robot's last measurement in it.
+    The keyframes of one team time are one step, the clock of the maps. Robots with an unknown
+    initial pose are left out; if none is known the first robot's is the frame. A map's members name
+    each robot's last measurement.
     """
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
@@ -66,11 +63,11 @@ class MeasurementCentre(ComparisonCentre):
 
     @abstractmethod
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        """Begin with the robots' initial poses; covariances in (x, y, θ), None: exactly known."""
+        """Begin with the robots' initial poses; covariances in (x, y, θ), None: exact."""
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """Process one step of the team, already in the members; returns poses to publish."""
+        """Process one step of the team; return poses to publish."""
 
     @abstractmethod
     def _content(self, *, final: bool) -> MapContent:
@@ -135,7 +132,6 @@ class MeasurementCentre(ComparisonCentre):
             yield from self.publish_final()
 
     def _begin(self) -> bool:
-        """Place the robots' initial poses in one frame; False while one is missing."""
         starts = self._keyframes.starts
         if not starts:
             return False
@@ -245,7 +241,6 @@ class MeasurementCentre(ComparisonCentre):
 
 
 def _inputs_in_order(log: "Recorded") -> Iterator[m.Message]:
-    """The robots' models, every measurement by stream and counter, the end of the streams."""
     for node in sorted(log.configured):
         if node.startswith("robot/"):
             yield log.configured[node]

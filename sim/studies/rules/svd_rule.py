@@ -1,9 +1,8 @@
 """Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
-Every robot's submaps make one map by least squares in the frame of its own initial pose (section
-4.1). It is moved into the others' frame by a singular value decomposition over the common
-landmarks, and the landmarks are joined (section 4.3). Only the first robot's initial pose matters:
-it fixes the frame.
+Every robot's submaps make one map by least squares (section 4.1), moved into the others' frame by
+SVD over the common landmarks, and joined (section 4.3). The first robot's initial pose fixes the
+frame.
 """
 
 import math
@@ -46,7 +45,7 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """The submaps of a stream so far: number, map, and digest of the inputs.
+    """Submaps of a stream so far: number, map, and digest of the inputs.
 
     refused: the submap that ended the chain, with the reason.
     """
@@ -60,8 +59,7 @@ class _Joined:
 class SvdFold(SubmapFold):
     """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
 
-    A later incarnation is a stream in its own frame. A later running map may place stored submaps
-    elsewhere.
+    A later incarnation is a stream in its own frame.
     """
 
     def __init__(
@@ -109,7 +107,7 @@ class SvdFold(SubmapFold):
         first = min(states or chains, key=lambda s: (initial[s] is None, s))
         maps = {s: svd_joining.landmark_gaussian(state) for s, state in states.items()}
         with np.errstate(all="ignore"):
-            fused, reasons = tied(first, maps, full=self._weighting == "full")
+            fused, reasons = align_maps(first, maps, full=self._weighting == "full")
         refused = tuple(x.refused for _, x in sorted(joined.items()) if x.refused)
         self.landmarks = len(fused.ids)
         return fused_message(
@@ -132,7 +130,7 @@ class SvdFold(SubmapFold):
     def _extended(
         self, stream: Stream, chain: Sequence[m.Submap], initial_pose: Pose | None, final: bool
     ) -> _Joined:
-        """The map of a stream's chain, from its longest stored part.
+        """Extend the map of a stream's chain from its longest stored part.
 
         Running maps continue from the last solution; the final one is solved until it converges,
         including a search for other minima.
@@ -180,12 +178,12 @@ def _join_with(state: SubmapJoining, robot: str, local: LocalMap) -> SubmapJoini
 def _solution(state: SubmapJoining) -> SubmapJoining:
     try:
         with np.errstate(all="ignore"):
-            return svd_joining.solved(state)
+            return svd_joining.solve(state)
     except UNSOLVABLE:
         return state
 
 
-def tied(
+def align_maps(
     first: Stream,
     maps: Mapping[Stream, LandmarkGaussian],
     *,
@@ -194,25 +192,25 @@ def tied(
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """Align greedily the map with the most landmarks in common with the aligned ones.
 
-    sightings: by two streams in order, the robots' positions in both maps where they measured each
-    other (`mutual_sighting`); aligned like common landmarks, but not with `full`. A map with too
-    few common points is left out, with the reason.
+    sightings: by two streams in order, the positions in both maps of robots that measured each
+    other; aligned like common landmarks, but not with `full`. A map with too few common points is
+    left out, with the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}
     waiting = {stream: maps[stream] for stream in sorted(maps) if stream != first}
     unsolvable: list[Stream] = []
     while waiting:
-        seen = {s: _seen(s, frames, sightings) for s in waiting}
+        seen = {s: _shared_points(s, frames, sightings) for s in waiting}
         shared = {
             s: len(np.intersect1d(fused.ids, x.ids)) + len(seen[s].in_a) for s, x in waiting.items()
         }
         stream = max(waiting, key=lambda s: shared[s])
         try:
             exchange = (
-                svd_joining.exchanged_fully(fused, waiting[stream])
+                svd_joining.exchange_maps_fully(fused, waiting[stream])
                 if full
-                else svd_joining.exchanged(fused, waiting[stream], seen[stream])
+                else svd_joining.exchange_maps(fused, waiting[stream], seen[stream])
             )
         except TooFewPointsError:
             break
@@ -234,12 +232,11 @@ def tied(
     return fused, tuple(reasons)
 
 
-def _seen(
+def _shared_points(
     stream: Stream,
     frames: Mapping[Stream, Pose],
     sightings: Mapping[tuple[Stream, Stream], PointPairs],
 ) -> PointPairs:
-    """Points that a stream shares with the map, in the map's frame and in its own."""
     found = [NO_PAIRS]
     for other, frame in frames.items():
         pairs = sightings.get((min(stream, other), max(stream, other)))

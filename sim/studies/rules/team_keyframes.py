@@ -1,6 +1,4 @@
-"""Merge all robots' raw measurements into one sequence of keyframes, independent of arrival
-order.
-"""
+"""Merge all robots' raw measurements into one sequence of keyframes."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -19,7 +17,7 @@ from teamslam.team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and final measurements; `number`: of the measurement that closed it."""
+    """One robot's motion and final measurements; number: of the closing measurement."""
 
     stamp_ns: int
     robot: str
@@ -29,7 +27,7 @@ class RobotKeyframe(NamedTuple):
 
 @dataclass
 class _Stream:
-    """The measurements of one robot, from its initial pose on.
+    """Measurements of one robot, from its initial pose on.
 
     covered_ns: no keyframe before this team time can follow. start: measurement 0.
     """
@@ -47,12 +45,10 @@ class _Stream:
 
     @property
     def complete(self) -> bool:
-        """Whether all measurements have been used."""
         end = self.end
         return self.broken or (end is not None and self.inbox.complete(end))
 
     def take(self) -> None:
-        """Cut the complete measurements into keyframes."""
         if self.config is None:
             return
         while (measurement := self.inbox.take_next()) is not None:
@@ -97,10 +93,9 @@ class _Stream:
 
 
 class TeamKeyframes:
-    """The team's keyframes by (stamp, robot), as far as every robot's stream is known.
+    """Keyframes of the team by (stamp, robot), as far as every robot's stream is known.
 
-    A function of the streams alone. A stream that restarts at an unknown pose ends there;
-    inter-robot measurements are not used.
+    A stream that restarts at an unknown pose ends there; inter-robot measurements are not used.
     """
 
     def __init__(self, robots: Sequence[str]) -> None:
@@ -149,7 +144,7 @@ class TeamKeyframes:
         return all(stream.complete for stream in self._streams.values())
 
     def steps(self) -> Iterator[list[RobotKeyframe]]:
-        """Complete keyframes by team time."""
+        """Yield complete keyframes by team time."""
         for stream in self._streams.values():
             stream.take()
         horizon = min(stream.covered_ns for stream in self._streams.values())

@@ -1,5 +1,5 @@
 from teamslam.central.desk.evaluation.events import EventDetector
-from teamslam.central.desk.view.landmark_sets import sets_of
+from teamslam.central.desk.view.page_frames import sets_of
 from teamslam.team.wire import messages as m
 from tests.support import examples
 

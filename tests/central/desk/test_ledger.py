@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.ledger import Ledger, ledger
-from teamslam.central.desk.verification.recorded import recorded
+from teamslam.central.desk.verification.recorded import index_log
 from teamslam.sim.cli.rerun import app
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -24,7 +24,7 @@ def samples():
 
 
 def ledger_of(samples: list[Sample], folder: Path) -> Ledger:
-    return ledger(recorded(written(folder / "log.mcap", samples)))
+    return ledger(index_log(written(folder / "log.mcap", samples)))
 
 
 def submap_changed(samples: list[Sample], sequence: int, **fields: int) -> list[Sample]:

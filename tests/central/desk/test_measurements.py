@@ -5,8 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.central.desk.verification.measurements import RecordedMeasurements
-from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.central.desk.verification.recorded import Recorded, RecordedMeasurements
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample

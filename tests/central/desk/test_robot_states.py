@@ -13,7 +13,7 @@ from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.containment import Boundary
 from teamslam.team.shell import FaultyRunError, judge
@@ -85,7 +85,7 @@ def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]
 def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
     """r1 alone has a known start; it is withdrawn, and the map is in the frame of r2."""
     of = scenario()
-    streams = simulated(of.world, of.robots, of.seed)
+    streams = simulate(of.world, of.robots, of.seed)
     streams = without_starts(streams, "r2", "r3")
     wrong = list(run_team(of, streams))
     order = m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="its wheel is flat")

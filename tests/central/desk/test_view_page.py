@@ -427,11 +427,11 @@ def test_a_second_view_gives_foxglove_a_free_port_and_says_so(log, monkeypatch, 
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]
         monkeypatch.setattr(view, "FOXGLOVE_PORT", taken)
-        with view.shown_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
+        with view.show_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
             assert urlsplit(shown.foxglove).port not in (taken, None)
     said = capsys.readouterr().out
     assert f"{shown.foxglove}   ({taken} is taken; --foxglove-port chooses another)" in said
-    with view.shown_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
+    with view.show_on_page(log, "127.0.0.1", 0, None, browser=False, growing=False) as shown:
         assert urlsplit(shown.foxglove).port == taken
     assert "is taken" not in capsys.readouterr().out
 

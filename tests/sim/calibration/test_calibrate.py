@@ -18,7 +18,7 @@ from teamslam.sim.calibration.figures import (
     jackknife,
     with_figures,
 )
-from teamslam.sim.calibration.join import joined_team
+from teamslam.sim.calibration.join import join_team
 from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
 from teamslam.sim.calibration.motion import fit_motion
 from teamslam.sim.calibration.scenario import scenario_text
@@ -160,7 +160,7 @@ def test_a_team_without_submaps_is_an_error_with_a_text():
         for s in world.streams
     ]
     with pytest.raises(CalibrationError, match="no robot has odometry and measurements"):
-        joined_team(replace(world, streams=tuple(standing)), team)
+        join_team(replace(world, streams=tuple(standing)), team)
 
 
 def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path):

@@ -8,7 +8,7 @@ from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS
 from teamslam.sim.calibration.claims import landmark_factor, mount_note, odometry_factor
 from teamslam.sim.calibration.data import Reference, references, true_paths
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 MOUNT = (1.2, -0.4, 0.3)
@@ -30,7 +30,7 @@ WORLD = SimulatedWorld(
 
 
 def seen(assumed: tuple[float, float, float] = MOUNT, **changes: object) -> list[Reference]:
-    world = simulated(msgspec.structs.replace(WORLD, **changes), ROBOTS, 3)
+    world = simulate(msgspec.structs.replace(WORLD, **changes), ROBOTS, 3)
     assert world.landmarks is not None
     places = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
     sensor = msgspec.structs.replace(ROBOTS[0].sensor, mount=assumed)

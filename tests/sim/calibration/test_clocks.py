@@ -35,7 +35,7 @@ def test_a_late_clock_is_found_without_a_mount_and_is_written_into_the_scenario(
 
     The figures of the joined map, which take most of the time, have tests of their own.
     """
-    monkeypatch.setattr(calibrate, "joined_team", lambda *_: SimpleNamespace(fold=None))
+    monkeypatch.setattr(calibrate, "join_team", lambda *_: SimpleNamespace(fold=None))
     monkeypatch.setattr(calibrate, "central_figures", lambda *_: ())
     late = scenario_in(places[1])
     begun = msgspec.structs.replace(late.robots[1], clock_offset_s=0.1)

@@ -12,7 +12,7 @@ from teamslam.central.monitor import miscalibrations
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from tests.final_maps import final_only
@@ -57,7 +57,7 @@ def joined(biases: tuple[Bias, ...], true_scale: float) -> Run:
         )
         for robot in told.robots
     )
-    fused = evaluate(run_team(final_only(told), simulated(told.world, truly, 11))).map
+    fused = evaluate(run_team(final_only(told), simulate(told.world, truly, 11))).map
     a, b = (of - of.mean(axis=0) for of in (fused.means, fused.truth))
     along, across = np.sum(a * b), np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     return Run(fused, float(np.hypot(along, across) / np.sum(b * b)))

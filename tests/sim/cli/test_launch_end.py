@@ -32,7 +32,7 @@ def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(launch, "_launched", lambda *_: outcome)
+    monkeypatch.setattr(launch, "_launch", lambda *_: outcome)
     monkeypatch.setattr(launch, "_conclude", interrupted)
     words = ["launch", "thesis", "-o", str(log.parent), "--json", str(figures)]
     ended = CliRunner().invoke(app, words)

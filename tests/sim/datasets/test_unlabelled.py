@@ -8,14 +8,13 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.sim.calibration.data import messages_of
-from teamslam.sim.calibration.source import measurements_of
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.unlabelled import unlabelled
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.sim.scenarios.source import open_data_set, scenario_beside, streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import FIXES, NO_LABEL, OBSERVATIONS, ODOMETRY
@@ -63,7 +62,7 @@ def streams(folder, robots=1, **fields):
 
 
 def test_calibration_takes_a_set_without_names_and_hears_no_label(steps):
-    world, scenario = measurements_of(steps)
+    world, scenario, _ = open_data_set(steps)
     (stream,) = world.streams
     assert scenario.name == "dlr"
     seen = stream.landmark_detections

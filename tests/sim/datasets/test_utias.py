@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.calibration.source import measurements_of, own_scenario
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets import errata
 from teamslam.sim.datasets.tables import DatasetError
@@ -21,6 +20,7 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options
 from teamslam.sim.scenarios.source import (
+    open_data_set,
     scenario_beside,
     streams_of,
     with_present_robots,
@@ -102,14 +102,13 @@ def test_a_set_of_another_rig_brings_its_own_models(folder):
     own = folder / "scenario.toml"
     own.write_text('base = "utias"\n[defaults.sensor]\nrange_is_depth = false\n', "utf-8")
     assert scenario_beside(folder) == str(own)
-    assert own_scenario(folder) == str(own)
     zipped = Path(shutil.make_archive(str(folder), "zip", folder.parent, folder.name))
     within = scenario_beside(zipped)
-    assert within == own_scenario(zipped) == str(zipped / folder.name / "scenario.toml")
+    assert within == str(zipped / folder.name / "scenario.toml")
     for each in (own, within):
         loaded = with_options(load(str(each)), dataset=zipped)
         assert [robot.sensor.range_is_depth for robot in loaded.robots] == [False] * 5
-    streams, scenario = measurements_of(folder)
+    streams, scenario, _ = open_data_set(folder)
     assert [robot.sensor.range_is_depth for robot in scenario.robots] == [False] * 3
     assert [stream.robot for stream in streams.streams] == ["r1", "r2", "r3"]
 

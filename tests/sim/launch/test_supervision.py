@@ -7,7 +7,7 @@ import time
 import pytest
 
 from teamslam.sim.launch import launch as launching
-from teamslam.sim.launch.launch import entered
+from teamslam.sim.launch.launch import enter_team
 from teamslam.sim.launch.processes import Starter
 from teamslam.sim.launch.supervision import Silence, supervise
 from teamslam.sim.launch.supervisor import Child, Supervised, end_all
@@ -141,7 +141,7 @@ def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
             raise BusError("no router answers")
         return ZenohBus("team", endpoint, 60.0)
 
-    endpoint, bus = entered(router, enter)
+    endpoint, bus = enter_team(router, enter)
     bus.close()
     end_all([router.child])
     assert tried == [endpoint, endpoint]

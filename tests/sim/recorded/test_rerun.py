@@ -228,7 +228,7 @@ def test_a_killed_process_of_a_verification_is_an_error_with_its_remedy(log, mon
     def die(*_):
         os.kill(os.getpid(), signal.SIGKILL)
 
-    monkeypatch.setattr(verification, "recomputed_centre", die)
+    monkeypatch.setattr(verification, "recompute_centre", die)
     with pytest.raises(RerunError, match=r"was killed, .*: on one processor"):
         verify(log, processes=2)
 

@@ -8,14 +8,14 @@ from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.forms import (
-    claimed,
+    draw_covariances,
     measured_increments,
     measured_steering,
     seen_from,
     with_errors,
 )
 from teamslam.sim.world.sensing import Visible
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 
 MOTION = MotionModel(
@@ -67,7 +67,7 @@ def test_measurements_err_by_the_covariances_that_come_with_them(points):
     count = 6000
     seen = Visible(*np.zeros((2, count), np.int64), np.full(count, 5.0), np.zeros(count))
     sensor = Sensor(range_sigma=0.2, bearing_sigma=0.03)
-    of = claimed(seen, sensor, (0.5, 2.0), rng.random((count, 3)), points=points)
+    of = draw_covariances(seen, sensor, (0.5, 2.0), rng.random((count, 3)), points=points)
     errors = with_errors(np.zeros((count, 2)), of, rng.standard_normal((count, 2)))
     full = of[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(full), errors)
@@ -82,7 +82,7 @@ def test_forms_that_do_not_fit_are_named():
         msgspec.structs.replace(WORLD, landmark_form="points", outlier_share=0.1)
     steered = msgspec.structs.replace(WORLD, odometry="steering")
     with pytest.raises(ValueError, match="r1 needs motion"):
-        simulated(steered, [RobotConfig("r1")], 1)
+        simulate(steered, [RobotConfig("r1")], 1)
 
 
 def streams(form: str, identities: str):
@@ -124,6 +124,6 @@ ROBOT = RobotConfig("r1")
 
 def landmarks(**fields) -> np.ndarray:
     world = SimulatedWorld(steps=1, size_m=30.0, **fields)
-    found = simulated(world, (ROBOT,), 3).landmarks
+    found = simulate(world, (ROBOT,), 3).landmarks
     assert found is not None
     return found

@@ -10,7 +10,7 @@ from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.rules.team_keyframes import TeamKeyframes
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.models import increment_of
@@ -42,7 +42,7 @@ def whitened(truth: MotionModel, filters: MotionModel) -> np.ndarray:
     """L⁻¹ log(mean⁻¹ ∘ true step), L Lᵀ the filter's covariance, of every step of a team."""
     world = SimulatedWorld(steps=1500, step_s=0.5, size_m=60.0, turn_rate_rad_s=0.8)
     errors = []
-    for stream in simulated(world, [RobotConfig(id="r1", motion=truth)], 11).streams:
+    for stream in simulate(world, [RobotConfig(id="r1", motion=truth)], 11).streams:
         steps = stream.intervals
         for k in range(len(steps.end_ns)):
             speed, yaw_rate = float(steps.forward[k]), float(steps.yaw_rate[k])

@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.paths import followed, moved
-from teamslam.sim.world.simulator import simulated
+from teamslam.sim.world.paths import follow_way_points, move_pose
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import (
     OBSERVATIONS,
     ODOMETRY,
@@ -24,7 +24,7 @@ from teamslam.team.config import MotionModel, RobotConfig, Sensor
 
 
 def world_of(scenario: Scenario, seed: int = 1) -> WorldStreams:
-    return simulated(scenario.world, scenario.robots, seed)
+    return simulate(scenario.world, scenario.robots, seed)
 
 
 def content(stream: RobotStream) -> list[bytes]:
@@ -137,7 +137,7 @@ def test_a_sensor_is_simulated_with_its_calibration_and_field_of_view():
         max_range=30.0,
     )
     world = SimulatedWorld(steps=50, landmark_count=200)
-    streams = simulated(world, [RobotConfig(id="r1", sensor=sensor)], 3)
+    streams = simulate(world, [RobotConfig(id="r1", sensor=sensor)], 3)
     true_range, true_bearing = true_detections(streams.streams[0], streams.landmarks)
     seen = streams.streams[0].landmark_detections
     assert len(seen.ids) > 100
@@ -170,7 +170,7 @@ def test_a_further_robot_changes_nothing_of_the_others(name):
 
 def test_a_start_pose_is_exact_or_not_told_at_all():
     robots = [RobotConfig(id="a"), RobotConfig(id="b")]
-    streams = simulated(SimulatedWorld(steps=5, unknown_starts=("b",)), robots, 1).streams
+    streams = simulate(SimulatedWorld(steps=5, unknown_starts=("b",)), robots, 1).streams
     assert streams[0].start.covariance is None
     assert np.array_equal(streams[0].start.pose, streams[0].truth[0])
     assert streams[1].start is None
@@ -183,7 +183,7 @@ def test_a_start_pose_is_exact_or_not_told_at_all():
 )
 def test_unknown_starts_are_named_or_all_or_all_but_some(named, unknown):
     robots = [RobotConfig(id=name) for name in "abc"]
-    streams = simulated(SimulatedWorld(steps=5, unknown_starts=named), robots, 1).streams
+    streams = simulate(SimulatedWorld(steps=5, unknown_starts=named), robots, 1).streams
     assert "".join(each.robot for each in streams if each.start is None) == unknown
 
 
@@ -195,10 +195,10 @@ def test_unknown_starts_are_named_or_all_or_all_but_some(named, unknown):
     st.integers(1, 200),
 )
 def test_a_followed_path_is_driven_by_its_own_steps(path, steps):
-    drive = followed(np.array(path), steps)
+    drive = follow_way_points(np.array(path), steps)
     pose = tuple(drive.poses[0].tolist())
     for k in range(steps):
-        pose = moved(pose, tuple(drive.steps[k].tolist()), "turn-then-drive")
+        pose = move_pose(pose, tuple(drive.steps[k].tolist()), "turn-then-drive")
         assert np.allclose(pose[:2], drive.poses[k + 1, :2], atol=1e-9)
     assert np.allclose(drive.poses[-1, :2], path[-1])
 
@@ -207,7 +207,7 @@ def errors_by_landmark(sensor: Sensor) -> list[np.ndarray]:
     """Normalised (range, bearing) errors of a standing robot, a row per step, by landmark."""
     world = SimulatedWorld(steps=4000, step_s=0.5, landmark_count=12, paths=(((0, 0), (1e-9, 0)),))
     motion = MotionModel(kind="turn-then-drive")
-    streams = simulated(world, [RobotConfig("r1", motion, sensor)], 5)
+    streams = simulate(world, [RobotConfig("r1", motion, sensor)], 5)
     stream = streams.streams[0]
     true_range, true_bearing = true_detections(stream, streams.landmarks)
     seen = stream.landmark_detections

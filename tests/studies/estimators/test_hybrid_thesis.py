@@ -52,7 +52,7 @@ def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_
 
 
 def test_a_new_landmark_has_the_covariance_of_its_measurement_and_of_the_steps_spread():
-    state = hybrid_thesis.started(np.array([1.0, 2.0, 0.5]))
+    state = hybrid_thesis.initial_state(np.array([1.0, 2.0, 0.5]))
     after = filter_step(state, STANDING, [4], [10.0], [0.2], particles=10)
     c, s = np.cos(0.7), np.sin(0.7)
     np.testing.assert_allclose(after.landmarks, [[1.0 + 10.0 * c, 2.0 + 10.0 * s]])
@@ -68,7 +68,7 @@ def test_a_new_landmark_has_the_covariance_of_its_measurement_and_of_the_steps_s
 def test_an_absorbed_map_replaces_what_it_knows_and_adds_what_it_does_not():
     landmarks = np.array([[1.0, 1.0], [5.0, 5.0]])
     covariances = np.array([0.01 * np.eye(2), 0.02 * np.eye(2)])
-    after = hybrid_thesis.absorbed(KNOWN, ids(5, 3), landmarks, covariances)
+    after = hybrid_thesis.absorb_map(KNOWN, ids(5, 3), landmarks, covariances)
     np.testing.assert_array_equal(after.ids, [2, 3, 5, 8])
     np.testing.assert_array_equal(
         after.landmarks, [KNOWN.landmarks[0], landmarks[1], landmarks[0], KNOWN.landmarks[2]]
@@ -85,7 +85,7 @@ ID = np.array([7], np.uint32)
 def run(steps: int, particles: int = 50, seed: int = 1) -> list[CodedState]:
     """Straight on, past a landmark at (10, 5) whose measurements have no error."""
     generator = np.random.default_rng(seed)
-    state = hybrid_thesis_coded.started(np.zeros(3), particles)
+    state = hybrid_thesis_coded.initial_state(np.zeros(3), particles)
     states = [state]
     for k in range(1, steps + 1):
         offset = np.array([10.0 - k, 5.0])
@@ -116,7 +116,7 @@ def test_all_poses_and_landmarks_become_the_mean_and_covariances_stay_each_parti
 
 def test_a_new_landmark_begins_with_15_m_and_the_printed_matrix():
     generator = np.random.default_rng(1)
-    started = hybrid_thesis_coded.started(np.zeros(3), 4)
+    started = hybrid_thesis_coded.initial_state(np.zeros(3), 4)
     state = hybrid_thesis_coded.filter_step(
         started,
         Increment.identity(),

@@ -20,7 +20,7 @@ def joined(made, weighting):
     state = svd_joining.initial_state({start.robot: start.pose for start in made.starts}, weighting)
     for each in made.submaps:
         state = svd_joining.filter_step(state, each.robot, each.local)
-    return svd_joining.solved(state)
+    return svd_joining.solve(state)
 
 
 def written_again(made):
@@ -91,7 +91,7 @@ def map_nees(weighting, honest, runs=80):
                 noise[:2] += 4.0 * 0.05 * rng.standard_normal()
             local = LocalMap(each.local.ids, truth + noise, 0.05**2 * np.eye(len(truth)))
             state = svd_joining.filter_step(state, each.robot, local)
-        landmarks = svd_joining.landmark_gaussian(svd_joining.solved(state))
+        landmarks = svd_joining.landmark_gaussian(svd_joining.solve(state))
         error = (landmarks.means - made.landmarks[landmarks.ids]).ravel()
         values.append((nees(error, landmarks.covariance), len(error)))
     total, dof = np.sum(values, axis=0)
@@ -125,7 +125,7 @@ def two_maps(seed, sigma=0.1, common=4):
 @given(st.integers(0, 10_000))
 def test_turning_by_svd_and_taking_the_middle_is_the_minimum_of_the_whole_cost(seed):
     (a, b), _, _ = two_maps(seed, sigma=0.4)
-    merged = svd_joining.exchanged(a, b)
+    merged = svd_joining.exchange_maps(a, b)
     ids = merged.landmarks.ids
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
 
@@ -149,12 +149,12 @@ def test_an_exchange_is_consistent_for_spherical_errors_and_not_if_landmarks_cou
     honest, twice, dof = [], [], 0
     for seed in range(80):
         (a, b), _, points = two_maps(seed, common=12)
-        merged = svd_joining.exchanged(a, b).landmarks
+        merged = svd_joining.exchange_maps(a, b).landmarks
         error = (merged.means - points).ravel()
         honest.append(nees(error, merged.covariance))
         # The mutant counts every common landmark six times, so the turn seems too well known.
         pairs = PointPairs(np.tile(a.means[:12], (5, 1)), np.tile(b.means[:12], (5, 1)))
-        again = svd_joining.exchanged(a, b, pairs).landmarks
+        again = svd_joining.exchange_maps(a, b, pairs).landmarks
         twice.append(nees((again.means - points).ravel(), again.covariance))
         dof += len(error)
     low, high = chi2_interval(dof, 0.999, 1)
@@ -180,6 +180,6 @@ def full_maps(seed, common=4, sigma=0.05):
 @pytest.mark.parametrize("form", ["spherical", "full"])
 def test_two_maps_with_one_common_point_are_refused_with_the_number(form):
     (a, b), _, _ = (two_maps if form == "spherical" else full_maps)(0, common=1)
-    exchange = svd_joining.exchanged if form == "spherical" else svd_joining.exchanged_fully
+    exchange = svd_joining.exchange_maps if form == "spherical" else svd_joining.exchange_maps_fully
     with pytest.raises(TooFewPointsError, match="1 common point of two maps, 2 needed"):
         exchange(a, b)

@@ -11,7 +11,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
 from teamslam.sim.studies.estimators import svd_joining
 from teamslam.sim.studies.estimators.svd_joining import PointPairs
-from teamslam.sim.studies.rules.svd_rule import tied
+from teamslam.sim.studies.rules.svd_rule import align_maps
 from teamslam.team import translate
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import LandmarkGaussian
@@ -58,8 +58,8 @@ def test_the_final_map_is_downs_exchange_of_the_robots_own_joined_maps(rule):
         )
         for submap in SUBMAPS[name]:
             state = svd_joining.filter_step(state, name, translate.local_map_of(submap))
-        maps.append(svd_joining.landmark_gaussian(svd_joining.solved(state)))
-    exchanged = svd_joining.exchanged_fully if full else svd_joining.exchanged
+        maps.append(svd_joining.landmark_gaussian(svd_joining.solve(state)))
+    exchanged = svd_joining.exchange_maps_fully if full else svd_joining.exchange_maps
     expected = exchanged(*maps).landmarks
     found, out = final(messages(), rule)
     ids, means = translate.landmarks_of(found)
@@ -124,9 +124,9 @@ def test_maps_without_a_common_landmark_are_tied_where_their_robots_saw_each_oth
 
     r1, r2, r3 = frames
     sightings = {(r1, r2): seen(r1, r2, slice(0, 2)), (r2, r3): seen(r2, r3, slice(2, 4))}
-    fused, reasons = tied(r1, maps, full=False, sightings=sightings)
+    fused, reasons = align_maps(r1, maps, full=False, sightings=sightings)
     assert reasons == ()
     np.testing.assert_allclose(fused.means, points, atol=1e-9)
-    alone, reasons = tied(r1, maps, full=False)
+    alone, reasons = align_maps(r1, maps, full=False)
     assert len(alone.ids) == 3
     assert len(reasons) == 2
