@@ -61,7 +61,7 @@ class CoreErrors:
 def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
     """Compute the lower L with L Lᵀ = covariance; `what` names the matrix in the error.
 
-    Symmetry and rank are relative to the diagonal: the least pivot is n ε of its diagonal entry.
+    Symmetry and rank are relative to the diagonal: a pivot exceeds n ε of its diagonal entry.
     """
     factor, fault = core.factor_or_fault(covariance)
     if fault:

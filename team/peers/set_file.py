@@ -66,8 +66,8 @@ def records_in(content: bytes) -> Iterator[Record]:
 def _next_record(content: bytes, at: int) -> int | None:
     """Find the first intact record from `at` on.
 
-    A damaged record of valid length is skipped as a whole: apparent records within it are its
-    author's.
+    A damaged record of valid length is skipped as a whole: its payload might contain forged
+    records.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]

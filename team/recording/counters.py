@@ -71,7 +71,7 @@ class Counters:
 def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"]) -> list[Life]:
     """Split publications, in order of arrival, into lives of their publisher.
 
-    A life begins where the wall clock steps back or stands still, or by order of arrival. The order
+    A life ends where the counters, ordered by wall clock or by arrival, do not ascend. The order
     with fewer lives is used, then with fewer gaps: a set clock adds to the first, late arrivals to
     the second.
     """

@@ -107,8 +107,8 @@ class LandmarkChange(msgspec.Struct, frozen=True, kw_only=True, array_like=True)
 
     dx, dy [m]: its displacement in the frame of the map; sigma [m]: of one coordinate of it; chi2:
     two degrees of freedom, that it has not moved; both 0 for a gone or new landmark. dx, dy of a
-    gone one: from the map's place to that of a submap with its number. expected: how often a gone
-    one should have been observed.
+    gone one: to the map's place for its number, if a submap has that elsewhere. expected: how often
+    a gone one should have been observed.
     """
 
     landmark: Count
@@ -226,9 +226,9 @@ class Prior(Message, frozen=True, kw_only=True, tag="prior/1"):
     as in FusedMap; withdrawn: number of withdrawn robots; they order two priors. frame: of pose and
     landmarks, as in FusedMap; in_team_frame: the robot is in the team's map.
 
-    If not, the prior withdraws those before it. Without landmarks `frame` is then the robot's own,
-    and ids, mean and covariance are empty; else `frame` is the team's, and mean (2L floats) and
-    covariance are those of landmarks alone, by which the robot estimates its pose.
+    A prior outside the team's map withdraws those before it. Without landmarks its `frame` is the
+    robot's own, and ids, mean and covariance are empty; else `frame` is the team's, and mean (2L
+    floats) and covariance are those of landmarks alone, by which the robot estimates its pose.
     """
 
     robot: Name
