@@ -287,23 +287,15 @@ def _row(values: ArrayLike, name: str, what: str, count: int) -> np.ndarray:
 def _polar(
     polar: tuple[ArrayLike, ArrayLike], what: str, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    ranges, bearings = polar
-    far = _positive(_row(ranges, "ranges", what, count), what)
-    return far, _wrapped(_row(bearings, "bearings", what, count), what)
-
-
-def _positive(ranges: np.ndarray, what: str) -> np.ndarray:
-    if len(ranges) and ranges.min() < 0.0:
-        raise MeasurementError(f"{what}: a range of {ranges.min():g} m; ranges are distances")
-    return ranges
-
-
-def _wrapped(angles: np.ndarray, what: str) -> np.ndarray:
-    if len(angles) and np.abs(angles).max() > 2.0 * np.pi:
+    far = _row(polar[0], "ranges", what, count)
+    angles = _row(polar[1], "bearings", what, count)
+    if far.min(initial=0.0) < 0.0:
+        raise MeasurementError(f"{what}: a range of {far.min():g} m; ranges are distances")
+    if np.abs(angles).max(initial=0.0) > 2.0 * np.pi:
         raise MeasurementError(
             f"{what}: a bearing of {angles[np.abs(angles).argmax()]:g}; bearings are in radians"
         )
-    return wrap_angles(angles)
+    return far, wrap_angles(angles)
 
 
 def wrap_angles(angles: np.ndarray) -> np.ndarray:

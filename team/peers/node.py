@@ -8,6 +8,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import msgspec
+
 from teamslam.team.peers.exchange import is_oversized, list_requested, make_answer, make_request
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.proofs import Proofs
@@ -303,12 +305,7 @@ class PeerNode:
             self._close(name)
             self._asked[name] = until
             self._open[summary.node] += 1
-        asked = m.MembersRequest(
-            stamp_ns=request.stamp_ns,
-            node=self.node,
-            requested=request.requested,
-            statements=request.statements,
-        )
+        asked = msgspec.structs.replace(request, node=self.node)
         return [Outgoing(ch.MEMBERS, summary.node, asked)]
 
     def answer(self, request: bytes) -> list[bytes]:
