@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -245,10 +246,17 @@ def tie_nodes(
 
 
 def upper_of(upper: Matrix, chosen: Indices, size: int) -> Float[np.ndarray, "m m"]:
-    """Return the upper triangle among these ascending numbers, at the corner of a larger matrix."""
+    """Return the upper triangle among these ascending numbers, at the corner of a larger matrix.
+
+    Runs of consecutive numbers are copied as blocks, with what is below the diagonal.
+    """
     result = np.zeros((size, size))
-    for a, row in enumerate(chosen.tolist()):
-        result[a, a : len(chosen)] = upper[row, chosen[a:]]
+    begins = np.flatnonzero(np.diff(chosen, prepend=-2) != 1).tolist()
+    runs = [slice(begin, end) for begin, end in pairwise([*begins, len(chosen)])]
+    origins = [slice(chosen[run.start], chosen[run.stop - 1] + 1) for run in runs]
+    for k, (rows, of_rows) in enumerate(zip(runs, origins, strict=True)):
+        for columns, of_columns in zip(runs[k:], origins[k:], strict=True):
+            result[rows, columns] = upper[of_rows, of_columns]
     return result
 
 
