@@ -123,9 +123,7 @@ def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize(
-    ("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "still"), ("r2", "modest")]
-)
+@pytest.mark.parametrize(("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "modest")])
 def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
     """r1 is the robot that names the frame."""
     samples = run_with(liar, kind)
@@ -159,7 +157,7 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
     assert list(ticks.convicted) == ["r1"]
 
 
-@pytest.mark.parametrize("kind", ["micrometre", "far", "swap"])
+@pytest.mark.parametrize("kind", ["micrometre", "swap"])
 def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind):
     """Most of its newest submaps contradict the map, however little they weigh."""
     samples = run_with("r1", kind)
