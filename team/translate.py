@@ -74,15 +74,15 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     if isinstance(message, m.Detections):
         seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
     else:
-        seen = np.frombuffer(message.ids, "<u4").astype(np.uint32)
+        seen = ids(message.ids, "ids").astype(np.uint32, copy=False)
     claimed = None
     if message.covariances:
         claimed = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
     if isinstance(message, m.Points):
         positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
         return point_scan(seen, positions, claimed)
-    ranges = np.frombuffer(message.ranges, "<f8").astype(np.float64)
-    bearings = np.frombuffer(message.bearings, "<f8").astype(np.float64)
+    ranges = floats(message.ranges, "ranges").astype(np.float64, copy=False)
+    bearings = floats(message.bearings, "bearings").astype(np.float64, copy=False)
     return polar_scan(seen, ranges, bearings, claimed)
 
 

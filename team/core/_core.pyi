@@ -80,26 +80,6 @@ class Consensus:
         Take a keyframe: the motion since the last one, then its measurements (there may be none).
         """
 
-    def accept(self) -> bool:
-        """
-        Accept the new measurements that agree with others so far, or all anew where one that was accepted
-        before does not agree any more; return whether those accepted before stay accepted.
-        """
-
-    def confirm(self) -> bool:
-        """
-        Accept the `confirmed` measurements; return whether others are accepted now.
-        """
-
-    def accepted(self, begin: int, end: int) -> NDArray[numpy.bool_] | None:
-        """
-        Mark the accepted measurements among begin ... end - 1; None where they all are.
-        """
-
-    @property
-    def rejected(self) -> int:
-        """Number of measurements that are not accepted."""
-
     def agreeing(self) -> NDArray[numpy.bool_]:
         """
         Mark the measurements that agree with others of their landmark under the odometry alone.
@@ -529,7 +509,7 @@ class WholeMap:
         is as it was.
         """
 
-    def end_pose(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
+    def pose_after(self, submap: WholeMap, gate: float) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], int, int, int]:
         """
         Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.
 
@@ -998,26 +978,27 @@ class Window:
     base, in the frame of its start. Brooks and Bailey 2009, HybridSLAM.
     """
 
-    def __init__(self, particles: int, noise: Sequence[float], improved: bool = True, mount: Sequence[float] = [0.0, 0.0, 0.0]) -> None:
+    def __init__(self, particles: int, noise: Sequence[float], improved: bool = True, mount: Sequence[float] = [0.0, 0.0, 0.0], resample_below: float = 0.0) -> None:
         """
         Open a window: every particle exactly at zero, without landmarks or measurements.
 
         noise: (range_variance, range_per_m2, range_white, bearing_variance, bearing_white), as of
-        `fastslam.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base.
+        `models.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base. resample_below: the
+        share of effective particles below which they are resampled.
         """
 
     @staticmethod
     def of_particles(poses: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], ids: NDArray[numpy.uint32], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], noise: Sequence[float], improved: bool = True) -> Window:
         """Make a window whose particles are these, without a keyframe."""
 
-    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], uniform: float | None, normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> Step:
+    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> Step:
         """
         Take a keyframe: the motion since the last one, then its measurements (there may be none).
 
         own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
-        resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,
-        in (forward, left, turn), by an error of the scale of speed, with the motion's duration [s].
-        Raises MotionError, and leaves the window as it was.
+        resampled first where too few are effective. random: a uniform number is drawn where they are, then three
+        normal ones for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the
+        scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window as it was.
         """
 
     def step(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> float:
@@ -1027,13 +1008,15 @@ class Window:
         Raises MotionError, and leaves the window as it was.
         """
 
-    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], normals: NDArray[numpy.float64], shift: NDArray[numpy.float64] | None = None) -> None:
+    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> None:
         """
-        Move the particles without a keyframe; the weights stay. shift: as of `advance`. Raises MotionError.
+        Move the particles without a keyframe; the weights stay. random, shift: as of `advance`. Raises MotionError.
         """
 
-    def mark(self) -> None:
-        """Make the particles' poses at the last keyframe a pose node."""
+    def mark(self, stamp_ns: int) -> None:
+        """
+        Make the particles' poses at the last keyframe a pose node at this team time [ns].
+        """
 
     def innovation(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> tuple[float, NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
@@ -1048,11 +1031,19 @@ class Window:
         `gaussian.FAULTS` of why they are no Gaussian.
         """
 
-    def run(self) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], int]:
+    def run(self) -> tuple[WholeMap, int]:
         """
         Match moments of (end pose, landmarks) so far, which are not fused; as `close` without pose nodes.
 
-        Where all errors of the sensor are white the landmarks are those that the particles hold.
+        Where all errors of the sensor are white the landmarks are those that the particles hold. Returns a map, and
+        the index in `gaussian.FAULTS` of why it is no Gaussian.
+        """
+
+    def corrected(self, map: WholeMap, factor: float, errors: Sequence[tuple[float, float, int]]) -> tuple[WholeMap, int]:
+        """
+        Correct the map of `run` by errors (b, sigma, row of `sensitivity`), as the function `corrected` does.
+
+        Returns it, and the index in `gaussian.FAULTS` of why it has no derivatives.
         """
 
     def replace(self, paths: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64]) -> None:
@@ -1105,6 +1096,15 @@ class Window:
     def nodes(self) -> NDArray[numpy.int64]:
         """Copy the keyframe of each pose node."""
 
+    def node_stamps(self) -> NDArray[numpy.int64]:
+        """Copy the team time [ns] of each pose node."""
+
+    @property
+    def innovated(self) -> tuple[float, int]:
+        """
+        Sum of the innovations of all keyframes: NIS, and its degrees of freedom.
+        """
+
     @property
     def landmarks(self) -> int:
         """Number of landmarks."""
@@ -1116,3 +1116,63 @@ class Window:
     @property
     def effective(self) -> float:
         """Number of effective particles after the last keyframe."""
+
+class OpenWindow:
+    """
+    A window while it is open: its particles behind a gate against outliers, and their random numbers.
+    """
+
+    def __init__(self, particles: int, noise: Sequence[float], improved: bool, mount: Sequence[float], resample_below: float, max_range: float, field_of_view: float, outlier_share: float, random: Random) -> None:
+        """
+        Open a window: arguments as of `Window` and `Consensus`. random: copied, where it is.
+        """
+
+    def admit(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], node_ns: int | None = None) -> bool:
+        """
+        Take a keyframe with those of its measurements that agree with others of the window so far.
+
+        node_ns: the team time, where the keyframe is a pose node. Other arguments are as of `Window.advance`.
+        Returns False, and leaves the particles as they are, where a measurement that was accepted before does not
+        agree any more: they are to begin anew with the accepted measurements of all keyframes. Raises MotionError.
+        """
+
+    def take(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], node_ns: int | None = None) -> None:
+        """
+        Take a keyframe past the gate; arguments as of `admit`. Raises MotionError.
+        """
+
+    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64]) -> None:
+        """Move the particles without a keyframe, as `Window.move`."""
+
+    def confirm(self) -> bool:
+        """
+        Compare all measurements of the window; return whether others are accepted now.
+        """
+
+    def accepted(self, keyframe: int) -> NDArray[numpy.bool_] | None:
+        """
+        Mark the accepted measurements of an admitted keyframe; None where they all are.
+        """
+
+    def begin(self, particles: int) -> None:
+        """
+        Begin anew with so many particles and the first random number; the gate stays.
+        """
+
+    @property
+    def window(self) -> Window:
+        """The particles."""
+
+    @property
+    def random(self) -> Random:
+        """The random numbers."""
+
+    @property
+    def rejected(self) -> int:
+        """Number of measurements that are not accepted."""
+
+    @property
+    def least_effective(self) -> float:
+        """
+        Least number of effective particles after a keyframe since the beginning.
+        """

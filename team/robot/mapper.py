@@ -19,7 +19,7 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
-from teamslam.team.estimation.hybrid_slam.window import Innovation
+from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.scans import Scan, sensible
@@ -384,7 +384,7 @@ class Mapper:
         """The innovations of all windows of this incarnation that this process has computed."""
         return self._slam.innovation
 
-    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+    def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
         """The running pose by own measurements alone, given the open window."""
         return self.own_map.pose(window)
 
@@ -392,6 +392,6 @@ class Mapper:
         """The running map by own measurements alone."""
         return self.own_map.landmarks
 
-    def open_window(self) -> LocalMap | None:
+    def open_window(self) -> RunningWindow | None:
         """The Gaussian of the open window at its last keyframe, if there is one."""
         return self._slam.running()

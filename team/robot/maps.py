@@ -22,6 +22,7 @@ from teamslam.team.estimation.gaussian import (
     curved,
 )
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.window import RunningWindow
 from teamslam.team.estimation.map_joining.conditioning import (
     Followed,
     Posed,
@@ -92,10 +93,10 @@ class OwnMap:
             after = join_submap(self.whole, named.motion)
         self.whole = after
 
-    def pose(self, window: LocalMap | None) -> PoseGaussian:
+    def pose(self, window: RunningWindow | None) -> PoseGaussian:
         """The pose after the open window, or after its motion alone if it contradicts the map."""
         try:
-            return compose_pose(self.whole, window).pose
+            return compose_pose(self.whole, None if window is None else window.map).pose
         except UNSOLVABLE:
             return compose_pose(self.whole, None if window is None else window.motion).pose
 
@@ -133,27 +134,34 @@ class TeamMap:
         self.refused = 0
         self.doubt = ""
 
-    def pose(self, prior: m.Prior, submaps: Sequence[LocalMap], window: LocalMap | None) -> Posed:
+    def pose(
+        self, prior: m.Prior, submaps: Sequence[LocalMap], window: RunningWindow | None
+    ) -> Posed:
         """The robot's pose in the team's frame; `window`: the open one, if it has begun.
 
         A robot whose heading is badly known lies on an arc; its pose gets the covariance of that
         arc.
         """
         given = self.join(prior, submaps)
-        open_window = None if window is None else self._shared.taken(window.named)
+        open_window = None if window is None else window.corrected(*self._shared)
         posed = compose_pose(given.whole, open_window)
         self.known = posed.known + sum(given.known[-1:])
         self.refused = posed.refused + sum(given.refused[-1:])
         self.doubt = self._warning(given)
         return Posed(curved(posed.pose), posed.known, posed.refused)
 
-    def place(self, prior: m.Prior, own: OwnMap, window: LocalMap | None) -> PoseGaussian | None:
+    def place(
+        self, prior: m.Prior, own: OwnMap, window: RunningWindow | None
+    ) -> PoseGaussian | None:
         """Estimate the robot's pose in the team's frame by a prior of landmarks alone; None where
         they do not determine it.
         """
         given, self.doubt = self.decode(prior), ""
         team = LandmarkGaussian(given.ids, given.means, given.covariance[3:, 3:])
-        posed = locate_robot(team, own.whole, window)
+        local = None
+        if window is not None:
+            local = LocalMap(window.map.ids, window.map.mean, window.map.covariance)
+        posed = locate_robot(team, own.whole, local)
         if isinstance(posed, str):
             return None
         self.known, self.refused = posed.known, posed.refused

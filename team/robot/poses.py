@@ -15,9 +15,9 @@ import numpy as np
 
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.hybrid_slam.window import RunningWindow
 from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
 from teamslam.team.estimation.plausibility import prior_beyond
-from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.maps import OwnMap, TeamMap
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps
@@ -38,10 +38,10 @@ class PoseEstimator(Protocol):
     def sequence(self) -> int:
         """The number of the open window."""
 
-    def open_window(self) -> LocalMap | None:
+    def open_window(self) -> RunningWindow | None:
         """The Gaussian of the open window, if there is one."""
 
-    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+    def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
         """The pose by own measurements alone, given the open window."""
 
 

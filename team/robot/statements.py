@@ -1,6 +1,7 @@
 """Writes a robot's estimates as messages."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -120,6 +121,10 @@ class MessageWriter:
         )
         return Outgoing(ch.OWN_MAP, self.robot, message)
 
+    @cached_property
+    def _frame(self) -> str:
+        return translate.frame_name(self.robot, self.incarnation)
+
     def own_pose(self, stamp_ns: int, sequence: int, pose: PoseGaussian) -> Outgoing:
         """A running pose by own measurements alone, in the frame of the stream's start."""
         message = translate.pose_message(
@@ -129,7 +134,7 @@ class MessageWriter:
             sequence,
             NO_MAP,
             *pose,
-            frame=translate.frame_name(self.robot, self.incarnation),
+            frame=self._frame,
             in_team_frame=self.started,
         )
         return Outgoing(ch.OWN_POSE, self.robot, message)

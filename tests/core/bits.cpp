@@ -57,7 +57,7 @@ void run_window(int number) {
     add(run.particles().pose);
     add(run.particles().map);
     add({run.particles().log_weights.data(), particles});
-    if (k % 5 == 4) run.mark();
+    if (k % 5 == 4) run.mark(k);
     add(run.run());
   }
   add(run.close());
@@ -93,7 +93,7 @@ void run_smoother(int number) {
     run.advance(increment, {ids, ranges, bearings, claims}, window::NO_RESAMPLING, normals);
     consensus.add(step, {ids, ranges, bearings, claims});
     for (const bool each : consensus.agreeing()) add(each);
-    if (k % 4 == 2) run.mark();
+    if (k % 4 == 2) run.mark(k);
     if (k == 9 && number % 2) run.move(increment, normals);
   }
   for (const bool each : consensus.confirmed()) add(each);

@@ -48,6 +48,7 @@ EXAMPLES = {
     **dict.fromkeys(("n", "rows", "columns"), lambda: 2),
     "what": lambda: "ranges",
     "key": lambda: bytes(range(16)),
+    "random": lambda: core.Random(bytes(range(16))),
     "noise": lambda: NOISE,
     **dict.fromkeys(("motion", "pose", "mount", "a_from_b", "a_from_c", "twist"), POSE.copy),
     **dict.fromkeys(("mean", "then", "shift", "xi", "observer", "teammate"), POSE.copy),
@@ -63,7 +64,7 @@ EXAMPLES = {
     "spread": lambda: np.ones((4, 3)),
     **dict.fromkeys(("x", "y", "angle", "dof"), MEAN.copy),
     **dict.fromkeys(("below", "above", "uniform", "outlier_share", "share", "rest"), lambda: 0.5),
-    **dict.fromkeys(("heading", "max_range", "field_of_view", "gate", "factor"), lambda: 2.0),
+    **dict.fromkeys(("heading", "field_of_view", "gate", "factor"), lambda: 2.0),
     **dict.fromkeys(("submap_gate", "landmark_gate", "covariance_factor"), lambda: 2.0),
     **dict.fromkeys(("cost", "between", "range", "bearing", "tolerance"), lambda: 0.5),
     # maps
@@ -74,14 +75,13 @@ EXAMPLES = {
     "poses": lambda: np.zeros((4, 3)),
     "reduce_scans.poses": lambda: np.zeros((1, 3)),
     "scans": lambda: [(IDS, POINT.__abs__(), POINT.copy(), NO_CLAIMS)],
-    **{f"{each}.mean": MEAN.copy for each in ("WholeMap", "WholeMap.joined", "WholeMap.end_pose")},
+    **{f"{each}.mean": MEAN.copy for each in ("WholeMap", "WholeMap.joined")},
     **{f"{each}.mean": MEAN.copy for each in ("Chain.append", "corrected", "SubmapFactor")},
     **{
         f"{each}.covariance": lambda: covariance(7)
         for each in (
             "WholeMap",
             "WholeMap.joined",
-            "WholeMap.end_pose",
             "Chain.append",
             "corrected",
         )
@@ -89,7 +89,10 @@ EXAMPLES = {
     "sensitivity": lambda: np.ones((1, 7)),
     "curvature": lambda: np.ones((1, 7)),
     "errors": lambda: [(0.1, 0.2, 0)],
-    "prior": lambda: core.WholeMap(IDS, MEAN, covariance(7)),
+    **dict.fromkeys(
+        ("prior", "WholeMap.pose_after.submap", "map"),
+        lambda: core.WholeMap(IDS, MEAN, covariance(7)),
+    ),
     # the graph
     "SubmapFactor.landmarks": lambda: np.array([[0.1, 0.0, 0.2]] * 2),
     "information": lambda: covariance(7),
@@ -131,7 +134,10 @@ EXAMPLES = {
     "unknowns": lambda: np.array([0, 4]),
     # the window
     "particles": lambda: 4,
-    "Window.mount": lambda: (0.1, 0.0, 0.2),
+    **dict.fromkeys(("Window.mount", "OpenWindow.mount"), lambda: (0.1, 0.0, 0.2)),
+    **dict.fromkeys(("resample_below", "max_range"), lambda: 0.5),
+    **dict.fromkeys(("stamp_ns", "node_ns"), lambda: 10**18),
+    "keyframe": lambda: 0,
     **dict.fromkeys(("log_weights", "weights"), lambda: np.full(4, -1.4)),
     **{
         f"{each}.weights": lambda: np.full(4, 0.25)
@@ -140,8 +146,14 @@ EXAMPLES = {
     "mean_direction.weights": lambda: np.ones(3),
     "normals": lambda: np.ones((4, 3)),
     **{
-        f"Window.{each}.shift": lambda: np.array([1.0, 0.0, 0.0, 0.5])
-        for each in ("advance", "move")
+        f"{each}.shift": lambda: np.array([1.0, 0.0, 0.0, 0.5])
+        for each in (
+            "Window.advance",
+            "Window.move",
+            "OpenWindow.admit",
+            "OpenWindow.take",
+            "OpenWindow.move",
+        )
     },
     "means": MEANS.copy,
     "covariances": COVARIANCES.copy,
@@ -149,7 +161,6 @@ EXAMPLES = {
     "keyframes": lambda: np.array([0, 0]),
     "seen": IDS.copy,
     "Window.sensitivity.mean": MEAN.copy,
-    **dict.fromkeys(("Consensus.accepted.begin", "Consensus.accepted.end"), lambda: 0),
     # odometry
     **dict.fromkeys(("duration_s", "interval_s", "yaw_rate"), lambda: 0.1),
     **{
@@ -216,6 +227,12 @@ def advanced_window() -> tuple[core.Window, core.Step]:
     return window, window.advance(**examples_of("Window.advance"))
 
 
+def opened_window() -> core.OpenWindow:
+    opened = made("OpenWindow")
+    opened.admit(**examples_of("OpenWindow.admit"))
+    return opened
+
+
 def longer_chain() -> core.Chain:
     chain = made("Chain")
     chain.append(**examples_of("Chain.append"))
@@ -225,6 +242,7 @@ def longer_chain() -> core.Chain:
 OBJECTS = {
     "Window": lambda: advanced_window()[0],
     "Step": lambda: advanced_window()[1],
+    "OpenWindow": opened_window,
     "Chain": longer_chain,
     "ChainSolution": lambda: longer_chain().solve(3, 1e-6),
 }

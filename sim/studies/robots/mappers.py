@@ -20,9 +20,8 @@ from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
-from teamslam.team.estimation.hybrid_slam.window import Innovation
+from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
 from teamslam.team.estimation.scans import Scan
-from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import NEEDS_MAP
 from teamslam.team.rejection import UNMEASURED, Rejection
 from teamslam.team.robot.mapper import Mapper
@@ -203,7 +202,7 @@ class StreamMapper(ExchangingMapper):
         """Innovation of all predicted measurements."""
         return self.estimator.innovation
 
-    def own_pose(self, window: LocalMap | None) -> PoseGaussian:
+    def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
         """Running pose."""
         return self.estimator.own_pose()
 
@@ -211,6 +210,6 @@ class StreamMapper(ExchangingMapper):
         """Running map."""
         return self.estimator.own_map()
 
-    def open_window(self) -> LocalMap | None:
+    def open_window(self) -> RunningWindow | None:
         """None: there is no window."""
         return None

@@ -14,19 +14,13 @@ using View1 = nb::ndarray<nb::numpy, const double, nb::ndim<1>, nb::c_contig>;
 using View2 = nb::ndarray<nb::numpy, const double, nb::ndim<2>, nb::c_contig>;
 using ViewIds = nb::ndarray<nb::numpy, const std::uint32_t, nb::ndim<1>, nb::c_contig>;
 
-LocalMap submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
+// Without pose nodes.
+LocalMap bare_submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
   const std::size_t n = mean.size();
-  check(n >= 3 + 2 * ids.size() && (n - 2 * ids.size()) % 3 == 0,
-        "mean must be of poses (x, y, theta), then of each landmark");
+  check(n == 3 + 2 * ids.size(), "mean must be of a pose (x, y, theta), then of each landmark");
   check(covariance.shape(0) == n && covariance.shape(1) == n, "covariance must be (n, n) of a mean of n numbers");
   for (std::size_t k = 1; k < ids.size(); k++) check(ids(k - 1) < ids(k), "ids must ascend");
   return {{ids.data(), ids.size()}, {mean.data(), n}, matrix_of(covariance)};
-}
-
-// Without pose nodes.
-LocalMap bare_submap_of(const Ids& ids, const Numbers& mean, const Table& covariance) {
-  check(mean.size() == 3 + 2 * ids.size(), "mean must be of a pose (x, y, theta), then of each landmark");
-  return submap_of(ids, mean, covariance);
 }
 
 }  // namespace
@@ -71,13 +65,13 @@ void bind_maps(nb::module_& m) {
           "Returns the map and a fault: 0, 1 where the known landmarks' innovation has no covariance; then the map\n"
           "is as it was.")
       .def(
-          "end_pose",
-          [](const WholeMap& self, const Ids& ids, const Numbers& mean, const Table& covariance, double gate) {
-            const maps::TiedPose at = maps::end_pose(self, submap_of(ids, mean, covariance), gate);
+          "pose_after",
+          [](const WholeMap& self, const WholeMap& submap, double gate) {
+            const maps::TiedPose at = maps::end_pose(self, submap.view(), gate);
             return std::tuple(std::vector(at.pose.begin(), at.pose.end()),
                               dense::Matrix(dense::Const{at.covariance.data(), 3, 3, 3}), at.known, at.refused, int(at.fault));
           },
-          "ids"_a.noconvert(), "mean"_a, "covariance"_a, "gate"_a,
+          "submap"_a, "gate"_a,
           "Compute the pose of `joined` alone, without landmarks that the others contradict by more than the gate.\n\n"
           "Returns pose (3,), covariance (3, 3), the numbers of known and of refused landmarks, and a fault: 0, 1 as\n"
           "of `joined`, 2 where a single landmark's innovation is singular.");

@@ -34,9 +34,7 @@ void bind_random(nb::module_& m) {
           "normals",
           [](Random& self, std::size_t rows, std::size_t columns) {
             check(columns == 0 || rows <= MOST_NUMBERS / columns, "at most 2^30 numbers");
-            std::vector<double> numbers(rows * columns);
-            self.fill_normals(numbers);
-            return made<double, nb::ndim<2>>(std::move(numbers), {rows, columns});
+            return made<double, nb::ndim<2>>(self.normals(rows * columns), {rows, columns});
           },
           "rows"_a, "columns"_a, "Draw standard normal numbers (rows, columns) (Box and Muller 1958).");
 }

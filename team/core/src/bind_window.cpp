@@ -2,7 +2,10 @@
 #include <algorithm>
 #include <numeric>
 
+#include <nanobind/stl/vector.h>
+
 #include "binding_scan.hpp"
+#include "own_map.hpp"
 #include "sensitivity.hpp"
 
 namespace teamslam::binding {
@@ -100,15 +103,6 @@ Rows path_of(const Stack& paths, std::size_t count) {
   return path;
 }
 
-window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Quadruple>& shift = std::nullopt) {
-  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-  if (shift) {
-    increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
-    increment.seconds = (*shift)(3);
-  }
-  return increment;
-}
-
 std::span<const double> normals_of(const Table& normals, std::size_t count) {
   check(normals.shape(0) == count && normals.shape(1) == 3, "normals must be (M, 3)");
   return finite(normals, "normals");
@@ -121,6 +115,13 @@ Rows pose_rows_of(const Table& poses, std::size_t count) {
   Rows rows(count, k);
   for (std::size_t j = 0; j < k; j++) rows.set(j, poses.data() + j, k);
   return rows;
+}
+
+window::Sensitivity rounded_sensitivity(const Window& of, std::span<const double> mean, bool with_nodes) {
+  const std::size_t nodes = with_nodes ? of.nodes().size() : 0;
+  check(mean.size() == 3 + 3 * nodes + 2 * of.particles().landmarks(), "mean must be of this window");
+  check_finite(mean.data(), mean.size(), "mean");
+  return window::sensitivity_of(of, mean, with_nodes).rounded();
 }
 
 void bind_particles(nb::module_& m) {
@@ -244,15 +245,14 @@ void bind_window(nb::module_& m) {
       .def(
           "__init__",
           [](Window* self, std::size_t particles, const std::array<double, 5>& noise, bool improved,
-             const std::array<double, 3>& mount) {
-            check(particles > 0 && particles <= 10'000'000, "particles must be in 1 ... 10,000,000");
-            check_finite(mount.data(), 3, "the mount");
-            new (self) Window({particles, improved, noise_of(noise), se2::Mount(mount[0], mount[1], mount[2])});
+             const std::array<double, 3>& mount, double resample_below) {
+            new (self) Window(settings_of(particles, noise, improved, mount, resample_below));
           },
-          "particles"_a, "noise"_a, "improved"_a = true, "mount"_a = std::array<double, 3>{0.0, 0.0, 0.0},
+          "particles"_a, "noise"_a, "improved"_a = true, "mount"_a = std::array<double, 3>{0.0, 0.0, 0.0}, "resample_below"_a = 0.0,
           "Open a window: every particle exactly at zero, without landmarks or measurements.\n\n"
           "noise: (range_variance, range_per_m2, range_white, bearing_variance, bearing_white), as of\n"
-          "`fastslam.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base.")
+          "`models.Noise`. improved: the proposal of FastSLAM 2.0. mount: of the sensor on the base. resample_below: the\n"
+          "share of effective particles below which they are resampled.")
       .def_static(
           "of_particles",
           [](const Table& poses, const Numbers& log_weights, const Ids& ids, const Stack& means, const Stack& covariances,
@@ -267,18 +267,15 @@ void bind_window(nb::module_& m) {
       .def(
           "advance",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own, std::optional<double> uniform, const Table& normals,
-             const std::optional<Quadruple>& shift) {
-            check(!uniform || (*uniform >= 0.0 && *uniform < 1.0), "uniform must be in [0, 1)");
-            return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own),
-                                uniform.value_or(window::NO_RESAMPLING), normals_of(normals, self.settings().particles));
+             const Numbers& bearings, const Table& own, random::Random& random, const std::optional<Quadruple>& shift) {
+            return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own), random);
           },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "uniform"_a.none(), "normals"_a, "shift"_a = nb::none(),
+          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "random"_a, "shift"_a = nb::none(),
           "Take a keyframe: the motion since the last one, then its measurements (there may be none).\n\n"
           "own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are\n"
-          "resampled first, by `uniform` in [0, 1), unless it is None. normals: (M, 3). shift: of the motion's end,\n"
-          "in (forward, left, turn), by an error of the scale of speed, with the motion's duration [s].\n"
-          "Raises MotionError, and leaves the window as it was.")
+          "resampled first where too few are effective. random: a uniform number is drawn where they are, then three\n"
+          "normal ones for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the\n"
+          "scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window as it was.")
       .def(
           "step",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
@@ -291,13 +288,11 @@ void bind_window(nb::module_& m) {
           "Raises MotionError, and leaves the window as it was.")
       .def(
           "move",
-          [](Window& self, const Triple& motion, const Matrix3& covariance, const Table& normals,
-             const std::optional<Quadruple>& shift) {
-            self.move(increment_of(motion, covariance, shift), normals_of(normals, self.settings().particles));
-          },
-          "motion"_a, "covariance"_a, "normals"_a, "shift"_a = nb::none(),
-          "Move the particles without a keyframe; the weights stay. shift: as of `advance`. Raises MotionError.")
-      .def("mark", &Window::mark, "Make the particles' poses at the last keyframe a pose node.")
+          [](Window& self, const Triple& motion, const Matrix3& covariance, random::Random& random,
+             const std::optional<Quadruple>& shift) { self.move(increment_of(motion, covariance, shift), random); },
+          "motion"_a, "covariance"_a, "random"_a, "shift"_a = nb::none(),
+          "Move the particles without a keyframe; the weights stay. random, shift: as of `advance`. Raises MotionError.")
+      .def("mark", &Window::mark, "stamp_ns"_a, "Make the particles' poses at the last keyframe a pose node at this team time [ns].")
       .def(
           "innovation",
           [](const Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
@@ -313,9 +308,36 @@ void bind_window(nb::module_& m) {
            "Match moments with the landmarks solved again along the paths: the submap of the window.\n\n"
            "Returns ids, mean and covariance of (end pose, pose nodes, landmarks by ascending id), and the index in\n"
            "`gaussian.FAULTS` of why they are no Gaussian.")
-      .def("run", [](Window& self) { return made_gaussian(self.run()); },
-           "Match moments of (end pose, landmarks) so far, which are not fused; as `close` without pose nodes.\n\n"
-           "Where all errors of the sensor are white the landmarks are those that the particles hold.")
+      .def(
+          "run",
+          [](Window& self) {
+            Gaussian found = self.run();
+            const std::size_t n = found.mean.size();
+            dense::Matrix covariance(dense::Const{found.covariance.data(), n, n, n});
+            return std::tuple(maps::WholeMap{std::move(found.ids), std::move(found.mean), std::move(covariance)}, int(found.fault));
+          },
+          "Match moments of (end pose, landmarks) so far, which are not fused; as `close` without pose nodes.\n\n"
+          "Where all errors of the sensor are white the landmarks are those that the particles hold. Returns a map, and\n"
+          "the index in `gaussian.FAULTS` of why it is no Gaussian.")
+      .def(
+          "corrected",
+          [](const Window& self, const maps::WholeMap& map, double factor,
+             const std::vector<std::tuple<double, double, std::size_t>>& errors) {
+            std::vector<maps::SharedError> shared;
+            for (const auto& [value, sigma, row] : errors) {
+              check(row < window::BIASES, "there is no such error");
+              shared.push_back({value, sigma, row});
+            }
+            window::Sensitivity found;
+            if (!shared.empty()) found = rounded_sensitivity(self, map.mean, false);
+            maps::WholeMap corrected = map;
+            if (found.fault == gaussian::Fault::NONE)
+              maps::correct(corrected.mean, corrected.covariance.view(), factor, shared, found.rows, found.curvature);
+            return std::tuple(std::move(corrected), int(found.fault));
+          },
+          "map"_a, "factor"_a, "errors"_a,
+          "Correct the map of `run` by errors (b, sigma, row of `sensitivity`), as the function `corrected` does.\n\n"
+          "Returns it, and the index in `gaussian.FAULTS` of why it has no derivatives.")
       .def(
           "replace",
           [](Window& self, const Stack& paths, const Numbers& log_weights, const Stack& means, const Stack& covariances) {
@@ -336,12 +358,7 @@ void bind_window(nb::module_& m) {
       .def(
           "sensitivity",
           [](const Window& self, const Numbers& mean, bool with_nodes) {
-            const std::size_t nodes = with_nodes ? self.nodes().size() : 0;
-            check(mean.size() == 3 + 3 * nodes + 2 * self.particles().landmarks(), "mean must be of this window");
-            window::Sensitivity found = window::sensitivity_of(self, finite(mean, "mean"), with_nodes);
-            for (dense::Matrix* each : {&found.rows, &found.curvature})
-              for (std::size_t i = 0; i < each->rows(); i++)
-                for (std::size_t j = 0; j < each->columns(); j++) (*each)[i][j] = double(float((*each)[i][j]));
+            window::Sensitivity found = rounded_sensitivity(self, {mean.data(), mean.size()}, with_nodes);
             return std::tuple(made_matrix(std::move(found.rows)), made_matrix(std::move(found.curvature)), int(found.fault));
           },
           "mean"_a, "with_nodes"_a,
@@ -416,6 +433,10 @@ void bind_window(nb::module_& m) {
             return Places{{nodes.begin(), nodes.end()}};
           },
           "Copy the keyframe of each pose node.")
+      .def("node_stamps", &Window::node_stamps, "Copy the team time [ns] of each pose node.")
+      .def_prop_ro(
+          "innovated", [](const Window& self) { return std::tuple(self.innovated().squared, self.innovated().dof); },
+          "Sum of the innovations of all keyframes: NIS, and its degrees of freedom.")
       .def_prop_ro("landmarks", [](const Window& self) { return self.particles().landmarks(); }, "Number of landmarks.")
       .def_prop_ro("keyframes", &Window::keyframes, "Number of keyframes.")
       .def_prop_ro("effective", &Window::effective, "Number of effective particles after the last keyframe.");

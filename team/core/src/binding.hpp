@@ -259,9 +259,11 @@ inline nb::object array_of(std::span<const std::int64_t> from) {
   return array_of(std::vector<std::int64_t>(from.begin(), from.end()));
 }
 inline nb::object array_of(std::vector<bool>&& from) {
-  std::vector<std::uint8_t> bytes(from.begin(), from.end());
-  const std::size_t n = bytes.size();
-  return nb::cast(made<std::uint8_t, nb::ndim<1>>(std::move(bytes), {n})).attr("view")("bool");
+  const std::size_t n = from.size();
+  auto* kept = new bool[n];
+  std::copy(from.begin(), from.end(), kept);
+  nb::capsule owner(kept, [](void* p) noexcept { delete[] static_cast<bool*>(p); });
+  return nb::cast(Made<bool, nb::ndim<1>>(kept, {n}, owner));
 }
 inline nb::object array_of(dense::Matrix&& from) { return nb::cast(made_matrix(std::move(from))); }
 inline nb::object array_of(const linalg::Matrix3& from) { return array_of(dense::Matrix(from)); }
@@ -340,6 +342,7 @@ void bind_models(nb::module_& m);
 void bind_motion(nb::module_& m);
 void bind_se2(nb::module_& m);
 void bind_sparse(nb::module_& m);
+void bind_open_window(nb::module_& m);
 void bind_random(nb::module_& m);
 void bind_window(nb::module_& m);
 

@@ -2,7 +2,7 @@
 #pragma once
 
 #include "binding.hpp"
-#include "window.hpp"
+#include "consensus.hpp"
 
 namespace teamslam::binding {
 
@@ -31,6 +31,31 @@ inline window::Scan scan_of(const Ids& ids, const Numbers& ranges, const Numbers
   const std::size_t n = ids.size();
   check(ranges.size() == n && bearings.size() == n, "ids, ranges and bearings must have one length");
   return {{ids.data(), n}, finite(ranges, "ranges"), finite(bearings, "bearings"), claims_of(own, n)};
+}
+
+inline window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Quadruple>& shift = std::nullopt) {
+  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
+  if (shift) {
+    increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
+    increment.seconds = (*shift)(3);
+  }
+  return increment;
+}
+
+constexpr std::size_t MOST_PARTICLES = 10'000'000;
+
+inline window::Settings settings_of(std::size_t particles, const std::array<double, 5>& noise, bool improved,
+                                    const std::array<double, 3>& mount, double resample_below) {
+  check(particles > 0 && particles <= MOST_PARTICLES, "particles must be in 1 ... 10,000,000");
+  check_finite(mount.data(), 3, "the mount");
+  check_finite(&resample_below, 1, "resample_below");
+  return {particles, improved, noise_of(noise), se2::Mount(mount[0], mount[1], mount[2]), resample_below};
+}
+
+inline window::Consensus gate_of(const std::array<double, 5>& noise, double max_range, double field_of_view, double share) {
+  check(max_range > 0.0 && field_of_view > 0.0, "max_range and field_of_view must be positive");
+  check(share > 0.0 && share < 1.0, "outlier_share must be in (0, 1)");
+  return window::Consensus(noise_of(noise), max_range, field_of_view, share);
 }
 
 }  // namespace teamslam::binding

@@ -7,7 +7,7 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
-#include <span>
+#include <vector>
 
 #include "elementary.hpp"
 
@@ -37,7 +37,8 @@ class Random {
 
   // Standard normal numbers. They are made sixteen at a time, whatever the width of a pack; those of
   // a last block that are not asked for are dropped.
-  void fill_normals(std::span<double> out) {
+  std::vector<double> normals(std::size_t asked) {
+    std::vector<double> out(asked);
     constexpr std::size_t HALF = pack::LANES / 2;
     for (std::size_t begin = 0; begin < out.size(); begin += pack::LANES) {
       double numbers[pack::LANES];
@@ -55,6 +56,7 @@ class Random {
       const std::size_t count = std::min(pack::LANES, out.size() - begin);
       std::copy(numbers, numbers + count, out.begin() + std::ptrdiff_t(begin));
     }
+    return out;
   }
 
  private:

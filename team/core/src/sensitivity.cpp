@@ -261,6 +261,13 @@ void set_row(double* row, const Solution& at, const Answer& answer, Bias bias, s
 
 }  // namespace
 
+Sensitivity Sensitivity::rounded() && {
+  for (dense::Matrix* each : {&rows, &curvature})
+    for (std::size_t i = 0; i < each->rows(); i++)
+      for (std::size_t j = 0; j < each->columns(); j++) (*each)[i][j] = double(float((*each)[i][j]));
+  return std::move(*this);
+}
+
 Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, bool with_nodes) {
   window.check_of_sensor();
   const se2::Mount& mount = window.settings().mount;

@@ -24,6 +24,9 @@ enum Bias : std::size_t { BEARING, CLOCK_OFFSET, FORWARD_SCALE, RANGE_OFFSET, RA
 struct Sensitivity {
   dense::Matrix rows, curvature;
   gaussian::Fault fault = gaussian::Fault::NONE;  // of the smoother; there are no rows then
+
+  // The numbers in single precision, as in a message.
+  Sensitivity rounded() &&;
 };
 
 // mean: the window's, of `close`, or of `run` without `with_nodes`.

@@ -77,6 +77,17 @@ Step Window::advance(const Increment& increment, const Scan& scan, double unifor
   return {effective_, log_evidence, innovation.squared, innovation.error.size()};
 }
 
+Step Window::advance(const Increment& increment, const Scan& scan, random::Random& random) {
+  const bool is_thin = effective_ < settings_.resample_below * double(settings_.particles);
+  const double uniform = is_thin ? random.uniform() : NO_RESAMPLING;
+  const Step step = advance(increment, scan, uniform, random.normals(3 * settings_.particles));
+  if (std::isfinite(step.squared)) {
+    innovated_.squared += step.squared;
+    innovated_.dof += step.dof;
+  }
+  return step;
+}
+
 double Window::step(const Increment& increment, const Scan& scan, std::span<const double> normals) {
   return take(increment, factor_of(increment), scan, readings_of(scan), normals);
 }
@@ -112,9 +123,10 @@ void Window::move(const Increment& increment, std::span<const double> normals) {
   keep(increment);
 }
 
-void Window::mark() {
+void Window::mark(std::int64_t stamp_ns) {
   if (!keyframes()) throw std::out_of_range("a pose node needs a keyframe");
   nodes_.push_back(keyframes() - 1);
+  node_stamps_.push_back(stamp_ns);
 }
 
 std::vector<se2::Pose<double>> Window::mean_path() const {

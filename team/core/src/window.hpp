@@ -9,6 +9,7 @@
 #include "along_path.hpp"
 #include "innovation.hpp"
 #include "moments.hpp"
+#include "random.hpp"
 
 namespace teamslam::window {
 
@@ -17,6 +18,7 @@ struct Settings {
   bool is_improved;  // the proposal of FastSLAM 2.0
   Noise noise;
   se2::Mount mount;
+  double resample_below = 0.0;  // the share of effective particles below which they are resampled
 };
 
 // The motion since the last keyframe, which lasted `seconds`; its covariance, and its shift by an error of
@@ -52,6 +54,12 @@ struct Step {
   std::size_t dof;
 };
 
+// Sums of the innovations of several keyframes.
+struct Innovated {
+  double squared = 0.0;
+  std::size_t dof = 0;
+};
+
 // A motion whose mean or covariance is not finite, or whose covariance is indefinite.
 struct MotionError : std::domain_error {
   using std::domain_error::domain_error;
@@ -67,14 +75,19 @@ class Window {
   // and the step of the particles. Throws MotionError, and is then as it was.
   Step advance(const Increment& increment, const Scan& scan, double uniform, std::span<const double> normals);
 
+  // The same by numbers drawn here: a uniform one where the particles are to be resampled, then three
+  // normal ones for each. `innovated` counts the innovation, unless its covariance is singular.
+  Step advance(const Increment& increment, const Scan& scan, random::Random& random);
+
   // A keyframe without resampling, whose innovation is not asked for; returns its log evidence.
   double step(const Increment& increment, const Scan& scan, std::span<const double> normals);
 
   // Moves the particles without a keyframe; the weights stay. Throws MotionError.
   void move(const Increment& increment, std::span<const double> normals);
+  void move(const Increment& increment, random::Random& random) { move(increment, random.normals(3 * settings_.particles)); }
 
-  // Makes the poses at the last keyframe a pose node.
-  void mark();
+  // Makes the poses at the last keyframe a pose node at this team time.
+  void mark(std::int64_t stamp_ns);
 
   Innovation innovation(const Increment& increment, const Scan& scan) const;
 
@@ -109,6 +122,8 @@ class Window {
   std::span<const WindowMeasurement> measurements() const { return measurements_; }
   std::span<const WindowMotion> motions() const { return motions_; }
   std::span<const std::size_t> nodes() const { return nodes_; }
+  std::span<const std::int64_t> node_stamps() const { return node_stamps_; }
+  const Innovated& innovated() const { return innovated_; }
   double effective() const { return effective_; }
 
  private:
@@ -125,6 +140,8 @@ class Window {
   std::vector<WindowMeasurement> measurements_;
   std::vector<WindowMotion> motions_;
   std::vector<std::size_t> nodes_;  // the keyframe of each pose node
+  std::vector<std::int64_t> node_stamps_;
+  Innovated innovated_;
   Rows solved_;                     // the landmarks along the paths, as of `Particles::map`
   std::vector<bool> is_solved_;     // of each landmark, since its last measurement
   double effective_;

@@ -2,6 +2,7 @@
 
 import math
 from bisect import insort
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -50,6 +51,13 @@ class Keyframe(msgspec.Struct, frozen=True, gc=False):
     def __post_init__(self) -> None:
         if len(self.own) != len(self.ids):
             force_setattr(self, "own", unclaimed(len(self.ids)))
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """The arguments of `core.OpenWindow.admit` and `take`."""
+        motion, node_ns = self.increment, self.stamp_ns if self.is_node else None
+        seen = self.ids, self.ranges, self.bearings, self.own
+        return motion.mean, motion.covariance, self.forward, *seen, node_ns
 
     def only(self, taken: Bool[np.ndarray, " n"]) -> "Keyframe":
         """The keyframe with only these of its measurements."""

@@ -1,32 +1,38 @@
 """The open window of a robot; a step without a solution does not end the run.
 
+A measurement is accepted while the window is open if it agrees with the other ones of its landmark
+so far under the odometry, or is the only one. At its end all are compared with all others by a
+smoother over the window.
+
 Once the particles of a window have had no solution, none of its measurements are used: its submap
 is the motion by odometry alone.
 """
 
-import math
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
-import msgspec
 import numpy as np
 
+from teamslam.team import core
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.gaussian import NotACovarianceError
-from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.gaussian import CoreErrors, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
-from teamslam.team.estimation.hybrid_slam.outliers import OutlierGate
 from teamslam.team.estimation.hybrid_slam.redrawing import redraw_paths
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
     AssociatedKeyframes,
     associate_keyframes,
 )
 from teamslam.team.estimation.hybrid_slam.window import Window
-from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.models import Increment, noise_of
 from teamslam.team.estimation.mount import of_base
 from teamslam.team.estimation.plausibility import submap_beyond
 from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.estimation.submap import LocalMap
 
+OUTLIER_SHARE = 0.01
+"""Probability of an outlier before the window's measurements are compared. A landmark measurement
+is rejected where it is this much less likely given the others than anywhere in view; with ten times
+the share a tenth of the same likelihood is needed, so the value hardly matters."""
 DEPLETED = 10.0
 """Effective number of particles; where fewer remain after a keyframe, their scatter is no
 estimate of the uncertainty. It happens in one of a thousand windows of `thesis`, whose submap is
@@ -35,36 +41,47 @@ AGAIN = 8
 """The window is computed again with this many times the particles."""
 
 
+Solved = TypeVar("Solved")
+
+
 class OpenWindow:
-    """The particles since the window's start, and the odometry's motion beside them.
+    """The particles since the window's start, and the keyframes beside them.
 
     A window's random numbers are keyed by (seed, robot, incarnation, sequence).
     """
 
     def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
         self._config = config
-        self._key = incarnation, sequence
-        self._gate = OutlierGate(config.sensor)
+        self._most = config.bounds.submap_landmarks
         self._solvable = True
-        self._motions: list[Increment] = []
+        self._keyframes: list[Keyframe] = []
+        self._rest: Increment | None = None
         self.settled = AssociatedKeyframes(())
-        self._begin()
+        front, sensor = config.front_end, config.sensor
+        self._core = core.OpenWindow(
+            front.particles,
+            noise_of(sensor),
+            front.proposal == "fastslam2",
+            sensor.mount,
+            front.resample_below,
+            sensor.max_range,
+            sensor.field_of_view,
+            OUTLIER_SHARE,
+            random_numbers(config.seed, config.id, incarnation, sequence),
+        )
+        self.particles = Window(front, sensor, self._core.window)
 
-    def _begin(self, times: int = 1) -> None:
-        config = self._config
-        front = config.front_end
-        if times > 1:
-            front = msgspec.structs.replace(front, particles=times * front.particles)
-        self.particles = windows.open_window(front, config.sensor)
-        self._least = math.inf
-        self._random = random_numbers(config.seed, config.id, *self._key)
-        self.keyframes_ns: list[int] = []
+    @property
+    def keyframes_ns(self) -> tuple[int, ...]:
+        """Team times of the keyframes."""
+        return tuple(each.stamp_ns for each in self._keyframes)
 
     @property
     def motion(self) -> Increment:
         """The base's motion by odometry, as the sensor's."""
         motion, sensor = Increment.identity(), self._config.sensor
-        for each in self._motions:
+        steps = [each.increment for each in self._keyframes]
+        for each in steps if self._rest is None else [*steps, self._rest]:
             step = of_base(each, np.array(sensor.mount)) if sensor.is_mounted else each
             motion = motion.then(step)
         return motion
@@ -72,14 +89,16 @@ class OpenWindow:
     @property
     def gated(self) -> int:
         """Number of measurements that others of the window contradicted."""
-        return self._gate.gated + self.settled.gated
+        return self._core.rejected + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
         """Move and weigh the particles with the measurements that agree with others so far.
 
         Where a keyframe contradicts one that was used before, the window is computed again.
         """
-        self._motions.append(keyframe.increment)
+        if self._solvable and self._core.window.landmarks + len(keyframe.ids) > self._most:
+            keyframe = nearest_landmarks(keyframe, self.particles.landmarks, self._most)
+        self._keyframes.append(keyframe)
         self._try(self._admit, keyframe)
 
     def confirm(self) -> None:
@@ -94,10 +113,10 @@ class OpenWindow:
     def move(self, rest: Increment, forward: np.ndarray) -> None:
         """Take the motion after the last keyframe; forward: as of `Keyframe`."""
         if rest.mean.any() or rest.covariance.any():
-            self._motions.append(rest)
-            self._try(self._go, rest, forward)
+            self._rest = rest
+            self._try(self._core.move, rest.mean, rest.covariance, forward)
 
-    def solve(self, step: Callable[[Window], LocalMap]) -> LocalMap | None:
+    def solve(self, step: Callable[[Window], Solved]) -> Solved | None:
         """Make the Gaussian of the window by `step`; None where the window has none."""
         if not self._solvable:
             return None
@@ -111,65 +130,53 @@ class OpenWindow:
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
 
     def _admit(self, keyframe: Keyframe) -> None:
-        most = self._config.bounds.submap_landmarks
-        if self.particles.core.landmarks + len(keyframe.ids) > most:
-            keyframe = nearest_landmarks(keyframe, self.particles.landmarks, most)
-        if self._gate.add(keyframe):
-            self._take(self._gate.last)
-        else:
-            self._take_all(self._gate.keyframes)
+        if not self._core.admit(*keyframe.arguments):
+            self._take_all(self._accepted())
 
-    def _take(self, keyframe: Keyframe) -> None:
-        windows.advance(
-            self.particles,
-            keyframe.increment,
-            keyframe.ids,
-            keyframe.ranges,
-            keyframe.bearings,
-            self._random,
-            keyframe.forward,
-            own=keyframe.own,
-        )
-        self._least = min(self._least, self.particles.effective)
-        self.keyframes_ns.append(keyframe.stamp_ns)
-        if keyframe.is_node:
-            windows.mark_node(self.particles, keyframe.stamp_ns)
+    def _accepted(self) -> list[Keyframe]:
+        """The keyframes, reduced to their accepted measurements."""
+        accepted = [self._core.accepted(k) for k in range(len(self._keyframes))]
+        pairs = zip(self._keyframes, accepted, strict=True)
+        return [each if taken is None else each.only(taken) for each, taken in pairs]
 
     @np.errstate(all="ignore")
     def _settle(self) -> None:
-        has_others = self._gate.confirm()
-        keyframes = self._gate.keyframes
-        has_unnamed = bool([each for each in keyframes if each.looks])
+        has_others = self._core.confirm()
+        keyframes: Sequence[Keyframe] = self._keyframes
+        has_unnamed = any(each.looks for each in keyframes)
+        if not (has_others or has_unnamed or self._is_depleted):
+            return
+        keyframes = self._accepted()
         if has_unnamed:
             config = self._config
             self.settled = associate_keyframes(
-                keyframes,
-                config.front_end.association,
-                config.sensor,
-                config.bounds.submap_landmarks,
+                keyframes, config.front_end.association, config.sensor, self._most
             )
             keyframes = self.settled.keyframes
         if has_unnamed or has_others:
             self._take_all(keyframes)
         if has_unnamed:
-            redraw_paths(self.particles, keyframes, self._random)
-        sensor = self._config.sensor
-        white = sensor.range_white == sensor.bearing_white == 1.0
-        if self._least < DEPLETED and white and not has_unnamed:
+            redraw_paths(self.particles, keyframes, self._core.random)
+        elif self._is_depleted:
             self._take_all(keyframes, AGAIN)
 
-    def _take_all(self, keyframes: Sequence[Keyframe], times: int = 1) -> None:
-        self._begin(times)
-        for keyframe in keyframes:
-            self._take(keyframe)
+    @property
+    def _is_depleted(self) -> bool:
+        """Whether more particles would help."""
+        sensor = self._config.sensor
+        white = sensor.range_white == sensor.bearing_white == 1.0
+        return white and self._core.least_effective < DEPLETED
 
-    def _go(self, rest: Increment, forward: np.ndarray) -> None:
-        windows.move(self.particles, rest, self._random, forward)
+    def _take_all(self, keyframes: Sequence[Keyframe], times: int = 1) -> None:
+        self._core.begin(times * self._config.front_end.particles)
+        for keyframe in keyframes:
+            self._core.take(*keyframe.arguments)
 
     def _try(self, step: Callable[..., None], *arguments: object) -> None:
         """Apply a step to the particles, unless one has failed before."""
         if self._solvable:
             try:
-                step(*arguments)
+                with CoreErrors():
+                    step(*arguments)
             except (NotACovarianceError, np.linalg.LinAlgError):
                 self._solvable = False

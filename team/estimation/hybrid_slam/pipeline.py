@@ -15,12 +15,18 @@ configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is
 from dataclasses import replace
 
 from teamslam.team.config import RobotConfig
+from teamslam.team.core import WholeMap
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
-from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, Window
+from teamslam.team.estimation.hybrid_slam.window import (
+    NOTHING,
+    Innovation,
+    RunningWindow,
+    Window,
+)
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
@@ -168,7 +174,7 @@ class HybridSlam:
                 slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),
                 window=windows.of_base(self.window),
-                keyframes_ns=tuple(self._open.keyframes_ns),
+                keyframes_ns=self._open.keyframes_ns,
                 innovation=self.window.innovation,
             )
         self._innovation = self._innovation.plus(closed.innovation)
@@ -191,14 +197,15 @@ class HybridSlam:
         """The particles of the open window, their paths and measurements."""
         return self._open.particles
 
-    def running(self) -> LocalMap | None:
-        """The Gaussian of the open window at its last keyframe, if there is one; it is not a
-        submap.
-        """
+    def running(self) -> RunningWindow | None:
+        """The Gaussian of the open window at its last keyframe, if there is one."""
         if self.last_keyframe_ns is None:
             return None
-        found = self._open.solve(_running)
-        return self._moved_alone() if found is None else found
+        found = self._open.solve(windows.running)
+        if found is None:
+            alone = self._moved_alone()
+            found = RunningWindow(WholeMap(alone.ids, alone.mean, alone.covariance))
+        return found
 
     def _moved_alone(self) -> LocalMap:
         """The Gaussian of the open window's odometry alone."""
@@ -208,8 +215,3 @@ class HybridSlam:
     def innovation(self) -> Innovation:
         """The innovations of all windows of this incarnation that this process has computed."""
         return self._innovation.plus(self.window.innovation)
-
-
-def _running(window: Window) -> LocalMap:
-    """The window's Gaussian so far."""
-    return windows.gaussian(window, running=True)

@@ -6,7 +6,7 @@ measurements along that particle's path: an EKF is linearised at the first, nois
 and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
-import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -20,7 +20,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment, noise_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
-from teamslam.team.estimation.submap import NO_NODES, LocalMap
+from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
 STILL = np.zeros(4)
@@ -56,19 +56,36 @@ NOTHING = Innovation(0.0, 0)
 class Window(msgspec.Struct, gc=False):
     """Particles since the window's start, their paths, and the measurements that they have used.
 
-    `advance`, `move` and `mark_node` change it.
+    `advance` and `move` change it.
 
     The core holds them; the properties are copies, K keyframes, N measurements and M particles.
     Poses are the sensor's, in the frame of the window's start of the sensor.
-    node_stamps: team time [ns] of the pose nodes.
-    innovation: of all measurements so far that were predicted.
     """
 
     front_end: FrontEnd
     sensor: Sensor
     core: core.Window
-    node_stamps: Int64[np.ndarray, " nodes"] = NO_NODES
-    innovation: Innovation = NOTHING
+
+    @property
+    def innovation(self) -> Innovation:
+        """Of all measurements so far that were predicted."""
+        return Innovation(*self.core.innovated)
+
+    @property
+    def node_stamps(self) -> Int64[np.ndarray, " nodes"]:
+        """Team time [ns] of the pose nodes."""
+        return self.core.node_stamps()
+
+    @property
+    def biases(self) -> tuple[Bias, ...]:
+        """The biases by which the window has derivatives.
+
+        That by `forward_scale` is left out where all of the window's motion is calibrated.
+        """
+        biases = self.front_end.biases
+        if "forward_scale" in biases and not self.core.has_shifts:
+            return tuple(each for each in biases if each != "forward_scale")
+        return biases
 
     @property
     def particles(self) -> Particles:
@@ -119,8 +136,13 @@ class Window(msgspec.Struct, gc=False):
 def open_window(front_end: FrontEnd, sensor: Sensor) -> Window:
     """Open a window: every particle exactly at zero, without landmarks or measurements."""
     improved = front_end.proposal == "fastslam2"
-    particles = core.Window(front_end.particles, noise_of(sensor), improved, sensor.mount)
-    return Window(front_end, sensor, particles)
+    return Window(
+        front_end,
+        sensor,
+        core.Window(
+            front_end.particles, noise_of(sensor), improved, sensor.mount, front_end.resample_below
+        ),
+    )
 
 
 def advance(
@@ -143,23 +165,9 @@ def advance(
     own: the noises that the measurements claim (`teamslam.team.estimation.scans`).
     Raises NotACovarianceError, and leaves the window as it was.
     """
-    noises = unclaimed(len(ids)) if own is None else own
-    seen, count = (ids, ranges, bearings, noises), window.front_end.particles
-    is_thin = window.effective < window.front_end.resample_below * count
-    uniform = random.uniform() if is_thin else None
-    normals = random.normals(count, 3)
+    seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own
     with CoreErrors():
-        step = window.core.advance(
-            increment.mean, increment.covariance, *seen, uniform, normals, forward
-        )
-    if math.isfinite(step.squared):
-        window.innovation = window.innovation.plus(Innovation(step.squared, step.dof))
-
-
-def mark_node(window: Window, stamp_ns: int) -> None:
-    """Make the particles' poses at the last keyframe a pose node at this team time."""
-    window.core.mark()
-    window.node_stamps = np.append(window.node_stamps, stamp_ns)
+        window.core.advance(increment.mean, increment.covariance, *seen, random, forward)
 
 
 def move(
@@ -172,32 +180,80 @@ def move(
 
     It never resamples: the weights of the last measurements stay as they are.
     """
-    normals = random.normals(window.front_end.particles, 3)
     with CoreErrors():
-        window.core.move(increment.mean, increment.covariance, normals, forward)
+        window.core.move(increment.mean, increment.covariance, random, forward)
 
 
-def gaussian(window: Window, *, running: bool = False) -> LocalMap:
+def gaussian(window: Window) -> LocalMap:
     """Make one Gaussian of the window so far: (end pose, pose nodes, landmarks by ascending id).
 
     Each landmark of each particle is solved again over the window's measurements, given the path.
     With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
     Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on
     SE(2), plus POSE_JITTER. Poses and landmarks are those of the base, in the frame of its start.
-    Its derivatives by the biases are those of the window's smoother.
-    running: for a pose within the window, which is not fused: without pose nodes, and, where all of
-    the sensor's errors are white, with the landmarks that the particles hold.
+    Its derivatives by the biases, as precise as in a message, are those of the window's smoother.
     Raises NotACovarianceError if P is not finite or not positive definite.
     """
-    ids, mean, covariance, fault = window.core.run() if running else window.core.close()
+    ids, mean, covariance, fault = window.core.close()
+    _raise_fault(fault, "the submap of a window")
+    biases = window.biases
+    if not biases:
+        return LocalMap(ids, mean, covariance, window.node_stamps)
+    rows, curvature, fault = window.core.sensitivity(mean, True)
+    _raise_fault(fault, "the smoother of a window")
+    if len(biases) < len(BIASES):
+        chosen = [BIASES.index(each) for each in biases]
+        rows, curvature = rows[chosen], curvature[chosen]
+    return LocalMap(ids, mean, covariance, window.node_stamps, biases, rows, curvature=curvature)
+
+
+def _raise_fault(fault: int, what: str) -> None:
     if fault:
-        raise NotACovarianceError("the submap of a window", FAULTS[fault])
-    nodes = NO_NODES if running else window.node_keyframes
-    stamps = window.node_stamps[: len(nodes)]
-    if not window.front_end.biases:
-        return LocalMap(ids, mean, covariance, stamps)
-    biases, sensitivity, curvature = _sensitivity(window, mean, running)
-    return LocalMap(ids, mean, covariance, stamps, biases, sensitivity, curvature=curvature)
+        raise NotACovarianceError(what, FAULTS[fault])
+
+
+class RunningWindow(NamedTuple):
+    """The Gaussian (end pose, landmarks) of an open window, which is not fused.
+
+    It is `gaussian` without pose nodes and, where all of the sensor's errors are white, with the
+    landmarks that the particles hold. window: None where it is the odometry's motion alone.
+    """
+
+    map: core.WholeMap
+    window: Window | None = None
+
+    @property
+    def motion(self) -> core.WholeMap:
+        """The marginal over the end pose alone."""
+        return core.WholeMap(self.map.ids[:0], *self.map.pose())
+
+    def corrected(
+        self, covariance_factor: float, biases: Sequence[tuple[Bias, float, float]]
+    ) -> core.WholeMap:
+        """Correct the map as `SubmapCorrection` does a submap, by name, value and sigma of biases.
+
+        Raises NotACovarianceError where the window's smoother has no solution.
+        """
+        known: tuple[Bias, ...] = () if self.window is None else self.window.biases
+        errors = [(b, sigma, BIASES.index(name)) for name, b, sigma in biases if name in known]
+        if covariance_factor == 1.0 and not errors:
+            return self.map
+        if self.window is None:
+            mean, covariance = self.map.mean, covariance_factor * self.map.covariance
+            return core.WholeMap(self.map.ids, mean, covariance)
+        corrected, fault = self.window.core.corrected(self.map, covariance_factor, errors)
+        _raise_fault(fault, "the smoother of a window")
+        return corrected
+
+
+def running(window: Window) -> RunningWindow:
+    """Make the Gaussian of the window so far, for a pose within it.
+
+    Raises NotACovarianceError as `gaussian`.
+    """
+    found, fault = window.core.run()
+    _raise_fault(fault, "the submap of a window")
+    return RunningWindow(found, window)
 
 
 def of_base(window: Window) -> Window:
@@ -212,23 +268,3 @@ def motion_alone(motion: Increment) -> LocalMap:
     G = tangent(motion.mean[2])
     covariance = dense.product(dense.product(G, motion.covariance), G.T) + np.diag(core.POSE_JITTER)
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))
-
-
-def _sensitivity(
-    window: Window, mean: Float[np.ndarray, " n"], running: bool
-) -> tuple[tuple[Bias, ...], Float[np.ndarray, "b n"], Float[np.ndarray, "b n"]]:
-    """The biases, and the first and second derivatives of the window's mean by them, as precise as
-    in a message.
-
-    That by `forward_scale` is left out where all of the window's motion is calibrated.
-    """
-    biases = window.front_end.biases
-    if "forward_scale" in biases and not window.core.has_shifts:
-        biases = tuple(each for each in biases if each != "forward_scale")
-    rows, curvature, fault = window.core.sensitivity(mean, not running)
-    if fault:
-        raise NotACovarianceError("the smoother of a window", FAULTS[fault])
-    if len(biases) < len(BIASES):
-        chosen = [BIASES.index(each) for each in biases]
-        rows, curvature = rows[chosen], curvature[chosen]
-    return biases, rows, curvature

@@ -66,23 +66,6 @@ def join_submap(whole: WholeMap, local: LocalMap) -> WholeMap:
     return after
 
 
-def join_end_pose(
-    whole: WholeMap, local: LocalMap, gate: float = math.inf
-) -> tuple[PoseGaussian, int, int]:
-    """Compute the pose of `join_submap` alone, with the numbers of common and of refused landmarks.
-
-    gate: known landmarks whose constraints the others contradict by more are left out of the local
-    map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with the
-    multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed with
-    two degrees of freedom.
-    """
-    pose, covariance, known, refused, fault = whole.end_pose(
-        local.ids, local.mean, local.covariance, gate
-    )
-    _raise_fault(fault)
-    return PoseGaussian(pose, covariance), known, refused
-
-
 def _raise_fault(fault: int) -> None:
     if fault == INDEFINITE:
         raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
@@ -292,11 +275,17 @@ def _remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalM
     return local
 
 
-def compose_pose(whole: WholeMap, open_window: LocalMap | None) -> Posed:
+def compose_pose(whole: WholeMap, open_window: WholeMap | None) -> Posed:
     """Compose a map's pose with the window in progress: N(pose, covariance) of the robot.
 
     Only the marginal of the window's landmarks is taken from the map, which is exact.
+    Known landmarks whose constraints the others contradict by more than GATE are left out of the
+    window's map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with
+    the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed
+    with two degrees of freedom. Raises NotACovarianceError as `join_submap`.
     """
     if open_window is None:
         return Posed(PoseGaussian(*whole.pose()))
-    return Posed(*join_end_pose(whole, open_window, GATE))
+    pose, covariance, known, refused, fault = whole.pose_after(open_window, GATE)
+    _raise_fault(fault)
+    return Posed(PoseGaussian(pose, covariance), known, refused)

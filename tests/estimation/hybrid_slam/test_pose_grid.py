@@ -14,6 +14,7 @@ from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
 from teamslam.team.estimation.inter_robot import CarriedPoint
+from teamslam.team.estimation.map_joining.conditioning import SubmapCorrection
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import OdometryInterval
 from tests.estimation.submap_world import seen_from, wrap
@@ -179,7 +180,7 @@ def driven(marks, particles=200, sensor=SENSOR, biases=()):
     for k in range(4):
         windows.advance(window, STEP, *(seen() if k == 0 else NOTHING), random)
         if k in marks:
-            windows.mark_node(window, 1000 * k)
+            window.core.mark(1000 * k)
     return window
 
 
@@ -207,12 +208,13 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
 
 def test_a_running_gaussian_is_the_windows_without_its_pose_nodes():
     window = driven({0, 2}, sensor=Sensor(range_white=0.5), biases=("bearing", "range_scale"))
-    running, bare = windows.gaussian(window, running=True), windows.gaussian(window).without_nodes
-    assert not len(running.node_stamps)
-    assert running.biases == bare.biases
-    assert running.mean.tobytes() == bare.mean.tobytes()
-    assert running.sensitivity.tobytes() == bare.sensitivity.tobytes()
-    assert running.covariance.tobytes() == bare.covariance.tobytes()
+    running, bare = windows.running(window), windows.gaussian(window).without_nodes
+    assert running.map.mean.tobytes() == bare.mean.tobytes()
+    assert running.map.covariance.tobytes() == bare.covariance.tobytes()
+    shared = SubmapCorrection(1.3, (("bearing", 0.02, 0.01), ("range_scale", 0.1, 0.0)))
+    corrected, expected = running.corrected(*shared), shared.taken(bare)
+    assert corrected.mean.tobytes() == expected.mean.tobytes()
+    assert corrected.covariance.tobytes() == expected.covariance.tobytes()
 
 
 @pytest.mark.parametrize("delay_s", [0.4, -0.4])

@@ -104,7 +104,7 @@ def test_the_clocks_derivative_changes_as_the_curvature_states():
 
 def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
     """A core's window of six random keyframes, and its motions' covariances and shifts."""
-    rng = np.random.default_rng(seed)
+    rng, random = np.random.default_rng(seed), random_numbers(seed, "r1", 0, 0)
     window = core.Window(5, noise_of(sensor), mount=mount)
     motions = []
     for k in range(6):
@@ -115,11 +115,10 @@ def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
         if k == 3:
             own = np.array([[0.05, 0.006, 0.002, 0.0], [0.0, 0.0, 0.0, -1.0]])
         shift = np.append(rng.normal(size=3), rng.uniform(0.2, 1.0))
-        normals = rng.standard_normal((5, 3))
-        window.advance(step.mean, step.covariance, ids, ranges, bearings, own, None, normals, shift)
+        window.advance(step.mean, step.covariance, ids, ranges, bearings, own, random, shift)
         motions.append((step.covariance, shift))
         if k in mark:
-            window.mark()
+            window.mark(k)
     return window, motions
 
 

@@ -9,8 +9,8 @@ from teamslam.sim.studies.estimators.feedback import absorb_fused_map
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.conditioning import (
+    compose_pose,
     initial_map,
-    join_end_pose,
     join_submap,
     remove_landmark,
 )
@@ -25,6 +25,12 @@ from teamslam.team.estimation.map_joining.marginals import prior_for
 from tests.estimation.submap_world import correlated, team
 
 LINEAR = (0.1, 1e-5, 0.2)
+
+
+def map_of(local):
+    """The submap as a map."""
+    bare = local.without_nodes
+    return WholeMap(bare.ids, bare.mean, bare.covariance)
 
 
 def whole_of(world, count=None):
@@ -95,12 +101,12 @@ def test_the_end_pose_is_that_of_joining_without_the_landmark_that_the_gate_leav
     entry = len(local.mean) - 2 * len(local.ids) + 2 * bad
     moved = local.mean.copy()
     moved[entry] += 40.0 * np.sqrt(local.covariance[entry, entry] + whole.covariance.max())
-    pose, seen, refused = join_end_pose(whole, replace(local, mean=moved), gate=30.0)
+    pose, seen, refused = compose_pose(whole, map_of(replace(local, mean=moved)))
     expected = join_submap(whole, remove_landmark(local, bad))
     assert (seen, refused) == (len(known), 1)
     np.testing.assert_allclose(pose.mean, expected.mean[:3], rtol=1e-12)
     np.testing.assert_allclose(pose.covariance, expected.covariance[:3, :3], rtol=1e-9)
-    all_of_it, seen, refused = join_end_pose(whole, local, gate=30.0)
+    all_of_it, seen, refused = compose_pose(whole, map_of(local))
     assert (seen, refused) == (len(known), 0)
     np.testing.assert_allclose(all_of_it.mean, join_submap(whole, local).mean[:3], rtol=1e-12)
 
@@ -109,4 +115,4 @@ def test_a_map_whose_shared_landmarks_have_no_covariance_has_no_end_pose():
     world = team(6, robots=1, submaps=4, landmarks=12, reach=30.0)
     whole, local = whole_of(world, 3), world.submaps[3].local
     with pytest.raises(NotACovarianceError, match="not positive definite"):
-        join_end_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), local)
+        compose_pose(WholeMap(whole.ids, whole.mean, -2.0 * whole.covariance), map_of(local))
