@@ -56,7 +56,7 @@ NOTHING = Innovation(0.0, 0)
 class Window(msgspec.Struct, gc=False):
     """Particles since the window's start, their paths, and the measurements that they have used.
 
-    `advance` and `move` change it.
+    `advance` changes it.
 
     The core holds them; the properties are copies, K keyframes, N measurements and M particles.
     Poses are the sensor's, in the frame of the window's start of the sensor.
@@ -118,19 +118,9 @@ class Window(msgspec.Struct, gc=False):
         return self.core.measurements()[3]
 
     @property
-    def node_keyframes(self) -> Int64[np.ndarray, " nodes"]:
-        """The keyframe that each pose node is."""
-        return self.core.nodes()
-
-    @property
     def landmarks(self) -> UInt32[np.ndarray, " L"]:
         """The landmarks in order of first sight."""
         return self.core.ids()
-
-    @property
-    def effective(self) -> float:
-        """Number of effective particles after the last keyframe."""
-        return self.core.effective
 
 
 def open_window(front_end: FrontEnd, sensor: Sensor) -> Window:
@@ -168,20 +158,6 @@ def advance(
     seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own
     with CoreErrors():
         window.core.advance(increment.mean, increment.covariance, *seen, random, forward)
-
-
-def move(
-    window: Window,
-    increment: Increment,
-    random: core.Random,
-    forward: Float[np.ndarray, "4"] = STILL,
-) -> None:
-    """Move the particles without a keyframe, as from the last one to the window's end.
-
-    It never resamples: the weights of the last measurements stay as they are.
-    """
-    with CoreErrors():
-        window.core.move(increment.mean, increment.covariance, random, forward)
 
 
 def gaussian(window: Window) -> LocalMap:

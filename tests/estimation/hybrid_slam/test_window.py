@@ -74,6 +74,12 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
     return window
 
 
+def move(window, motion, seed):
+    """Move the particles of a window without a keyframe."""
+    random = random_numbers(seed, "a", 0, 0)
+    window.core.move(motion.mean, motion.covariance, random)
+
+
 def bytes_of(window):
     values = [window.paths, window.keyframes, window.ids, window.measurements]
     values += [getattr(window.particles, f.name) for f in dataclasses.fields(window.particles)]
@@ -223,7 +229,7 @@ def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_
     information = {"window": 0.0, "scatter": 0.0}
     for seed in range(runs):
         window = windows.open_window(FrontEnd(particles=count), ACCURATE)
-        windows.move(window, motion, random_numbers(seed, "a", 0, 0))
+        move(window, motion, seed)
         P = windows.gaussian(window).covariance - np.diag(POSE_JITTER)
         scatter = np.cov((window.particles.poses / sigmas).T, bias=True)
         np.testing.assert_allclose(P / np.outer(sigmas, sigmas), 4.0 / 3.0 * scatter, atol=4e-3)
@@ -238,7 +244,7 @@ def test_a_pose_after_an_uncertain_turn_is_that_of_the_odometry_and_no_mean_of_c
     """A turn that is known to 0.4 rad bends the particles about the start, 10 m away."""
     step = increment_of(MotionModel(kind="turn-then-drive", turn=MotionNoise(0.4)), 1.0, 10.0, 0.0)
     window = windows.open_window(FrontEnd(particles=4000), ACCURATE)
-    windows.move(window, step, random_numbers(2, "a", 0, 0))
+    move(window, step, 2)
     local, alone = windows.gaussian(window), windows.motion_alone(step)
     x = window.particles.poses[:, 0]
     assert x.mean() < 10.0 - 0.9 * (0.5 * 10.0 * 0.4**2)
