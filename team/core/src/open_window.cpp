@@ -33,8 +33,9 @@ bool OpenWindow::admit(const Increment& increment, const Scan& scan, std::option
 }
 
 std::optional<std::vector<bool>> OpenWindow::accepted(std::size_t keyframe) const {
+  if (keyframe >= begins_.size() - 1) throw std::invalid_argument("there is no such keyframe");
   const std::vector<bool>& all = gate_.accepted();
-  const auto begin = all.begin() + std::ptrdiff_t(begins_.at(keyframe)), end = all.begin() + std::ptrdiff_t(begins_.at(keyframe + 1));
+  const auto begin = all.begin() + std::ptrdiff_t(begins_[keyframe]), end = all.begin() + std::ptrdiff_t(begins_[keyframe + 1]);
   if (std::find(begin, end, false) == end) return std::nullopt;
   return std::vector<bool>(begin, end);
 }
