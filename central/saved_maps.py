@@ -35,6 +35,10 @@ LEAST_SUBMAPS = 2
 """Submaps that place a landmark elsewhere, for it to have moved while its former place is empty."""
 
 
+SCALE = 3e-4
+"""Share of all distances in a map by which the windows of every day may be off alike, so that more
+days do not reduce it: the bias of their Gaussians, and of ranges whose scale is no state.
+"""
 REMAINDER = 1e-3
 """Part of a prior that stays in the evidence about an error, which some map may not determine."""
 
@@ -61,7 +65,8 @@ def save_map(
     each counts once, and its Student's t keeps the tails that a joint Gaussian would lose.
 
     Landmarks that are gone are left out. One that moved by e, which chance explains at SEQUENTIAL,
-    may be an error of today: its covariance is P_ii + e eᵀ.
+    may be an error of today: its covariance is P_ii + e eᵀ. Where no common bias has the scale of
+    ranges, that of the map is uncertain by SCALE about the landmarks' centre.
     """
     gone = {each.landmark for each in fused.changes if each.state == "gone"}
     chosen = [id_ for id_ in ids(fused.ids, "ids").tolist() if id_ not in gone]
@@ -85,6 +90,10 @@ def save_map(
         if each.state == "moved" and each.chi2 < chi2_limit(2, SEQUENTIAL):
             at, e = 2 * chosen.index(each.landmark), np.array([each.dx, each.dy])
             given[at : at + 2, at : at + 2] += np.outer(e, e)
+    if "range_scale" not in biases:
+        points = means[K:].reshape(-1, 2)
+        away = SCALE * (points - points.mean(axis=0)).ravel()
+        given += np.outer(away, away)
     frame = fold.frame
     joined = [stream for stream, key in fold.home.items() if key == fold.main_key]
     earlier = [before[robot] for robot, _ in joined if robot in before]

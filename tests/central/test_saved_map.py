@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from teamslam.central import saved_maps
 from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
@@ -229,6 +230,20 @@ def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
     more[at : at + 2, at : at + 2] = 0.0
     assert np.allclose(block, np.outer(by, by))
     assert np.abs(more).max() < 1e-12
+
+
+def test_more_days_do_not_make_the_scale_of_a_map_certain(monkeypatch):
+    fold = second_day()[1].maps.fold
+    saved = fold.save_map("later")
+    monkeypatch.setattr(saved_maps, "SCALE", 0.0)
+    n = 2 * len(ids(saved.ids, "ids"))
+    more, less = (
+        unpacked(floats(each.covariance, "covariance"), n)
+        for each in (saved, fold.save_map("later"))
+    )
+    points = floats(saved.means, "means").reshape(-1, 2)
+    away = 3e-4 * (points - points.mean(axis=0)).ravel()
+    assert np.allclose(more - less, np.outer(away, away), atol=1e-12)
 
 
 def with_means(change):
