@@ -55,7 +55,10 @@ def import_(
     import re
 
     from teamslam.sim.datasets.folder_files import ROBOT_NAME
+    from teamslam.sim.datasets.tables import DatasetError
     from teamslam.sim.importing.addition import add_robot, takes_robot
+    from teamslam.sim.importing.checks import check_sources
+    from teamslam.sim.importing.proposal import ProposalWrittenError
     from teamslam.sim.importing.source import Request, import_data, proposal
 
     if output is None:
@@ -84,7 +87,16 @@ def import_(
     try:
         report = add_robot(request, output) if adds else import_data(request, output)
         elapsed_s = time.monotonic() - began
-        notes = dict.fromkeys([*report.notes, *_as_read(output)])  # each once
+        try:
+            read = _as_read(output)
+        except DatasetError:
+            check_sources(report.tables)  # names the user's file in place of the written one
+            raise
+        notes = dict.fromkeys([*report.notes, *read])  # each once
+    except ProposalWrittenError as proposed:
+        shutil.rmtree(output / robot if adds and robot else output, ignore_errors=True)
+        typer.echo(str(proposed))
+        raise typer.Exit(WRONG_USE) from None
     except BaseException:  # remove a partial data set, whose folder the next attempt may use
         shutil.rmtree(output / robot if adds and robot else output, ignore_errors=True)
         raise

@@ -2,8 +2,8 @@
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from math import isfinite, nan
 from typing import TypeVar
@@ -35,15 +35,27 @@ class UnknownColumnError(DatasetError):
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Columns of a map that a table comes from.
+
+    place: of the table in the map. columns: the user's column and its scale, by ours.
+    """
+
+    place: str
+    columns: Mapping[str, tuple[str, float]]
+
+
+@dataclass(frozen=True)
 class CsvTable:
     """Text cells of a table by column; lines: file line of each row, from 1.
 
-    name: file name for errors.
+    name: file name for errors. origin: where the table comes by a map of columns.
     """
 
     name: str
     columns: dict[str, list[str]]
     lines: list[int]
+    origin: Origin | None = None
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -69,7 +81,11 @@ class CsvTable:
     def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
         """Exact times in nanoseconds; raises DatasetError."""
         scale = unit_s * NANO
-        parsed = self._parsed(column, lambda text: _stamp_ns(text, scale))
+
+        def remedy(unit: str, by: str) -> str:
+            return self.conversion(column, unit, by)
+
+        parsed = self._parsed(column, lambda text: _stamp_ns(text, scale, remedy))
         return np.array(parsed, dtype=np.int64)
 
     def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
@@ -96,7 +112,7 @@ class CsvTable:
         """Chosen rows."""
         rows = [i for i, each in enumerate(chosen) if each]
         columns = {name: [cells[i] for i in rows] for name, cells in self.columns.items()}
-        return CsvTable(self.name, columns, [self.lines[i] for i in rows])
+        return replace(self, columns=columns, lines=[self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
         """Omit entirely empty columns, except needed ones.
@@ -108,7 +124,15 @@ class CsvTable:
         if not set(self.columns) - empty - {*needed[:1]}:
             return self
         columns = {n: cells for n, cells in self.columns.items() if n in needed or n not in empty}
-        return CsvTable(self.name, columns, self.lines)
+        return replace(self, columns=columns)
+
+    def conversion(self, column: str, unit: str, scale: str) -> str:
+        """Remedy for a column in another unit, in the map of columns if there is one."""
+        if self.origin is None or column not in self.origin.columns:
+            return conversion(unit, scale)
+        theirs, factor = self.origin.columns[column]
+        entry = f'{column} = {{ column = "{theirs}", scale = {factor * float(scale)!r} }}'
+        return f"to convert from {unit}, write {entry} in {self.origin.place}"
 
     def error(self, row: int, column: str, problem: str) -> DatasetError:
         """Error for one cell."""
@@ -243,7 +267,7 @@ def _number(text: str) -> float:
     return value
 
 
-def _stamp_ns(text: str, scale: Decimal) -> int:
+def _stamp_ns(text: str, scale: Decimal, remedy: Callable[[str, str], str]) -> int:
     try:
         value = Decimal(text) * scale
     except InvalidOperation:
@@ -254,18 +278,18 @@ def _stamp_ns(text: str, scale: Decimal) -> int:
     if not value.is_finite() or abs(value) > LARGEST * 1e9:
         raise ValueError(
             f"{text[:SHOWN]} is out of bounds: a time is finite and at most {LARGEST:g} s"
-            f"{_unit_of(abs(value) / 10**9)}"
+            f"; {remedy(*_unit_of(abs(value) / 10**9))}"
         )
     return int(value.to_integral_value())
 
 
-def _unit_of(seconds: Decimal) -> str:
-    """Probable unit of a Unix time read as seconds, and the remedy."""
+def _unit_of(seconds: Decimal) -> tuple[str, str]:
+    """Probable unit of a Unix time read as seconds, and its scale."""
     unit, scale = "nanoseconds", "1e-9"
     for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
             unit, scale = each, by
-    return f"; {conversion(unit, scale)}"
+    return unit, scale
 
 
 def conversion(unit: str, scale: str) -> str:

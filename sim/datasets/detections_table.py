@@ -14,7 +14,7 @@ import numpy as np
 
 from teamslam.sim.datasets.csv_table import CsvTable, cells_of, covariances_of, read_table
 from teamslam.sim.datasets.folder_files import name_table
-from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE
+from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE, check_polar
 from teamslam.sim.datasets.scans import on_circle
 from teamslam.sim.datasets.tables import File
 from teamslam.sim.world.identities import in_order
@@ -42,6 +42,7 @@ def detections_of(place: File, robot: str, classes: Sequence[str] = ()) -> Detec
     if lacking:
         raise table.fault(f"no column {', '.join(lacking)}; it needs t_s,{','.join(POLAR)}")
     ranges, bearings = table.numbers(*POLAR).T
+    check_polar(table, ranges, bearings)
     return scans_of(
         table,
         table.stamps("t_s"),

@@ -5,7 +5,6 @@ import numpy as np
 from teamslam.sim.datasets.csv_table import (
     POSE_COVARIANCE,
     CsvTable,
-    conversion,
     numbers_in,
     pose_covariances,
 )
@@ -38,6 +37,8 @@ SHORTEST_S, LONGEST_S = 1e-4, 5.0
 """Plausible median odometry interval in seconds."""
 IMPOSSIBLE_S = 60.0
 """Median odometry interval [s] of no robot."""
+LEAST_OTHERS, MOST_OTHERS = 2, 0.1
+"""Number and share of rows that may have the time of another row and other values."""
 OFF_NS = 1_000_000
 """A duration deviates if it differs from the time since the previous row by more than this and by a
 hundredth.
@@ -60,6 +61,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     rows = Rows(table, "odometry row")
     forms = _forms(table)
     form = forms[0]
+    _check_times(rows)
     rows.drop(
         np.diff(rows.stamps_ns, prepend=rows.stamps_ns[:1] - 1) <= 0,
         "another row has the same time",
@@ -98,26 +100,44 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
             _judge_speeds(rows, INCREMENTS, motions, duration)
     else:
         intervals = moved(ends, duration, steps, claims)
-    rows.notes += pace_notes(duration, table.name)
+    rows.notes += pace_notes(duration, table)
     _judge_speeds(rows, form, steps, duration)
     return intervals, rows.notes
 
 
-def pace_notes(duration_ns: Int64[np.ndarray, " I"], name: str = "") -> list[str]:
-    """Note a usual odometry interval that is implausible in seconds.
+def _check_times(rows: Rows) -> None:
+    """Raise DatasetError where many rows have the time of another row with other values."""
+    cells = list(zip(*(c for name, c in rows.table.columns.items() if name != "t_s"), strict=True))
+    same = (np.flatnonzero(np.diff(rows.stamps_ns) == 0) + 1).tolist()
+    others = [row for row in same if cells[row] != cells[row - 1]]
+    if len(others) <= max(LEAST_OTHERS, MOST_OTHERS * len(cells)):
+        return
+    table = rows.table.origin.place if rows.table.origin else "the table [odometry] of a column map"
+    raise rows.table.error(
+        others[0],
+        "t_s",
+        f"{len(others)} of {len(cells)} odometry rows have the time of another row with other "
+        'values. Rows of several robots: keep those of one by drop = { robot = ["r2", "r3"] } in '
+        f"{table}. Rounded times: write them with their decimals (docs/your_data.md)",
+    )
 
-    Raises DatasetError for a table (name) whose usual interval is impossible.
+
+def pace_notes(duration_ns: Int64[np.ndarray, " I"], table: CsvTable | None = None) -> list[str]:
+    """Note on odometry whose usual interval is implausible in seconds.
+
+    Raises DatasetError for a table whose usual interval is impossible.
     """
     usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
     if SHORTEST_S <= usual_s <= LONGEST_S:
         return []
+    convert = (table or CsvTable("", {}, [])).conversion
     usual = f"{usual_s:,.0f}" if usual_s > 1.0 else f"{usual_s:.3g}"
     note = (
         f"{PACE} {usual} s apart: times are taken for seconds; "
-        f"{conversion('other units, as milliseconds', '1e-3')}"
+        f"{convert('t_s', 'other units, as milliseconds', '1e-3')}"
     )
-    if name and usual_s > IMPOSSIBLE_S:
-        raise DatasetError(f"{name}, column t_s: {note}")
+    if table is not None and usual_s > IMPOSSIBLE_S:
+        raise DatasetError(f"{table.name}, column t_s: {note}")
     return [note]
 
 
@@ -227,10 +247,11 @@ def _judge_speeds(
     else:
         speed, rate = np.hypot(*steps[:, :2].T) / seconds, np.abs(steps[:, 2]) / seconds
     turning = rate[rate > 0.0]
+    turn = next(column for column in form if column.endswith(("rad", "rad_s")))
     if len(turning) > 1 and np.median(turning) > WHIRLING_RAD_S:
         raise rows.table.fault(
             f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: "
-            f"{conversion('degrees', DEGREE)}"
+            f"{rows.table.conversion(turn, 'degrees', DEGREE)}"
         )
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)

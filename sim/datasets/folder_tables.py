@@ -4,13 +4,13 @@ Unused rows are counted in notes, with reason and first line.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from teamslam.sim.datasets.csv_table import (
     POSE_COVARIANCE,
     CsvTable,
-    conversion,
     covariances_of,
     numbers_in,
     pose_covariances,
@@ -38,6 +38,8 @@ EARLY_NS = 2_000_000_000
 """Longest time by which measurements may precede odometry, at standstill."""
 FAR_M = 1_000.0
 """Median range [m] above which metres are improbable."""
+LEAST_BELOW, MOST_BELOW = 2, 0.1
+"""Number and share of ranges that may be below 0 by chance."""
 MOST_RAD = 2.0 * np.pi + 1e-3
 """Largest bearing that can be in radians."""
 
@@ -56,7 +58,7 @@ class Rows:
             )
         order = np.argsort(stamps, kind="stable").tolist() if len(back) else range(len(table))
         columns = {name: [cells[i] for i in order] for name, cells in table.columns.items()}
-        self.table = CsvTable(table.name, columns, [table.lines[i] for i in order])
+        self.table = replace(table, columns=columns, lines=[table.lines[i] for i in order])
         self.stamps_ns = stamps[list(order)]
 
     def drop(self, dropped: Bool[np.ndarray, " rows"], reason: str) -> None:
@@ -133,7 +135,7 @@ def measurements_of(
         rows.notes.append(
             f"the median range is {np.median(found.ranges):,.0f} m "
             f"({rows.table.name}): ranges must be in metres; "
-            f"{conversion('millimetres', '0.001')}"
+            f"{rows.table.conversion('range_m', 'millimetres', '0.001')}"
         )
     found = keep(found.ranges > 0.0, "range not above 0")
     if found.covariances is not None:
@@ -177,19 +179,39 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
         )
     polar, points = (numbers_in(table, form, forms) for form in (POLAR, POINTS))
     ranges, bearings = polar.T.copy()
-    for row in np.flatnonzero(np.abs(bearings) > MOST_RAD)[:1].tolist():
-        raise table.error(
-            row,
-            "bearing_rad",
-            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: "
-            f"{conversion('degrees', DEGREE)}",
-        )
+    check_polar(table, ranges, bearings)
     bearings, as_points = on_circle(bearings), ~np.isnan(points[:, 0])
     x, y = points[as_points].T
     ranges[as_points], bearings[as_points] = np.hypot(x, y), on_circle(np.arctan2(y, x))
     claimed = _own(rows, forms, as_points) if claims else None
     measured = points if claims and as_points.any() else None
     return Scans(rows.stamps_ns, ids, ranges, bearings, measured, claimed)
+
+
+def check_polar(
+    table: CsvTable, ranges: Float[np.ndarray, " R"], bearings: Float[np.ndarray, " R"]
+) -> None:
+    """Raise DatasetError for ranges that are bearings, and for bearings in degrees; NaN in rows of
+    another form.
+    """
+    below = ranges <= 0.0
+    count, measured = int(np.count_nonzero(below)), int(np.count_nonzero(~np.isnan(ranges)))
+    varied = len(np.unique(ranges[below]))  # few values mark an echo that did not return
+    if count > max(LEAST_BELOW, MOST_BELOW * measured) and 2 * varied > count:
+        where = "" if table.origin is None else f" in {table.origin.place}"
+        raise table.error(
+            int(below.argmax()),
+            "range_m",
+            f"{count} of {measured} ranges are not above 0, as bearings are: exchange range_m and "
+            f"bearing_rad{where}",
+        )
+    for row in np.flatnonzero(np.abs(bearings) > MOST_RAD)[:1].tolist():
+        raise table.error(
+            row,
+            "bearing_rad",
+            f"{bearings[row]:g} is more than a whole turn; bearings must be in radians: "
+            f"{table.conversion('bearing_rad', 'degrees', DEGREE)}",
+        )
 
 
 def _own(
@@ -274,7 +296,7 @@ def start_of(table: CsvTable) -> StartPose | None:
             0,
             "theta_rad",
             f"{pose[2]:g} is more than a whole turn; it must be in radians: "
-            f"{conversion('degrees', DEGREE)}",
+            f"{table.conversion('theta_rad', 'degrees', DEGREE)}",
         )
     if not any(table.has(column) for column in POSE_COVARIANCE):
         return StartPose(pose, None)

@@ -58,6 +58,15 @@ def import_bag(
 
 def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
     present = {topic.name for topic in bag.topics}
+    for role in ("odometry", "truth"):
+        of: dict[str, str] = {}
+        for name, robot in topics.robots.items():
+            topic = getattr(robot, role)
+            if topic and of.setdefault(topic, name) != name:
+                raise UndecidedError(
+                    f"{path}: {topic} is the {role} of both {of[topic]} and {name}: in the file of "
+                    "topics (--ros2 FILE) give it to its robot alone"
+                )
     for name, robot in topics.robots.items():
         for topic in (robot.odometry, *robot.detections, robot.fixes, robot.truth):
             if topic and topic not in present:

@@ -73,8 +73,8 @@ def _question(path: Path, bag: Bag, found: Proposal) -> str:
         head
         + f"{listing(bag.topics)}\n"
         + "".join(f"{doubt}\n" for doubt in found.warnings)
-        + ("" if found.warnings else "For other roles: ")
-        + "Write it into a file, as topics.toml, beginning with this:\n\n"
+        + ("To decide" if found.warnings else "To change the roles")
+        + ", write this into topics.toml:\n\n"
         + as_toml(found)
         + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml (where there is no "
         "such file, this writes it)\n"

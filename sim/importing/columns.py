@@ -48,6 +48,14 @@ class ColumnMap(msgspec.Struct, frozen=True):
         """Tables of a robot."""
         return self.shared | self.robots.get(robot, {})
 
+    def places_of(self, robot: str, path: Path | None) -> Mapping[str, str]:
+        """Place of a robot's tables in the map's file, by kind."""
+        own = self.robots.get(robot, {})
+        return {
+            kind: f"[robots.{robot}.{kind}] of {path}" if kind in own else f"[{kind}] of {path}"
+            for kind in self.tables_of(robot)
+        }
+
 
 TABLES: Mapping[str, Sequence[str]] = {
     **folder.TABLES,

@@ -4,10 +4,11 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from math import atan2
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import CsvTable, read_table
+from teamslam.sim.datasets.csv_table import CsvTable, Origin, read_table
 from teamslam.sim.datasets.folder_tables import (
     POINT_COVARIANCE,
     POINTS,
@@ -16,12 +17,15 @@ from teamslam.sim.datasets.folder_tables import (
     POSES,
 )
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import REQUIRED, TABLES, Map, Table, map_columns
+from teamslam.sim.importing.columns import MEASURED, REQUIRED, TABLES, Map, Table, map_columns
 from teamslam.sim.importing.proposal import propose_map, proposed_kinds
 from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.importing.words import names_robot
 from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
 
+MOST_ROBOTS = 100
+"""Most values of a column that names robots."""
 QUATERNION = 8
 """Columns of a TUM trajectory: t x y z qx qy qz qw."""
 
@@ -45,12 +49,17 @@ def read_files(paths: Sequence[Path], *, tum: bool) -> dict[str, CsvTable]:
 
 
 def import_files(
-    files: Mapping[str, CsvTable], chosen: Map, robot: str, everyones: Collection[str] = ()
+    files: Mapping[str, CsvTable],
+    chosen: Map,
+    robot: str,
+    everyones: Collection[str] = (),
+    places: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[RobotTables, list[str]]:
     """Import one robot's tables from CSV files by a map; also returns notes on the files.
 
-    everyones: file names of all robots. Raises DatasetError, also for an unused file that is
-    probably a missing table.
+    everyones: file names of all robots; a table whose files only other robots have is omitted.
+    places: place of each kind's table in the map.
+    Raises DatasetError, also for an unused file that is probably an omitted table.
     """
     tables = RobotTables(robot)
     notes: list[str] = []
@@ -62,7 +71,7 @@ def import_files(
             notes.append(f"no {', '.join(lacking)}: no {kind}")
             omitted.add(kind)
             continue
-        notes += _take(kind, table, files, tables, used)
+        notes += _take(kind, table, files, tables, used, places.get(kind, ""))
     unused = {name: table for name, table in files.items() if name not in used}
     if "odometry" in chosen:
         _refuse_second_robot(chosen["odometry"].files, used, unused)
@@ -105,12 +114,21 @@ def map_by_names(files: Mapping[str, CsvTable]) -> Map | None:
 
 
 def _take(
-    kind: str, table: Table, files: Mapping[str, CsvTable], tables: RobotTables, used: set[str]
+    kind: str,
+    table: Table,
+    files: Mapping[str, CsvTable],
+    tables: RobotTables,
+    used: set[str],
+    place: str,
 ) -> list[str]:
     side_by_side: list[CsvTable] = []
     for ending in table.files:
         named = [name for name in files if name.endswith(ending)]
-        if len(named) != 1:
+        if not named:
+            raise DatasetError(
+                f"{tables.robot} has no {kind}: expected {ending}; there are {', '.join(files)}"
+            )
+        if len(named) > 1:
             raise DatasetError(
                 f"{kind}: {len(named)} files end in {ending!r}; there are {', '.join(files)}"
             )
@@ -130,15 +148,44 @@ def _take(
                 f"({whole.name}, first at line {whole.lines[first]})"
             )
             whole = whole.rows(chosen)
+    _refuse_several_robots(kind, whole, table, place)
     found = map_columns(whole, table.columns)
     if kind == "detections":
         found = _convert_points(found, whole)
+    origin = Origin(
+        place,
+        {
+            ours: (theirs, 1.0) if isinstance(theirs, str) else (theirs.column, theirs.scale)
+            for ours, theirs in table.columns.items()
+        },
+    )
+    tables.sources[kind] = CsvTable(whole.name, found, whole.lines, origin if place else None)
     tables.columns[kind] = list(found)
     tables.rows[kind] = [*zip(*found.values(), strict=True)]
     return notes
 
 
+def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) -> None:
+    """Raise DatasetError for an unused column that names several robots."""
+    if kind not in (*MEASURED, "truth"):
+        return
+    used = {each if isinstance(each, str) else each.column for each in table.columns.values()}
+    for column, cells in rows.columns.items():
+        names = list(dict.fromkeys(cells))
+        if column not in used and names_robot(column) and 1 < len(names) <= MOST_ROBOTS:
+            others = ", ".join(f'"{name}"' for name in names[1:])
+            key = column if re.fullmatch(r"[A-Za-z0-9_-]+", column) else f'"{column}"'
+            raise rows.fault(
+                f"column {column} has {len(names)} values, {', '.join(names)}, and the rows of one "
+                f"robot are imported. To import {names[0]}, write drop = {{ {key} = [{others}] }} "
+                f"below `files` of {place or 'its table in the map of columns'}; to import all, "
+                "give each robot such tables, [robots.NAME.odometry] and so on. If it names no "
+                "robots, rename it"
+            )
+
+
 def _convert_points(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
+    """Convert detections from points (ahead, left) to range and bearing."""
     if not all(name in columns for name in POINTS):
         return columns
     x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)

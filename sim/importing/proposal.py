@@ -80,6 +80,13 @@ class _Guess(NamedTuple):
     rank: tuple[int, int]
 
 
+class _Proposed(NamedTuple):
+    """TOML text of a table, with KIND for its name, and its file."""
+
+    file: str
+    text: str
+
+
 Files = Mapping[str, CsvTable]
 """Tables of one robot by file name."""
 
@@ -87,16 +94,19 @@ Files = Mapping[str, CsvTable]
 def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
     """Propose a TOML map for the files of each robot.
 
-    Robots whose tables of a kind differ, with `own` all robots, have tables `[robots.NAME.KIND]`.
-    Missing columns and files without a table are comments at the end.
+    A table that not all robots have alike, with `own` every table, is the robot's own,
+    `[robots.NAME.KIND]`. One file is the truth of one robot. A robot without odometry has the table
+    of the file that it should have. Missing columns and files without a table are comments.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
+    _drop_shared_truth(robots, found)
+    comments = _add_odometry(found)
     kinds = dict.fromkeys(kind for tables, _ in found.values() for kind in tables)
     shared: list[str] = []
     by_robot: dict[str, list[str]] = {robot: [] for robot in robots}
     for kind in kinds:
-        of = {robot: tables[kind] for robot, (tables, _) in found.items() if kind in tables}
-        if len(set(of.values())) == 1 and not own:
+        of = {robot: tables[kind].text for robot, (tables, _) in found.items() if kind in tables}
+        if len(of) == len(found) and len(set(of.values())) == 1 and not own:
             shared.append(next(iter(of.values())).replace(KIND, kind))
             continue
         for robot, text in of.items():
@@ -106,11 +116,48 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
         for robot, (_, lines_of) in found.items()
         for line in lines_of
     )
-    return "\n".join([*shared, *chain(*by_robot.values())]) + "".join(lacking)
+    return comments + "\n".join([*shared, *chain(*by_robot.values())]) + "".join(lacking)
 
 
-def write_proposal(text: str, path: Path) -> str:
-    """Write a proposal to the missing file of an option; return the request to check it.
+def _drop_shared_truth(
+    robots: Mapping[str, Files], found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]
+) -> None:
+    """Replace the truth that several robots would have of one file by a comment."""
+    files = {
+        robot: tables["truth"].file for robot, (tables, _) in found.items() if "truth" in tables
+    }
+    for robot, file in files.items():
+        table = robots[robot][file]
+        if any(other != robot and robots[other].get(file) is table for other in robots):
+            tables, comments = found[robot]
+            del tables["truth"]
+            comments.append(f"{file}: whose truth? It goes into [robots.NAME.truth]")
+
+
+def _add_odometry(found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]) -> str:
+    """Add the expected odometry of robots that have none; returns a comment for each."""
+    comments = ""
+    models = {
+        robot: tables["odometry"] for robot, (tables, _) in found.items() if "odometry" in tables
+    }
+    for robot, (tables, _) in found.items():
+        if "odometry" in tables:
+            continue
+        for other, model in models.items():
+            if other in _words(model.file):
+                file = re.sub(rf"(?i)(?<![a-z0-9]){other}(?![a-z0-9])", robot, model.file)
+                tables["odometry"] = _Proposed(file, model.text.replace(model.file, file))
+                comments += f"# {robot} has no odometry: expected {file}, as {model.file}\n"
+                break
+    return comments
+
+
+class ProposalWrittenError(DatasetError):
+    """A proposal is written to the missing file that an option names; the text is the next step."""
+
+
+def write_proposal(text: str, path: Path) -> ProposalWrittenError:
+    """Write a proposal to the missing file that an option names; returns the request to check it.
 
     Raises DatasetError.
     """
@@ -118,9 +165,9 @@ def write_proposal(text: str, path: Path) -> str:
         path.write_text(text, "utf-8")
     except OSError as error:
         raise DatasetError(f"{path}: can not be written: {error.strerror}") from None
-    return (
-        f"{path}: no such file, so a proposal is written to it. Correct it, and repeat the "
-        f"command:\n\n{text}"
+    return ProposalWrittenError(
+        f"next step: check {path}, which now has this proposal, and repeat the command. Nothing is "
+        f"imported yet, hence status 2.\n\n{text}"
     )
 
 
@@ -130,8 +177,12 @@ def proposed_kinds(files: Files) -> set[str]:
 
 
 def split_by_robot(files: Files) -> dict[str, Files]:
-    """Files of each robot, by first or last words of names that name at least two robots with
-    odometry and measurements; else empty.
+    """Files of each robot, if the first or last words of their names are the names of at least two
+    robots; else empty.
+
+    A robot has odometry and measurements; beside one, also a name with one of both in a file that
+    is called as that robot's. Other files with a robot's name in their own are this robot's; the
+    rest is every robot's.
     """
     for position in (0, -1):
         words = {name: _words(name)[position] for name in files}
@@ -141,10 +192,20 @@ def split_by_robot(files: Files) -> dict[str, Files]:
             if re.fullmatch(ROBOT_NAME, word)
         }
         kinds = {word: proposed_kinds(of) for word, of in robots.items()}
+        whole = {
+            word
+            for word in robots
+            if "odometry" in kinds[word] and len(kinds[word].intersection(MEASURED)) > 1
+        }
+        known = {_words_without(name, word) for word in whole for name in robots[word]}
         robots = {
             word: of
             for word, of in robots.items()
-            if "odometry" in kinds[word] and len(kinds[word].intersection(MEASURED)) > 1
+            if word in whole
+            or (
+                kinds[word].intersection(MEASURED)
+                and not known.isdisjoint(_words_without(name, word) for name in of)
+            )
         }
         if len(robots) > 1:
             return {
@@ -158,11 +219,16 @@ def split_by_robot(files: Files) -> dict[str, Files]:
     return {}
 
 
+def _words_without(name: str, robot: str) -> tuple[str, ...]:
+    return tuple(word for word in _words(name) if word != robot)
+
+
 def _words(name: str) -> list[str]:
     return re.split(r"[^a-z0-9]+", Path(name).stem.lower())
 
 
-def _tables(files: Files) -> tuple[dict[str, str], list[str]]:
+def _tables(files: Files) -> tuple[dict[str, _Proposed], list[str]]:
+    """TOML text of each probable table, with KIND for its name; also returns missing columns."""
     guesses: list[_Guess] = []
     lacking: list[str] = []
     for name, table in files.items():
@@ -174,7 +240,7 @@ def _tables(files: Files) -> tuple[dict[str, str], list[str]]:
     best: dict[str, _Guess] = {}
     for guess in sorted(guesses, key=lambda each: each.rank, reverse=True):  # stable
         best.setdefault(guess.kind, guess)
-    tables: dict[str, str] = {}
+    tables: dict[str, _Proposed] = {}
     for guess in guesses:
         kind, columns = guess.kind, guess.columns
         if best[kind] is not guess:
@@ -182,7 +248,8 @@ def _tables(files: Files) -> tuple[dict[str, str], list[str]]:
             continue
         columns |= _clock(columns.get("t_s", ""), files[guess.file])
         rows = "".join(f"{ours} = {text}\n" for ours, text in columns.items())
-        tables[kind] = f'[{KIND}]\nfiles = ["{guess.file}"]\n[{KIND}.columns]\n{rows}'
+        text = f'[{KIND}]\nfiles = ["{guess.file}"]\n[{KIND}.columns]\n{rows}'
+        tables[kind] = _Proposed(guess.file, text)
         lacking += [
             f"{guess.file}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns
         ]

@@ -58,11 +58,16 @@ class Request:
 
 @dataclass
 class Report:
-    """Result of an import: robots, notes, number of messages read from bags."""
+    """Result of an import.
+
+    robots: names. notes: used and omitted files and rows. messages: number read from bags. tables:
+    of each robot, for files and bags.
+    """
 
     robots: list[str]
     notes: list[str]
     messages: int = 0
+    tables: Sequence[RobotTables] = ()
 
 
 def import_data(request: Request, folder: Path) -> Report:
@@ -165,6 +170,7 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
     """Import CSV files of each robot; those of "" are of the robots that map or names have."""
     is_given = request.columns is not None and request.columns.exists()
     read = {robot: read_files(of, tum=not is_given) for robot, of in paths.items()}
+    columns = None
     if is_given:
         assert request.columns is not None
         columns = load_map(request.columns)
@@ -179,7 +185,8 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
     everyones = {name for files in read.values() for name in files}
     tables, notes = [], list[str]()
     for robot, files in robots.items():
-        of, noted = import_files(files, maps[robot], robot, everyones)
+        places = {} if columns is None else columns.places_of(robot, request.columns)
+        of, noted = import_files(files, maps[robot], robot, everyones, places)
         tables.append(of)
         notes += noted if len(robots) == 1 else [f"{robot}: {note}" for note in noted]
     used = {name for files in robots.values() for name in files}
@@ -216,7 +223,7 @@ def _question(
 ) -> DatasetError:
     proposed = propose_map(robots)
     if request.columns is not None:
-        return DatasetError(write_proposal(proposed, request.columns))
+        return write_proposal(proposed, request.columns)
     name, table = next(
         (name, table)
         for files in robots.values()
@@ -275,7 +282,7 @@ def _bags(request: Request, folder: Path) -> Report:
     try:
         if request.ros2 is not None and not request.ros2.exists():
             proposed = "\n".join(map(propose_assignment, request.sources))
-            raise DatasetError(write_proposal(proposed, request.ros2))
+            raise write_proposal(proposed, request.ros2)
         topics = load_topics(request.ros2) if request.ros2 else None
         found, datum = [], request.datum
         for path in request.sources:
@@ -304,6 +311,7 @@ def _written(
     datum: Datum | None = None,
 ) -> Report:
     by_name = {each.robot: each for each in tables}
+    _refuse_shared_truth(tables)
     if not any(kind in each.rows for each in tables for kind in MEASURED):
         raise DatasetError(
             f"{request.sources[0]}: neither odometry nor observations in it; give a folder with "
@@ -324,7 +332,22 @@ def _written(
     for each in tables:
         each.write(folder)
     notes += _write_scenario(tables, datum, folder / SCENARIO)
-    return Report([each.robot for each in tables], notes)
+    return Report([each.robot for each in tables], notes, tables=tables)
+
+
+def _refuse_shared_truth(tables: Sequence[RobotTables]) -> None:
+    """Raise DatasetError for rows of one file that are the true path of two robots."""
+    of: dict[tuple[str, tuple[int, ...]], str] = {}
+    for each in tables:
+        if (truth := each.sources.get("truth")) is None or not len(truth):
+            continue
+        other = of.setdefault((truth.name, tuple(truth.lines)), each.robot)
+        if other != each.robot:
+            raise DatasetError(
+                f"{truth.name}: the truth of both {other} and {each.robot}: give it to its robot, "
+                f"as [robots.{other}.truth] in the map of columns; where it has the paths of both, "
+                "give each robot such a table whose `drop` leaves out the other's rows"
+            )
 
 
 def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Path) -> list[str]:

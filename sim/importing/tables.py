@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from teamslam.sim.datasets.csv_table import POSE_COVARIANCE
+from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable
 from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSES, SPEEDS
 from teamslam.sim.datasets.folder_writer import Row, seconds, write_table
 from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
@@ -14,8 +14,9 @@ from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 class RobotTables:
     """Rows of one robot's tables.
 
-    columns: of tables that choose theirs. mount: sensor pose (x, y, yaw) on the base. antenna: GNSS
-    antenna (ahead, left) on the base.
+    columns: of tables that choose their columns. mount: sensor pose (x, y, yaw) on the base.
+    antenna: place (ahead, left) of the GNSS antenna on the base. sources: tables as read from the
+    user's files, under our column names.
     """
 
     robot: str
@@ -23,6 +24,7 @@ class RobotTables:
     columns: dict[str, Sequence[str]] = field(default_factory=dict)
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antenna: tuple[float, float] = (0.0, 0.0)
+    sources: dict[str, CsvTable] = field(default_factory=dict)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
         """Append a row; columns of only some rows are empty in the others."""

@@ -14,6 +14,16 @@ FUSED_WORDS = (
 """Words for odometry from more than wheels."""
 
 
+ROBOT_COLUMN = re.compile(
+    r"(robot|agent|vehicle|platform|rover|ugv)s?_?(id|name|no|nr|number|index|ns|namespace)?"
+)
+
+
+def names_robot(column: str) -> bool:
+    """Whether a column is named as one of robots' names."""
+    return ROBOT_COLUMN.fullmatch(re.sub(r"[^a-z0-9]+", "_", column.lower())) is not None
+
+
 def has_word(name: str, words: tuple[str, ...]) -> bool:
     """Whether a name has one of these words between marks or capital letters."""
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()

@@ -1,6 +1,7 @@
 """Maps of columns: references are no odometry, detections need no identities."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,8 +127,8 @@ def test_robots_with_other_columns_have_tables_of_their_own_in_one_map(tmp_path,
     logs, columns = team_files(tmp_path / "logs", layout), tmp_path / "columns.toml"
     command = (logs, "-o", tmp_path / "set", "--columns", columns)
     first = run(*command)
-    assert isinstance(first.exception, DatasetError)
-    assert "no such file, so a proposal is written to it" in str(first.exception)
+    assert first.exit_code == 2
+    assert f"next step: check {columns}, which now has this proposal" in first.output
     assert "[robots.bob.odometry]" in columns.read_text()
     result = run(*command)
     assert result.exit_code == 0, result.output
@@ -163,6 +164,123 @@ def test_a_robot_is_added_to_a_data_set(tmp_path):
         "ann.toml", "bob.toml", "logs", "set",
     ]  # fmt: skip
     check_team(tmp_path / "set")
+
+
+def team_of(folder: Path, **files: str) -> Path:
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / f"{name}.csv").write_text(text)
+    return folder
+
+
+def imported(logs: Path, columns: Path, to: Path) -> list[Any]:
+    result = run(logs, "-o", to, "--columns", columns)
+    assert result.exit_code == 0, result.output
+    return list(read(to).streams)
+
+
+def test_a_truth_that_is_called_as_a_robot_is_that_robots_alone(tmp_path):
+    team = {f"{robot}_{name}": text for robot in ("ann", "bob")
+            for name, text in (("odom", TRACK), ("tags", TAGS))}  # fmt: skip
+    logs, columns = team_of(tmp_path / "logs", **team, ann_mocap=TRACK), tmp_path / "columns.toml"
+    assert run(logs, "-o", tmp_path / "set", "--columns", columns).exit_code == 2
+    assert '[robots.ann.truth]\nfiles = ["ann_mocap.csv"]' in columns.read_text()
+    assert "[truth]" not in columns.read_text()
+    ann, bob = imported(logs, columns, tmp_path / "set")
+    assert ann.truth is not None
+    assert bob.truth is None
+
+
+def test_one_truth_of_two_robots_is_not_proposed_and_refused_unless_its_rows_are_told_apart(
+    tmp_path,
+):
+    team = {f"{robot}_{name}": text for robot in ("ann", "bob")
+            for name, text in (("odom", TRACK), ("tags", TAGS))}  # fmt: skip
+    head, *rows = TRACK.splitlines()
+    both = [f"{head},robot", *(f"{row},{robot}" for robot in ("ann", "bob") for row in rows)]
+    logs = team_of(tmp_path / "logs", **team, mocap=TRACK, both="\n".join(both))
+    columns = tmp_path / "columns.toml"
+    assert run(logs, "-o", tmp_path / "set", "--columns", columns).exit_code == 2
+    proposed = columns.read_text()
+    assert "mocap.csv: whose truth? It goes into [robots.NAME.truth]" in proposed
+    assert "truth]\nfiles" not in proposed
+    names = dict(zip(("t_s", "x_m", "y_m", "theta_rad"), head.split(","), strict=True))
+    of = "".join(f'{ours} = "{theirs}"\n' for ours, theirs in names.items())
+    columns.write_text(f'{proposed}\n[truth]\nfiles = ["mocap.csv"]\n[truth.columns]\n{of}')
+    refused = str(run(logs, "-o", tmp_path / "set", "--columns", columns).exception)
+    assert "mocap.csv: the truth of both ann and bob" in refused
+    assert "[robots.ann.truth]" in refused
+    truths = [
+        f'[robots.{robot}.truth]\nfiles = ["both.csv"]\ndrop = {{ robot = ["{other}"] }}\n'
+        f"[robots.{robot}.truth.columns]\n{of}"
+        for robot, other in (("ann", "bob"), ("bob", "ann"))
+    ]
+    columns.write_text(proposed + "".join(truths))
+    assert all(each.truth is not None for each in imported(logs, columns, tmp_path / "set"))
+
+
+def test_a_file_of_two_robots_is_refused_by_its_column_or_its_times_with_the_cure(tmp_path):
+    head = TRACK.splitlines()[0]
+    steps = [f"{t},{0.1 * t + 5 * k},0,0,{robot}" for t in range(1, 9)
+             for k, robot in enumerate(("ann", "bob"))]  # fmt: skip
+    text = "\n".join([f"{head},robot", *steps])
+    logs, columns = team_of(tmp_path / "logs", odom=text, tags=TAGS), tmp_path / "columns.toml"
+    command = (logs, "-o", tmp_path / "set", "--robot", "ann", "--columns", columns)
+    assert run(*command).exit_code == 2
+    refused = str(run(*command).exception)
+    cure = 'drop = { robot = ["bob"] }'
+    assert "odom.csv, line 1: column robot has 2 values, ann, bob" in refused
+    assert f"write {cure} below `files` of [odometry] of {columns}" in refused
+    proposed = columns.read_text()
+    columns.write_text(proposed.replace('["odom.csv"]', f'["odom.csv"]\n{cure}'))
+    (stream,) = imported(logs, columns, tmp_path / "set")
+    assert len(stream.intervals.end_ns) == 7
+    (logs / "odom.csv").write_text("\n".join(row.rpartition(",")[0] for row in text.splitlines()))
+    columns.write_text(proposed)
+    mixed = run(logs, "-o", tmp_path / "mixed", "--robot", "ann", "--columns", columns)
+    said = str(mixed.exception)
+    assert (
+        "odom.csv, line 3, column t_s: 8 of 16 odometry rows have the time of another row" in said
+    )
+    assert f"in [odometry] of {columns}" in said
+
+
+@pytest.mark.parametrize("kind", ["observations", "detections"])
+def test_a_fault_of_a_mapped_table_has_the_users_file_line_and_entry(tmp_path, kind):
+    head, cell = ("id,", "7,") if kind == "observations" else ("", "")
+    degrees = [f"{t},{cell}{2 + t},{40 * t - 100}" for t in range(5)]
+    logs = team_of(tmp_path / "logs", odom=TRACK, seen="\n".join([f"t,{head}far,angle", *degrees]))
+    ours = {"t_s": "t", "range_m": "far", "bearing_rad": "angle"}
+    ours |= {"landmark": "id"} if head else {}
+    columns = tmp_path / "columns.toml"
+
+    def refusal(**exchanged: str) -> str:
+        rows = "".join(f'{key} = "{theirs}"\n' for key, theirs in (ours | exchanged).items())
+        columns.write_text(f'{ODOMETRY}\n[{kind}]\nfiles = ["seen.csv"]\n[{kind}.columns]\n{rows}')
+        result = run(logs, "-o", tmp_path / "set", "--robot", "ann", "--columns", columns)
+        assert isinstance(result.exception, DatasetError)
+        return str(result.exception)
+
+    said = refusal()
+    assert (
+        f"{logs / 'seen.csv'}, line 2, column bearing_rad: -100 is more than a whole turn" in said
+    )
+    entry = 'bearing_rad = { column = "angle", scale = 0.017453292519943295 }'
+    assert f"write {entry} in [{kind}] of {columns}" in said
+    said = refusal(range_m="angle", bearing_rad="far")
+    assert f"{logs / 'seen.csv'}, line 2, column range_m: 3 of 5 ranges are not above 0" in said
+    assert f"exchange range_m and bearing_rad in [{kind}] of {columns}" in said
+
+
+def test_a_robot_whose_odometry_is_missing_has_the_expected_file_named(tmp_path):
+    files = {"husky_odom": TRACK, "husky_tags": TAGS, "jackal_tags": TAGS}
+    logs, columns = team_of(tmp_path / "logs", **files), tmp_path / "columns.toml"
+    said = run(logs, "-o", tmp_path / "set", "--columns", columns).output
+    assert "# jackal has no odometry: expected jackal_odom.csv, as husky_odom.csv" in said
+    refused = str(run(logs, "-o", tmp_path / "set", "--columns", columns).exception)
+    assert "jackal has no odometry: expected jackal_odom.csv; there are jackal_tags.csv" in refused
+    (logs / "jackal_odom.csv").write_text(TRACK)
+    assert len(imported(logs, columns, tmp_path / "set")) == 2
 
 
 @pytest.mark.parametrize("place", ["", "ann"])

@@ -269,7 +269,7 @@ def test_names_as_labs_give_them_are_proposed(header, row, expected):
         ('"speed"', '"velocity"', "no column 'velocity', which the map has for forward_m_s"),
         ("forward_m_s", "speed", "odometry has no column speed; known: t_s"),
         ("[odometry", "[wheels", "no table wheels; known: odometry"),
-        ('"wheels.csv"', '"w.csv"', "odometry: 0 files end in 'w.csv'"),
+        ('"wheels.csv"', '"w.csv"', "r1 has no odometry: expected w.csv; there are wheels.csv"),
         ("tree = [", "bush = [", "no column 'bush', which `drop` names"),
         ("[odometry]", "[odometry", "no map of columns"),
     ],
