@@ -16,7 +16,7 @@ import numpy as np
 from teamslam.central.carried_off import CarriedOff
 from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
-from teamslam.team.config import UNNAMED
+from teamslam.team.config import MAP, UNNAMED
 from teamslam.team.estimation.contribution import Contribution, moment
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.map_joining.hypotheses import (
@@ -67,6 +67,8 @@ class _SharedError(NamedTuple):
 
 
 NOISY: Final = "noise_underestimated"
+MOST_SCALE = 10.0
+"""Largest covariance scale, and inverse of the least one, that other sigmas are advised for."""
 _CLOCK = "add {value:.3g} to its clock_offset_s"
 _ERRORS: Mapping[str, _SharedError] = {
     "clock_offset": _SharedError("clock_offset", 0.02, " s", "late", "early", _CLOCK),
@@ -303,15 +305,32 @@ def _wrong_minimum(fold: Fold) -> Iterator[m.Diagnosis]:
 
 
 def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
-    factor = math.sqrt(value)
     return m.Diagnosis(
         cause=NOISY if value > 1.0 else "noise_overestimated",
         robot=robot,
         value=(value,),
         sigma=(value * log_sigma,),
         evidence=(core.log(value) / log_sigma) ** 2,
-        remedy=f"multiply the sigmas of sensor and odometry by {factor:.2g}, or with ground truth "
-        "learn them by `teamslam calibrate`",
+        remedy=_remedy_of_scale(robot, value),
+    )
+
+
+def _remedy_of_scale(robot: str, value: float) -> str:
+    """Describe the remedy for a covariance scale: other sigmas within MOST_SCALE, since noise is
+    hardly stated further off; a saved map has none.
+    """
+    if robot.startswith(MAP):
+        if value < 1.0:
+            return "leave out days that the saved map contains already: each counts once"
+        return "the place has changed since the map was saved, or the map is of another place"
+    if not 1.0 / MOST_SCALE < value < MOST_SCALE:
+        return (
+            "noise is not stated that far off: check the columns (range and bearing, ids), units, "
+            "clocks and robots' names of the data (docs/faq.md)"
+        )
+    return (
+        f"multiply the sigmas of sensor and odometry by {math.sqrt(value):.2g}, or with ground "
+        "truth learn them by `teamslam calibrate`"
     )
 
 

@@ -83,6 +83,7 @@ class SubmapFold:
         self._ticks = TickFold(config)
         self._ticks.convicts = self._ticks.convicts and convicts
         self._filed: dict[Stream, int] = {}
+        self._firsts: dict[Stream, bytes] = {}
         self._judged = 0
         self._without: set[str] = set()
         self._accused: Mapping[str, str] = {}
@@ -170,6 +171,8 @@ class SubmapFold:
                 sightings = store.sightings(submap)
                 named = (submap, saved) if own.errors and saved else (submap, *sightings)
                 digest = digest_of(*map(encoded, named))
+                if submap.sequence == 0 and store.maps:
+                    self._firsts[stream] = digest_of(encoded(submap))
                 taken = restricted(submap, store.maps.values()) if localises else submap
                 ticks.add_submap(taken, digest, sightings, own)
                 self._filed[stream] = submap.sequence + 1
@@ -206,13 +209,21 @@ class SubmapFold:
             "taken as no surer than that"
             for robot, count in self._ticks.raised.items()
         )
+        repeated = (
+            f"{robot}'s measurements of this day are in the saved map {saved.name} already, and "
+            "count twice: use a map without them, or another day"
+            for saved in self.store.maps.values()
+            for robot in sorted(
+                {stream[0] for stream, first in self._firsts.items() if first in saved.sets}
+            )
+        )
         undecided = [self._ticks.undecided] if self._ticks.undecided else []
         if self._apart:
             undecided.append(
                 f"{', '.join(self._apart)} contradict each other: until it is determined which of "
                 "them is wrong, each one's prior is made of its own submaps"
             )
-        return (*suspended, *undecided, *raised, *self.reasons)
+        return (*suspended, *undecided, *repeated, *raised, *self.reasons)
 
     def _messages(
         self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None

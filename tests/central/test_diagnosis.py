@@ -102,6 +102,14 @@ def test_noise_that_is_stated_wrong_is_named_with_its_factor(noise, cause):
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
 
 
+@pytest.mark.parametrize("noise", [5.0, 0.2])
+def test_noise_that_no_robot_has_is_answered_by_the_data_and_not_by_other_sigmas(noise):
+    (found,) = final_map(noisy(noise)).diagnosis
+    assert found.cause.startswith("noise_")
+    assert "check the columns" in found.remedy
+    assert "multiply" not in found.remedy
+
+
 def test_noise_that_is_stated_too_small_widens_the_covariance_of_the_final_map():
     samples = noisy(2.0)
     found = evaluate(samples).map

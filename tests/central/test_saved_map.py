@@ -118,6 +118,19 @@ def test_without_a_known_start_the_teams_frame_is_that_of_the_saved_map():
     assert np.abs(means).max() < 0.3
 
 
+@pytest.mark.parametrize("localise", [False, True])
+def test_a_day_that_the_map_contains_is_named_and_gives_no_advice_about_sigmas(localise):
+    scenario = final_only(with_options(load("thesis-b"), seed=1, localise=localise))
+    saved = first_day()[1]
+    _, centre, _ = day(1, [saved], scenario=scenario, streams=streams_of(scenario))
+    said = "; ".join(centre.findings)
+    for robot in ("r1", "r2"):
+        assert f"{robot}'s measurements of this day are in the saved map site already" in said
+    assert "map-site: the submaps' covariances are too large" in said
+    assert "sigmas" not in said
+    assert "already" not in "; ".join(second_day()[1].findings)
+
+
 @pytest.mark.parametrize("moved", [((15, (0.5, 0.0)),), tuple((k, (3.0, 2.0)) for k in (2, 8, 11))])
 def test_what_has_moved_is_found_and_nothing_else(moved):
     """It is separated: both days stay right, and the map is as accurate as without the old one."""

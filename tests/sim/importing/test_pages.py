@@ -71,13 +71,16 @@ def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
 
 def test_the_scenario_and_the_map_of_the_page_are_sound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    clock, columns, further, robots, own = blocks("your_data.md", "toml")
+    clock, columns, further, robots, mixed, own = blocks("your_data.md", "toml")
     (tmp_path / "columns.toml").write_text(columns)
     assert set(load_map(tmp_path / "columns.toml").shared) == {"odometry", "observations"}
     (tmp_path / "further.toml").write_text(further)
     assert set(load_map(tmp_path / "further.toml").shared) == {"detections", "truth"}
     (tmp_path / "robots.toml").write_text(robots)
     assert set(load_map(tmp_path / "robots.toml").robots["jackal"]) == {"odometry"}
+    (tmp_path / "mixed.toml").write_text(mixed)
+    husky = load_map(tmp_path / "mixed.toml").robots["husky"]
+    assert husky["odometry"].drop == {"robot": ("jackal",)}
     made("python examples/own_data.py my_set", tmp_path)
     (tmp_path / "my_set" / "scenario.toml").write_text(own)
     scenario = load(scenario_beside("my_set"))
@@ -96,7 +99,7 @@ def test_the_bag_of_the_page_is_listed_and_imported(tmp_path, monkeypatch):
     listed = CliRunner().invoke(app, ["import", "my_bag"])
     assert listed.exit_code == 0
     assert "`teamslam import my_bag -o FOLDER` imports these topics" in listed.output
-    proposal = listed.output.partition("with this:\n\n")[2].partition("\nand type")[0]
+    proposal = listed.output.partition("into topics.toml:\n\n")[2].partition("\nand type")[0]
     (tmp_path / "topics.toml").write_text(proposal)
     typed = "import my_bag -o my_set --ros2 topics.toml"
     assert f"teamslam {typed}" in page
