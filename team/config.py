@@ -211,6 +211,13 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Whether the sensor is not at the base's origin."""
         return self.mount != (0.0, 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        if self.max_range <= self.min_range:
+            raise ValueError(
+                f"max_range = {self.max_range:g} is not above min_range = {self.min_range:g}: each "
+                "measurement would be rejected"
+            )
+
 
 GATE = 13.8
 """χ² of two degrees of freedom that one in a thousand correct pairs exceeds: −2 ln 10⁻³."""

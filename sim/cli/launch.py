@@ -348,7 +348,6 @@ def _conclude(
 
     from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
     from teamslam.central.desk.evaluation.figures import to_json
-    from teamslam.central.desk.evaluation.states import not_in_the_map
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.run import run_figures
     from teamslam.team.recording.parts import join_parts
@@ -389,7 +388,7 @@ def _conclude(
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
-        outcome.failures += not_in_the_map(evaluation.states)  # with the reasons
+        outcome.failures += evaluation.missing  # with the reasons
         is_whole = not outcome.failures and len(evaluation.notes) == len(plain.notes)
         if outcome.deaths and is_whole:
             text = "; ".join(outcome.deaths)

@@ -218,7 +218,6 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from teamslam.central.desk.evaluation.evaluation import evaluate
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.evaluation.history import history
-    from teamslam.central.desk.evaluation.states import not_in_the_map
     from teamslam.central.desk.verification.recorded import RerunError
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.recorded.changed_run import changed_run
@@ -262,7 +261,7 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
             console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
-    if missing := not_in_the_map(changed.states):
+    if missing := changed.missing:
         fail("; ".join(missing), FAILED)
     if isinstance(log, Log) and not log.complete:
         fail(

@@ -64,6 +64,12 @@ class SimulatedWorld(
             raise ValueError('odometry_claims: only odometry = "increments" has a covariance')
         if self.outlier_share and (self.landmark_claims or self.landmark_form == "points"):
             raise ValueError("outliers are of ranges and bearings without covariances of their own")
+        nearest, farthest = self.visible_from_m, self.visible_to_m
+        if nearest is not None and farthest is not None and farthest <= nearest:
+            raise ValueError(
+                f"visible_to_m = {farthest:g} is not above visible_from_m = {nearest:g}: no "
+                "landmark would be seen"
+            )
         if self.landmarks and self.landmark_count:
             raise ValueError("landmarks and landmark_count exclude each other: leave one away")
         for i, path in enumerate(self.paths):

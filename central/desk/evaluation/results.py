@@ -16,7 +16,7 @@ from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
 from teamslam.central.desk.evaluation.peers import PeerResult
 from teamslam.central.desk.evaluation.robot import Consumption
-from teamslam.central.desk.evaluation.states import RobotState, not_in_the_map
+from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import describe
 from teamslam.central.team_config import TeamConfig
@@ -166,7 +166,13 @@ class Evaluation:
     def warnings(self) -> tuple[str, ...]:
         """Warnings for every command that shows the result."""
         causes = map(describe, self.diagnosis)
-        return (*not_in_the_map(self.states), *causes, *self.other_warnings)
+        return (*self.missing, *causes, *self.other_warnings)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Robots missing from the final map, and all landmarks if it has none: no success."""
+        is_empty = self.map is not None and not len(self.map.ids)
+        return (*not_in_the_map(self.states), *[NO_LANDMARK] * is_empty)
 
     @property
     def other_warnings(self) -> tuple[str, ...]:

@@ -63,6 +63,12 @@ def _reason_in(fused: m.FusedMap, name: str) -> str:
     return next((why for who, _, why in found if who == name), "")
 
 
+NO_LANDMARK = (
+    "the final map has no landmark: no robot saw any, or what it saw is none of its sensor's range "
+    "(sensor.min_range, max_range; of a simulated world visible_from_m, visible_to_m)"
+)
+
+
 def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
     """Describe robots not or incompletely in the map."""
     return tuple(

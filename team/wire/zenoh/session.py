@@ -95,7 +95,9 @@ def client(
                 reason = f": {found.waits_for}" if found.waits_for else ""
                 raise BusError(
                     f"no router answers at {connect} ({patience_s:g} s){reason}; start `teamslam "
-                    f"router{' --keys DIR' if keys else ''}`, or give its endpoint, as {example}"
+                    "launch lab.toml` with your team's scenario, or has its run ended? Without "
+                    f"launch start `teamslam router{' --keys DIR' if keys else ''}`, or give its "
+                    f"endpoint, as {example}"
                 ) from error
 
 

@@ -4,6 +4,7 @@ import errno
 import os
 from io import StringIO
 
+import msgspec
 import pytest
 import typer
 from rich.console import Console
@@ -81,3 +82,20 @@ def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
             launch._conclude(of, outcome, None, report=False)
         assert ended.value.exit_code == 1
         assert death in outcome.failures
+
+
+def test_a_run_whose_map_has_no_landmark_fails_with_the_reason(tmp_path):
+    of = scenario()
+    world = msgspec.structs.replace(of.world, landmark_count=0, landmarks=())
+    of = msgspec.structs.replace(of, world=world)
+    log = tmp_path / "log.mcap"
+    with Recorder(log, of.team, {"scenario": dumps(of)}) as recorder:
+        recorder.write(list(run_team(of, streams(of))))
+    outcome = Outcome(log=log, folder=tmp_path, wall_s=1.0, processes=[])
+    with pytest.raises(typer.Exit) as ended:
+        launch._conclude(of, outcome, None, report=False)
+    assert ended.value.exit_code == 1
+    assert [each for each in outcome.failures if "the final map has no landmark" in each]
+    again = CliRunner().invoke(app, ["rerun", str(log), "--noise", "bearing=2"])
+    assert again.exit_code == 1
+    assert "the final map has no landmark" in again.output

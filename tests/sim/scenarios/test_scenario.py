@@ -165,6 +165,14 @@ UTIAS = 'world = { kind = "utias" }\n'
             "robot_count = 3\n" + SMALL + "size_m = 1.9",
             "way_point_tolerance_m is 1 in a place 1.9 m wide",
         ),
+        (
+            SMALL + "visible_from_m = 0.5\nvisible_to_m = 0.2",
+            "visible_to_m = 0.2 is not above visible_from_m = 0.5: no landmark would be seen",
+        ),
+        (
+            SMALL + "[defaults.sensor]\nmin_range = 3\nmax_range = 2",
+            "max_range = 2 is not above min_range = 3",
+        ),
         ("world = { kind = 'simulated' }", "missing required field steps"),
         (
             SMALL + "[defaults.motion]\nkind = 'differential-drive'",
