@@ -1,6 +1,9 @@
 """Stress suite: worlds with a known fault, and whether the team's map is right or its cause named.
 
-    python -m tests.trials.stress [--only CASE …] [--seeds N] [--first SEED]
+    python -m tests.trials.stress [--only CASE …] [--seeds N] [--first SEED] [--drawn]
+
+With --drawn each seed also draws another world for the case's fault: 1 to 4 robots, 12 to 40
+landmarks in a square of 30 to 50 m, a reach of 6 to 12 m, 170 to 240 s.
 
 Each case runs in memory through the import of a CSV folder whose scenario states the noise of
 sensor and odometry and nothing else (`stress_world`). A line gives the map's error as it lies, the
@@ -106,6 +109,37 @@ CASES: Mapping[str, Case] = {
 }
 
 
+def draw(world: StressWorld, seed: int) -> StressWorld:
+    """Draw another world with the same faults; those at a time are at the same share of the run."""
+    rng = np.random.default_rng([1, seed])
+    seconds = float(rng.choice([170.0, 240.0]))
+    late = seconds / world.seconds
+    robots = max(int(rng.integers(1, 5)), *(int(name[1:]) for name in _faulty(world)), 1)
+    return replace(
+        world,
+        seed=seed,
+        robots=robots,
+        landmarks=int(rng.choice([12, 20, 30, 40])),
+        half_m=float(rng.choice([15.0, 20.0, 25.0])),
+        reach_m=float(rng.choice([6.0, 8.0, 10.0, 12.0])),
+        seconds=seconds,
+        carried_off=tuple(replace(each, at_s=late * each.at_s) for each in world.carried_off),
+        moved=tuple(replace(each, from_s=late * each.from_s) for each in world.moved),
+        bursts=tuple(
+            replace(each, from_s=late * each.from_s, to_s=late * each.to_s) for each in world.bursts
+        ),
+    )
+
+
+def _faulty(world: StressWorld) -> set[str]:
+    """Return the robots of a world's faults that not all robots have."""
+    by_robot = (world.late, world.odometry_scale, world.yaw_bias, world.bearing_offset)
+    names = {name for each in (*by_robot, world.range_offset) for name in each}
+    if names == {*ALL}:
+        names = set()
+    return names.union(world.mirrored, (each.robot for each in (*world.carried_off, *world.bursts)))
+
+
 class Outcome(NamedTuple):
     """Errors of a run's map and the reported causes; `is_said`: anything at all is reported."""
 
@@ -178,6 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="*", choices=[*CASES], default=[*CASES], metavar="CASE")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--drawn", action="store_true", help="another world for each seed")
     given = parser.parse_args(arguments)
     print(
         f"{'case':28} {'error [m]':>9} {'worst':>7} {'NEES':>8} {'shifted':>8} named silent  causes"
@@ -186,7 +221,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in given.only:
         case = CASES[name]
         seeds = range(given.first, given.first + given.seeds)
-        outcomes = [run(replace(case.world, seed=seed)) for seed in seeds]
+        worlds = (replace(case.world, seed=seed) for seed in seeds)
+        if given.drawn:
+            worlds = (draw(case.world, seed) for seed in seeds)
+        outcomes = [run(world) for world in worlds]
         moved = [each for each in outcomes if each.is_shifted and case.causes]
         right = sum(bool(case.causes.intersection(each.causes)) for each in outcomes)
         of_moved = sum(bool(case.causes.intersection(each.causes)) for each in moved)
