@@ -186,7 +186,7 @@ def reasons(
     biases: Sequence[BiasEstimate],
     landmark_submaps: int,
     *,
-    is_explained: bool,
+    is_explained: bool = False,
 ) -> tuple[str, ...]:
     """List why robots and landmarks are not in the map, and warnings about it.
 
