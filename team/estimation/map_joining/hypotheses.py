@@ -6,9 +6,10 @@ jumps between two submaps. Its evidence is the cost that they remove,
     e = min_x cost(x) − min_{x, θ} cost(x, θ),
 
 χ² with dim θ degrees of freedom where nothing is wrong. Both minima have the robust loss, so that
-one misfit does not hide another. Hypotheses are proposed by a scan of single submaps, then solved.
-The best one by evidence per degree of freedom is accepted and stays in the graph, and the others
-are tested again beside it: what it explains is not reported twice.
+one misfit does not hide another. Hypotheses are proposed by a scan of single submaps at the map's
+robust scales, then solved at the final ones. The best one by evidence per degree of freedom is
+accepted and stays in the graph, and the others are tested again beside it: what it explains is not
+reported twice.
 
 Real data have errors beyond the model. The evidence is therefore divided by the covariance scale
 that the rest of the submaps shows (an F test but for the scatter of the scale), and an effect must
