@@ -27,7 +27,7 @@ Submap = tuple[str, int, int]
 
 
 def measure_latency(log: Path) -> dict[str, Any]:
-    """Seconds until the map and until a teammate's prior; the round trip and the solution time."""
+    """Seconds until the map and until a teammate's prior; round trip and solution time."""
     arrived: dict[Submap, float] = {}
     mapped: dict[Submap, float] = {}
     told: dict[Submap, float] = {}

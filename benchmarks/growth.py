@@ -40,7 +40,7 @@ TICK_S = 10.0
 WINDOW = 25
 """Ticks per median."""
 SEEN = 8
-"""Mean number of landmarks that a robot detects in a window."""
+"""Mean number of landmarks detected in a window."""
 SPACING_M = 10.0
 """Spacing of neighbouring landmarks."""
 SIGMAS = (0.1, 0.02, 0.2)
@@ -113,7 +113,7 @@ class World:
         return translate.submap_message(f"r{r}", 1, k, counters, ends, bytes(8), local)
 
     def window(self) -> Scans:
-        """One robot's detections in a window: WINDOW scans along one step."""
+        """One robot's detections in a window of WINDOW scans."""
         rng, pose = self._rng, self._poses[0]
         offsets = self.landmarks - pose[:2]
         seen = offsets[np.hypot(*offsets.T) < self._reach]

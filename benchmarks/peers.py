@@ -85,7 +85,7 @@ def reach_of(topology: str, robots: int) -> Reach:
 
 
 class Team:
-    """Peers and the radio between them; said: bytes of each, a broadcast once."""
+    """Peers and the radio between them; said: bytes of each."""
 
     def __init__(self, topology: str, robots: int) -> None:
         self.names = [f"r{i + 1}" for i in range(robots)]
@@ -114,7 +114,7 @@ class Team:
             heapq.heappush(self._way, (at_ns + WAY_NS, self._count, sender, to, what))
 
     def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
-        """Send a node's messages: a request to one node, all else to everyone in reach."""
+        """Send a node's messages: a request to one node, others to everyone in reach."""
         for each in out:
             size = len(encoded(each.message))
             self.said[name] += size

@@ -40,7 +40,7 @@ from teamslam.team.wire.zenoh.router import router
 TEAM = "bench"
 PINGS = 500
 A_TURN = 500
-"""Messages per turn with the boundary, or without: some 10 ms, which is seldom interrupted."""
+"""Messages per turn with the boundary, or without."""
 _HERE = [sys.executable, "-m", "benchmarks.security"]
 
 
@@ -69,7 +69,7 @@ def serve(folder: Path | None) -> None:
 
 
 def take(endpoint: str, folder: Path | None, count: int) -> None:
-    """The receiver's process: answers each progress by one, counts observations."""
+    """Receive in a process: answer each progress, count observations."""
     with enter_team(endpoint, folder, "robot-r1") as bus:
         bus.subscribe(ch.OBSERVATIONS, "r1")
         bus.subscribe(ch.END)
@@ -120,7 +120,7 @@ def link(folder: Path | None, count: int) -> tuple[float, float]:
 
 
 def ping(bus: ZenohBus, stamp_ns: int) -> float:
-    """One round trip; sent again while the link is still coming up."""
+    """One round trip; sent again while the link is coming up."""
     began = time.perf_counter()
     bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=stamp_ns, streams=())))
     while True:

@@ -95,7 +95,7 @@ def await_line(process: "subprocess.Popen[str]", words: str) -> str:
 
 
 def measure_at_rest(pid: int) -> dict[str, float]:
-    """Memory and CPU of a process at rest: at most a tenth of a core for a second."""
+    """Memory and CPU of a process at rest: below a tenth of a core for a second."""
     ticks = [-100]
     while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
         time.sleep(1.0)

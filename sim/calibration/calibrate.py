@@ -49,7 +49,7 @@ ROUNDS = 2
 SYSTEMATIC = 0.02
 """Relative standard deviation of a forward scale from the joined map."""
 CLOCK_ROUNDS = 3
-"""Repetitions of the estimate of clocks from the joined map, which is linear in an offset."""
+"""Repetitions of the estimate of clocks, linear in an offset."""
 TYPICAL_M = 3.0
 BETTER = 0.8
 """A range model is reported if it reduces σ at TYPICAL_M below this share."""

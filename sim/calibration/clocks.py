@@ -73,7 +73,7 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
 
 
 def clock_of_map(robot: str, folds: Sequence[Fold]) -> Clock | None:
-    """Clock of a robot by the joined maps of all worlds; None where it is no state of them."""
+    """Clock of a robot by the joined maps of all worlds; None where it is no state."""
     found = [
         (each.value, each.sigma)
         for fold in folds
@@ -102,7 +102,7 @@ def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
 
 
 def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
-    """Move odometry and detections of robots with an offset to the true path's clock."""
+    """Move odometry and detections of robots with an offset to the path's clock."""
     streams = tuple(
         _move_detections(each, clocks[each.robot])
         if each.robot in clocks and clocks[each.robot].is_off

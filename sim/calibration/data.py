@@ -1,4 +1,4 @@
-"""Calibration data: a robot's measurements, with reference poses and landmarks."""
+"""Calibration data: measurements with reference poses and landmarks."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -73,7 +73,7 @@ def sensor_poses(
 
 
 class SeenLandmarks(NamedTuple):
-    """Detections of known landmarks from known sensor poses; chosen: mask of all detections."""
+    """Detections of known landmarks from known sensor poses; chosen: mask of all."""
 
     chosen: Bool[np.ndarray, " N"]
     stamps_ns: Int64[np.ndarray, " n"]
@@ -106,7 +106,7 @@ def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
 
 
 def messages_of(stream: RobotStream) -> Iterator[m.Measurement]:
-    """Measurements as a robot receives them, without the initial pose, stamped in team time."""
+    """Measurements as a robot receives them, without the initial pose."""
     source = Source(replace(stream, clock_offset_ns=0))
     return (source.message(counter) for counter in range(1, len(stream)))
 
@@ -191,7 +191,7 @@ def true_paths(streams: Sequence[RobotStream]) -> dict[str, Path]:
 
 
 SPAN_S = 10.0
-"""Stretch length [s] for errors: errors of one command are correlated for seconds."""
+"""Stretch length [s]: errors of one command are correlated for seconds."""
 LEAST_SPANS = 30
 """Least number of moving stretches of all robots together."""
 LEAST_WAY_M = 0.05
@@ -209,7 +209,7 @@ def too_short(stretches: int) -> str:
 
 
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
-    """Number of whole stretches of SPAN_S in which a robot's odometry moves."""
+    """Number of whole stretches of SPAN_S with moving odometry."""
     return sum(map(_count_moving, streams))
 
 

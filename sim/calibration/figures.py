@@ -1,4 +1,4 @@
-"""Calibrated figures with jackknife uncertainty, and models that contain them."""
+"""Calibrated figures with jackknife uncertainty."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from teamslam.team.config import MotionModel, Sensor
 from teamslam.team.shapes import Float
 
 GROUPS = 5
-"""Least number of parts left out in turn; fewer robots are cut into equal time stretches."""
+"""Least number of parts left out in turn."""
 
 HUBER = 2.0
 
@@ -53,7 +53,7 @@ def huber(
 
 
 def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
-    """Most independent groups: robots of each data set, or time stretches of each."""
+    """Most independent groups: robots of each data set, or stretches of each."""
     pieces = -(-GROUPS // len(data))
     if pieces == 1:
         return [[each] for each in data]
@@ -68,7 +68,7 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 def jackknife(
     fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """Fit all data, with the uncertainty of `leave_out_groups` over robots or time stretches."""
+    """Fit all data, with uncertainty over robots or time stretches."""
     return leave_out_groups(fit, groups_of(data), units)
 
 

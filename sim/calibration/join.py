@@ -1,4 +1,4 @@
-"""Team map and paths from its own measurements: the reference without truth."""
+"""Team map and paths from measurements: the reference without truth."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -23,7 +23,7 @@ LEAST_ROBOTS = 3
 LEAST_LANDMARKS = 4
 BEYOND_DOUBT = 0.99
 COMMON_DOF = 2
-"""Prior of the common range scale, as a number of further worlds with a robot's own spread."""
+"""Prior of the common range scale, as a number of further worlds."""
 BIAS_OF = {
     "bearing_offset": "bearing",
     "range_offset": "range_offset",
@@ -45,7 +45,7 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 
 
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
-    """Each robot's constants over the worlds (or time stretches, for few worlds)."""
+    """Each robot's constants over the worlds, or time stretches."""
     found: dict[str, list[Mapping[str, float]]] = {}
     covariances = []
     worlds: dict[str, list[str]] = {}

@@ -28,7 +28,7 @@ from teamslam.team.shapes import Float, Int64
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4
 OUTLIER = 4.0
-"""Standard deviations beyond which measurements are left out of spreads and correlations."""
+"""Standard deviations beyond which measurements are outliers."""
 MAD_TO_SIGMA = 1.4826
 LAGS_S = np.geomspace(0.1, 30.0, 9)
 """Lag edges [s] of the error correlation of one landmark."""

@@ -1,4 +1,4 @@
-"""Comma-separated tables with named columns, bit-exact numbers, and errors that name the cell."""
+"""Comma-separated tables with named columns and bit-exact numbers."""
 
 import csv
 import re
@@ -27,7 +27,7 @@ NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
 
 
 class UnknownColumnError(DatasetError):
-    """A table has a column that its kind does not have; header: all its columns."""
+    """Table with a foreign column; header: all its columns."""
 
     def __init__(self, text: str, header: Sequence[str]) -> None:
         super().__init__(text)
@@ -350,7 +350,7 @@ def numbers_in(
 
 
 def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
-    """Packed covariance of each row, NaN if absent; raises DatasetError for an incomplete one."""
+    """Packed covariance of each row, NaN if absent; raises DatasetError."""
     numbers = table.known_numbers(*columns)
     empty = np.isnan(numbers)
     for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1].tolist():
@@ -363,7 +363,7 @@ def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray,
 
 
 def pose_covariances(table: CsvTable) -> Float[np.ndarray, "N 3 3"]:
-    """Covariances of a table with all their columns; raises DatasetError if some are missing."""
+    """Covariances of a table with all their columns; raises DatasetError."""
     missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
     if missing:
         raise table.fault(

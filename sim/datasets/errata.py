@@ -19,7 +19,7 @@ class Erratum:
 
 
 def content_digest(barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]) -> str:
-    """SHA-256 of the numbers of two tables, independent of line ends, spaces and comments."""
+    """SHA-256 of the numbers of two tables."""
     numbers = barcodes.astype("<f8").tobytes() + landmarks.astype("<f8").tobytes()
     return hashlib.sha256(numbers).hexdigest()
 

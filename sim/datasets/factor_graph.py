@@ -98,7 +98,7 @@ def _show_key(key: Key) -> str:
 
 
 def split_at_gaps(graph: FactorGraph) -> FactorGraph:
-    """Split a graph whose poses have numbers alone: a robot ends where no edge leads on."""
+    """Split a graph whose poses have numbers alone, where no edge leads on."""
     links = {(edge.start, edge.end) for edge in graph.pose_edges}
     keys = sorted({key for link in links for key in link} | {e.pose for e in graph.point_edges})
     ends = [after for before, after in pairwise(keys) if (before, after) not in links]
@@ -116,7 +116,7 @@ def split_at_gaps(graph: FactorGraph) -> FactorGraph:
 
 
 def place_by_odometry(graph: FactorGraph) -> None:
-    """Place poses without a vertex by odometry, and landmarks without one by their first edge."""
+    """Place poses without a vertex by odometry, and landmarks by their first edge."""
     for robot in graph.robots:
         keys, edges = graph.chain(robot)
         pose = graph.poses.setdefault(keys[0], np.zeros(3))

@@ -1,4 +1,4 @@
-"""Locate robots' tables in a folder or zip with one folder per robot."""
+"""Locate robots' tables in a folder or zip."""
 
 import re
 import zipfile
@@ -107,7 +107,7 @@ def name_table(place: File, file: File, robot: str) -> str:
 
 
 def unused_files(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
-    """Describe CSV files that are no table, and folders with tables of no robot."""
+    """Describe CSV files that are no table, and folders of no robot."""
     known = {*tables, "detections", "labels"}
     notes = []
     for place in dict.fromkeys([root, *folders.values()]):

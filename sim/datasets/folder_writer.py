@@ -1,4 +1,4 @@
-"""Write streams bit-exactly as a data set of CSV tables for `teamslam.sim.datasets.folder`."""
+"""Write streams bit-exactly as a data set of CSV tables."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ Row = Sequence[object]
 
 
 def write_folder(streams: WorldStreams, directory: Path | str) -> None:
-    """Write one folder per robot; times in nanoseconds, other numbers as shortest exact text."""
+    """Write one folder per robot."""
     place = Path(directory)
     place.mkdir(parents=True, exist_ok=True)
     for stream in streams.streams:

@@ -1,4 +1,4 @@
-"""A landmark graph in a text file as a data set, cut into one piece per robot."""
+"""A landmark graph as a data set, cut into one piece per robot."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Write a landmark graph as text of g2o, isam or PyFactorGraph, for `graph_lines` and `pyfg`."""
+"""Write a landmark graph as text of g2o, isam or PyFactorGraph."""
 
 from collections.abc import Iterator, Sequence
 
@@ -12,7 +12,7 @@ LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
 
 
 def g2o_lines(graph: FactorGraph) -> Iterator[str]:
-    """Lines of a g2o file: landmarks keep their numbers, poses are numbered behind them."""
+    """Lines of a g2o file: poses are numbered behind the landmarks."""
     first = max(graph.landmarks, default=-1) + 1
     vertex: dict[Key, int] = {}
     for landmark, point in sorted(graph.landmarks.items()):

@@ -233,7 +233,7 @@ def _positions(
 
 
 def pieces(whole: RobotStream, count: int) -> tuple[RobotStream, ...]:
-    """Cut a log into robots r1, r2, … with unknown initial poses and equal interval counts."""
+    """Cut a log into robots r1, r2, … of equal interval counts and unknown initial poses."""
     intervals = whole.intervals
     bounds = np.linspace(0, len(intervals.end_ns), count + 1).astype(np.int64)
     names = tuple(f"r{i + 1}" for i in range(count))

@@ -211,10 +211,10 @@ LONG_GAP_NS = 2_000_000_000
 """Least reported gap in odometry or truth."""
 
 START_WINDOW_NS = 200_000_000
-"""Time around a robot's first measurement from which the initial pose is computed."""
+"""Time around a robot's first measurement for its initial pose."""
 
 START_SPREAD_RAD = 0.2
-"""Largest heading difference [rad] within that time (the base turns at most 0.58 rad/s)."""
+"""Largest heading difference [rad] within that time."""
 
 
 def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:

@@ -11,7 +11,7 @@ from teamslam.sim.world.streams import RobotStream, WorldStreams
 Row = tuple[str | float, ...]
 
 FIRST_BARCODE = 100
-"""Subject k has barcode 100 + k, so barcodes and subjects cannot be confused."""
+"""Subject k has barcode 100 + k."""
 
 
 def write_utias(streams: WorldStreams, directory: Path | str) -> None:
@@ -84,7 +84,7 @@ def _write_robot(folder: Path, stream: RobotStream, number: Mapping[str, int], s
 
 
 def _odometry_rows(stream: RobotStream) -> list[Row]:
-    """A row at the start of each interval and at the end of the last, on the odometry's clock."""
+    """A row at the start of each interval and at the end of the last."""
     intervals = stream.intervals
     if not len(intervals.end_ns):
         return []

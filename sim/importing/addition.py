@@ -19,7 +19,7 @@ LANDMARKS = "landmarks.csv"
 
 
 def takes_robot(folder: Path, robot: str) -> bool:
-    """Whether a folder is a data set with a sub-folder per robot, and none for this one."""
+    """Whether a folder is a data set of sub-folders, and none for this robot."""
     try:
         robots = robots_of(str(folder))
     except DatasetError:

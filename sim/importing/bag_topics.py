@@ -1,4 +1,4 @@
-"""Propose the use of a ROS 2 bag's topics by names, types and frames."""
+"""Propose the use of a ROS 2 bag's topics."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -43,13 +43,13 @@ class Proposal(NamedTuple):
 
 
 def propose_topics(path: Path) -> str:
-    """A bag's topics, with a proposed assignment file; raises BagError."""
+    """Describe a bag's topics, with a proposed assignment file; raises BagError."""
     with opened_bag(path) as bag:
         return _question(path, bag, _proposed(bag, None))
 
 
 def propose_assignment(path: Path) -> str:
-    """Proposed assignment file of a bag's topics, with warnings as comments; raises BagError."""
+    """Proposed assignment file of a bag's topics; raises BagError."""
     with opened_bag(path) as bag:
         found = _proposed(bag, None)
         topics = [*listing(bag.topics).splitlines(), *found.warnings]

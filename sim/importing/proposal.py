@@ -1,4 +1,4 @@
-"""Propose a column map from the names of a user's files and columns."""
+"""Propose a column map from the names of files and columns."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -49,7 +49,7 @@ UNITS = {
 }  # fmt: skip
 """Factor to our unit, by the unit at the end of a column name."""
 LARGEST_S = 1e11
-"""Times from here on are no seconds: as Unix times, 1e11 s is in the year 5138, 1e11 ms in 1973."""
+"""Times from here on are no seconds."""
 KIND = "<kind>"
 """Placeholder of a table's name."""
 PROPOSED = (*MEASURED, "truth", "landmarks", "start")

@@ -1,4 +1,4 @@
-"""Import a user's files, bag, log or data set into a data-set folder."""
+"""Import a user's files, bag, log or data set."""
 
 import re
 from collections.abc import Collection, Mapping, Sequence

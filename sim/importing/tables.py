@@ -1,4 +1,4 @@
-"""One robot's tables before they are written to a data set's folder."""
+"""One robot's tables before they are written."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -75,7 +75,7 @@ class RobotTables:
         self.columns["start"], self.rows["start"] = columns, [row]
 
     def write(self, folder: Path) -> None:
-        """Write the tables into a folder of the robot's name, and true landmarks beside it."""
+        """Write the tables into a folder of the robot's name, true landmarks beside it."""
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():

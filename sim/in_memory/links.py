@@ -22,7 +22,7 @@ _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Delivery of messages to a node at their arrival times; liveliness tokens come first."""
+    """Delivery of messages to a node at their arrival times, liveliness first."""
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns
@@ -57,7 +57,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Partition:
-    """These robots and the centre do not reach each other from begin_ns until end_ns."""
+    """Robots that do not reach the centre from begin_ns until end_ns."""
 
     robots: frozenset[str]
     begin_ns: int

@@ -1,4 +1,4 @@
-"""A whole team in one process, on the bus in memory: the same nodes, synchronous, deterministic."""
+"""A whole team in one process: the same nodes, deterministic."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ real time.
 """
 
 SHARED = 16
-"""Number of recent samples whose decoded messages are cached for other receivers."""
+"""Number of recent samples whose decoded messages are cached."""
 
 
 @runtime_checkable

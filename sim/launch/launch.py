@@ -64,7 +64,7 @@ class Plan:
 
 
 ROUTER_PATIENCE_S = 20.0
-"""Time [s] within which the router reports its endpoint; Python starts slowly on a busy machine."""
+"""Time [s] within which the router reports its endpoint."""
 POSES = (ch.OWN_POSE, ch.TEAM_POSE)
 """Channels that may lose messages to a slow observer."""
 REFUSED = 2

@@ -28,7 +28,7 @@ LINE_S = 5.0
 REPEAT_S = 60.0
 """Wall time after which an unchanged line is repeated."""
 SETTLED_S = 5.0
-"""A warning withdrawn within this time [s], as during the start, is not printed."""
+"""A warning withdrawn within this time [s] is not printed."""
 WIDE = 80
 """Terminal columns for the whole table."""
 MOST_ALIKE = 3
@@ -174,7 +174,7 @@ _NARROW = ("steps", "submaps", "pose_sigma_m", "nis_per_dof")
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
-"""Most robots with a row each, since a higher table would be cut."""
+"""Most robots with a row each."""
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:

@@ -12,7 +12,7 @@ AHEAD_S = 10.0
 NAMED = 5
 """Most missing robots that are named."""
 PATIENCE_S = 8.0
-"""Time [s] before absent nodes are reported: processes start slowly on a busy machine."""
+"""Time [s] before absent nodes are reported."""
 
 
 def _count_consumed(watch: Watch) -> tuple[float, float]:
@@ -97,7 +97,7 @@ def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
 
 
 def consistency(watch: Watch) -> str:
-    """Describe the consistency monitor's figures; with truth, NEES and coverage of landmarks."""
+    """Describe the consistency monitor's figures; with truth, NEES and coverage."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [

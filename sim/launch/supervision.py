@@ -26,7 +26,7 @@ MANY = "many"
 REPEAT_S = 60.0
 """Least time [s] between reports of the same silence."""
 STARTING_S = 60.0
-"""Silence [s] after which a starting process is reported: a busy machine is slow."""
+"""Silence [s] after which a starting process is reported."""
 MEASURE_S = 2.0
 """Time [s] between memory measurements; the last is at the final map."""
 END_DELAY_S = 1.0
@@ -237,7 +237,7 @@ def lacking_in(watch: Watch) -> str:
 
 
 def names_only(ended: Ended, lacks: str) -> bool:
-    """Whether a process failed only because of missing robots, which `launch` reports."""
+    """Whether a process failed only because of missing robots."""
     last = ended.last_lines[-1] if ended.last_lines else ""
     return bool(lacks) and ended.exit == 1 and last.endswith(f"error: {lacks}")
 

@@ -1,4 +1,4 @@
-"""Check that robots and centre run with the configurations of the world's scenario."""
+"""Check that robots and centre run with the configurations of the scenario."""
 
 import json
 from collections.abc import Collection, Iterator, Mapping
@@ -12,7 +12,7 @@ REMEDY = "start it again with the same scenario and options"
 
 
 class Configurations:
-    """Expected configurations by node, and received announcements, of which the newest counts."""
+    """Expected configurations by node, and received announcements."""
 
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
