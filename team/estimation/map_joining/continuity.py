@@ -7,10 +7,9 @@ landmarks, is
 
   ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
-The view of a side is the sector of its landmarks, to the greatest distance of both sides. Where the
-landmarks of either side surround the robot, the sensor looks around, and both views are whole
-circles: few landmarks span a narrow sector. A seam is between two submaps, or inside one, which
-then is spoilt. Landmarks with identities have a test of their own (`central.carried_off`).
+The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam is
+between two submaps, or inside one, which then is spoilt. Landmarks with identities have a test of
+their own (`central.carried_off`).
 """
 
 import math
@@ -143,10 +142,9 @@ def _compare_sides(
     a, b = np.searchsorted(nodes, one), np.searchsorted(nodes, two)
     points, possible = _mark_possible(island, nodes, a, b)
     reach = float(core.hypot(*(points - place).T).max())
-    around = any(_widest_gap(points[own] - place)[0] <= AROUND for own in (a, b))
     absent = present = 0
     for own, other, found in ((a, b, possible.any(axis=1)), (b, a, possible.any(axis=0))):
-        in_view = _mark_in_view(points[own] - place, points[other] - place, reach, around=around)
+        in_view = _mark_in_sector(points[own] - place, points[other] - place, reach)
         absent += int((in_view & ~found).sum())
         present += int(found.sum())
     return ABSENT * absent - PRESENT * present
@@ -167,23 +165,16 @@ def _mark_possible(
     return points, possible
 
 
-def _widest_gap(points: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
-    """Return the widest gap between the directions of neighbouring points, and where it ends."""
-    directions = np.sort(core.atan2(points[:, 1], points[:, 0]))
-    gaps = np.diff(np.append(directions, directions[0] + 2.0 * math.pi))
-    widest = int(gaps.argmax())
-    return float(gaps[widest]), float(directions[(widest + 1) % len(directions)])
-
-
-def _mark_in_view(
-    points: Float[np.ndarray, "n 2"], of: Float[np.ndarray, "m 2"], reach: float, *, around: bool
+def _mark_in_sector(
+    points: Float[np.ndarray, "n 2"], of: Float[np.ndarray, "m 2"], reach: float
 ) -> Bool[np.ndarray, " n"]:
-    """Mark the points within reach of the origin and, unless the sensor looks around, in the sector
-    of other points' directions.
-    """
+    """Mark the points within reach of the origin, in the sector of other points' directions."""
+    directions = np.sort(core.atan2(of[:, 1], of[:, 0]))
+    gaps = np.diff(np.append(directions, directions[0] + 2.0 * math.pi))
     near = core.hypot(*points.T) <= reach
-    if around:
+    widest = int(gaps.argmax())
+    if gaps[widest] <= AROUND:
         return np.asarray(near)
-    gap, begin = _widest_gap(of)
+    begin = directions[(widest + 1) % len(directions)]
     turned = np.mod(core.atan2(points[:, 1], points[:, 0]) - begin, 2.0 * math.pi)
-    return np.asarray(near & (turned <= 2.0 * math.pi - gap))
+    return np.asarray(near & (turned <= 2.0 * math.pi - gaps[widest]))
