@@ -1,9 +1,8 @@
 """Landmarks of a saved map that today's robots should have observed and have not.
 
-The probability p(d) that a submap observes a landmark at distance d from its path is learnt from
-today's landmarks, and at most that of a window beside it (`visibility.OVERLOOKED`). A landmark at
-distances d_s from the paths is expected Σ p(d_s) times, and missed by all with probability Π (1 −
-p(d_s)).
+The probability p(d) to observe a landmark at distance d from a submap's path is learnt from today's
+landmarks, at most that of a window beside it (`visibility.OVERLOOKED`). A landmark at distances d_s
+is expected Σ p(d_s) times and missed by all with probability Π (1 − p(d_s)).
 """
 
 from collections.abc import Sequence
@@ -28,14 +27,14 @@ STEPS = 4
 
 
 class Absence(NamedTuple):
-    """Expected number of observations of a landmark, and the probability to miss it always."""
+    """Expected number of observations of a landmark, and the probability of none."""
 
     expected: float
     chance: float
 
 
 def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
-    """Compute how surely each of these places, at which nothing was observed, was looked at."""
+    """Compute the expected observations of places at which nothing was observed."""
     submaps = [each for each in island.graph.submaps if not is_map(each.contribution.stream)]
     nodes = sorted({node for each in submaps for node in each.landmarks.tolist()})
     if not nodes:
@@ -56,7 +55,6 @@ def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
 
 
 def _path(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
-    """Interpolate positions along a submap's path."""
     poses = len(submap.contribution.local.node_stamps)
     start, end, *between = submap.nodes[: 2 + poses].tolist()
     at = island.graph.offset[[start, *between, end]]

@@ -1,8 +1,8 @@
-"""Align two maps: estimate the pose of one in the frame of the other from their common points.
+"""Align two maps by their common points.
 
-Weighted Procrustes alignment by singular values gives the first guess (Downs' thesis on map
-joining; Arun, Huang & Blostein 1987); Gauss-Newton in the metric of both joint covariances refines
-it. Agreement is tested on the joint cost, which is not linearised about a drifted map.
+Weighted Procrustes alignment (Downs' thesis; Arun, Huang & Blostein 1987) gives the first guess,
+Gauss-Newton in the metric of both joint covariances refines it. Agreement is tested on the joint
+cost, which is not linearised about a drifted map.
 """
 
 from typing import NamedTuple
@@ -25,11 +25,10 @@ class Alignment(NamedTuple):
     """The rigid motion a_from_b (x [m], y [m], theta [rad]), its covariance and the χ² of its
     residuals.
 
-    dof: degrees of freedom of `chi2`: 2 per shared landmark less the 3 of the motion.
-    heading_sigma: standard deviation [rad] of the heading from the shape of the shared landmarks.
-    Unlike `covariance` it leaves out how far each map may be rotated as a whole: with the
-    difference's covariance S and the projection Π off the rigid motions it is √(tr(Π S Π)/dof /
-    Σ‖bᵢ − b̄‖²), which is σ/√Σ‖bᵢ − b̄‖² for independent landmarks.
+    dof: of `chi2`, 2 per shared landmark less 3. heading_sigma: standard deviation [rad] of the
+    heading from the shape of the shared landmarks. Unlike `covariance` it leaves out the rotation
+    of each map as a whole: √(tr(Π S Π)/dof / Σ‖bᵢ − b̄‖²), with the difference's covariance S and
+    the projection Π off the rigid motions.
     """
 
     a_from_b: Float[np.ndarray, "3"]
@@ -42,7 +41,7 @@ class Alignment(NamedTuple):
 def procrustes(
     in_a: Float[np.ndarray, "n 2"], in_b: Float[np.ndarray, "n 2"], weights: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "3"]:
-    """a_from_b = argmin Σ wᵢ ‖aᵢ − (R bᵢ + t)‖² over proper rotations R and translations t.
+    """a_from_b = argmin Σ wᵢ ‖aᵢ − (R bᵢ + t)‖² over rotations R and translations t.
 
     R turns by the direction of (Σ wᵢ (bᵢ − b̄)·(aᵢ − ā), Σ wᵢ (bᵢ − b̄) × (aᵢ − ā)); t = ā − R b̄.
     """
@@ -65,10 +64,9 @@ def align(
     landmarks.
 
     Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate. The
-    motion is solved about the centroids, a − ā = R (b − b̄) + t', then t = ā + t' − R b̄: rounding
-    and conditioning do not depend on the distance to either origin. Points that all lie at one
-    place leave the heading free: `heading_sigma` is infinite and the heading 0. Raises
-    NotACovarianceError where the covariance of the differences is none.
+    motion is solved about the centroids, so that conditioning does not depend on the distance to
+    either origin. Points at one place leave the heading at 0 and `heading_sigma` infinite. Raises
+    NotACovarianceError.
     """
     n = len(in_a)
     variances = np.diag(covariance_a) + np.diag(covariance_b)
@@ -112,7 +110,7 @@ def fit_at_heading(
     covariance_b: Float[np.ndarray, "m m"],
     heading: float,
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """Fit the translation [m] of a_from_b at a given heading; return it with its χ²."""
+    """Fit the translation [m] of a_from_b at a given heading, with its χ²."""
     pose = np.array([0.0, 0.0, heading])
     residual, metric, jacobian = _linearise(pose, in_a, covariance_a, in_b, covariance_b)
     J = jacobian[:, :2]
@@ -162,7 +160,7 @@ def _linearise(
 
 
 class SharedPoints(NamedTuple):
-    """Numbers of shared points: landmarks, and teammates observed from one of the maps."""
+    """Numbers of shared landmarks, and of teammates observed from one of the maps."""
 
     landmarks: int
     sightings: int = 0
@@ -175,7 +173,7 @@ class SharedPoints(NamedTuple):
 
 
 def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Give the reason why the shared points cannot place one map in the other; None if they can."""
+    """Give the reason why the shared points cannot place one map in the other."""
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
     if alignment.heading_sigma == np.inf:
@@ -189,12 +187,10 @@ def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: fl
 
 
 def disagreement(shared: SharedPoints, chi2: float, confidence: float) -> str | None:
-    """Give the reason why two maps with these shared points cannot be of one place; None if they
-    can.
+    """Give the reason why two maps with these shared points cannot be of one place.
 
-    chi2: rise of the joint cost when the shared landmarks are made one and the inter-robot
-    measurements are added; for maps that agree χ² with 2 degrees of freedom per point less the 3 of
-    the motion. confidence: its quantile above which the maps disagree.
+    chi2: rise of the joint cost by the shared points; for maps that agree χ² with 2 degrees of
+    freedom per point less 3. confidence: quantile above which the maps disagree.
     """
     limit = chi2_limit(2 * sum(shared) - 3, 1.0 - confidence)
     if chi2 > limit:

@@ -1,12 +1,11 @@
 """Fold a tick, cut streams at its seams, and undo a closure that later submaps contradict.
 
-A stream whose view changes at once (`continuity`) is cut there, and the tick is folded again with
-the later part as an island of its own, which merges like one with an unknown initial pose.
+After a cut (`continuity`) the tick is folded again with the later part as an island of its own.
 
-For some ticks after a closure, or a merge of robots, the matched share of the landmarks near its
-places that both sides observed is computed again. Where it falls below the bound of the settings,
-these ticks are folded again without the closure. The fold before a closure and the ticks since are
-part of the fold, so the outcome depends on the set of submaps alone.
+For some ticks after a closure or a merge, the matched share of the landmarks near its places that
+both sides observed is computed again. Below the bound of the settings, these ticks are folded again
+without the closure. The fold before a closure is part of the fold, so the outcome depends on the
+set of submaps alone.
 """
 
 from dataclasses import replace
@@ -40,7 +39,6 @@ def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def _first_seam(fold: Fold, tick: Tick) -> Seam | None:
-    """Find the first seam that the submaps of a tick show."""
     for each in tick.contributions:
         if each.key not in fold.refused:
             island = fold.islands[fold.home[each.stream]]
@@ -51,7 +49,6 @@ def _first_seam(fold: Fold, tick: Tick) -> Seam | None:
 
 
 def _audit_closures(fold: Fold, after: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Undo a closure that the tick between two folds contradicts, else extend its audit."""
     if not after.landmarks.opened and not fold.audits:
         return after
     length = settings.association.audited
@@ -85,7 +82,7 @@ def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSetting
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:
-    """Share of the landmarks near a closure's places that both sides observed; None without any."""
+    """Compute the matched share of the landmarks near a closure that both sides observed."""
     places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
     if not places:
         return None

@@ -1,13 +1,11 @@
 """The condensed factor: old submaps as one quadratic cost over the nodes that remain in the graph.
 
-Linearised at the state `at` of the nodes when the submaps were condensed,
+Linearised at the state `at` of condensing,
 
     cost(x) = cost + 2 slopeᵀ d + dᵀ information d,   d = x − at (headings wrapped),
 
-where the poses that occur in no other factor are eliminated (Schur complement). This is exact but
-for the linearisation point, which stays `at`, and the robust weights, which keep their values.
-
-The covariance of landmarks at rest (`Resting`) is stored as its upper triangle.
+with the poses of no other factor eliminated (Schur complement): exact but for the linearisation
+point and the robust weights, which stay.
 """
 
 from collections import Counter
@@ -38,10 +36,8 @@ PATH_BLOCK = 64
 class SubmapCost(NamedTuple):
     """Agreement of one submap with the rest of the map: χ² should be close to dof.
 
-    chi2: unweighted χ² of the submap, no landmark discounted. dof: dim − w tr(JᵀP⁻¹J Σ), the part
-    of the submap's dimension that the solution does not absorb (its redundancy, Baarda 1968).
-    weight: the robust weight w; 1 without a robust loss. median: of χ² with `dof` degrees of
-    freedom; NaN for less than one.
+    chi2: without discounts. dof: dim − w tr(JᵀP⁻¹J Σ), its redundancy (Baarda 1968). weight: the
+    robust weight w. median: of χ² with `dof` degrees of freedom; NaN for less than one.
     """
 
     stream: Stream
@@ -55,9 +51,8 @@ class SubmapCost(NamedTuple):
 class EliminatedPath(NamedTuple):
     """The eliminated poses of a stream, first to last, at the state of their elimination.
 
-    blocks: runs of them. All but the last have PATH_BLOCK poses and are shared with every later
-    path of the stream, so that checkpoints store them once. is_fixed: whether the first pose is a
-    constant.
+    blocks: runs of PATH_BLOCK poses, the last one shorter; later paths share them, so that
+    checkpoints store them once. is_fixed: whether the first pose is a constant.
     """
 
     blocks: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -79,9 +74,8 @@ class EliminatedPath(NamedTuple):
 class Departed(NamedTuple):
     """Statistics of the condensed factors, as of their condensing.
 
-    robots: Σ w χ² and Σ dof of each robot. submaps: costs of the newest condensed submaps of each
-    stream, oldest first. believed: for each landmark the number of believed submaps that contain
-    it. paths: the eliminated poses, from which the submaps are linearised again.
+    robots: Σ w χ² and Σ dof of each robot. submaps: the newest costs of each stream, oldest first.
+    believed: number of believed submaps of each landmark. paths: the eliminated poses.
     """
 
     robots: Mapping[str, tuple[float, float]]
@@ -91,7 +85,7 @@ class Departed(NamedTuple):
 
 
 def select_newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
-    """Select the costs of the last HISTORY submaps of each stream, in order."""
+    """Select the costs of the last HISTORY submaps of each stream."""
     counts = Counter(each.stream for each in submaps)
     older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
     found: list[SubmapCost] = []
@@ -114,11 +108,11 @@ NOBODY = Departed({}, (), {}, {})
 class Resting:
     """Landmarks that no raw submap contains, given the nodes of the condensed factor.
 
-    x ~ N(means + gain d, covariance), d as in `Condensed`: the result of their elimination besides
-    the quadratic over the other nodes. They are no nodes of the graph until a submap observes them.
+    x ~ N(means + gain d, covariance), d as in `Condensed`. They are no nodes until a submap
+    observes them.
 
-    ids: in the order in which they came to rest; two numbers each in the other arrays. covariance:
-    its upper triangle, as a square matrix or packed (`packed`); `upper` has the square.
+    ids: in the order in which they came to rest. covariance: its upper triangle, square or packed;
+    `upper` has the square.
     """
 
     ids: Indices
@@ -128,7 +122,7 @@ class Resting:
 
     @cached_property
     def upper(self) -> Float[np.ndarray, "r r"]:
-        """The upper triangle as a square matrix; entries below the diagonal are not read."""
+        """The upper triangle of a square matrix; the rest is not read."""
         if self.covariance.ndim == 2:
             return self.covariance
         return unpacked_of(self.covariance, len(self.means))
@@ -156,8 +150,8 @@ class Condensed:
     """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
 
     headings: which of its numbers are headings. submaps: number of submaps that it replaces.
-    redundancy: number of measured quantities less that of eliminated unknowns. resting: landmarks
-    given these nodes; None: there have never been any.
+    redundancy: number of measured quantities less eliminated unknowns. resting: None if there have
+    never been any.
     """
 
     nodes: Indices
@@ -192,7 +186,7 @@ class Condensed:
 
 
 def places(offset: Indices, nodes: Indices) -> Indices:
-    """Indices in the state of the numbers of some nodes, node after node."""
+    """Indices in the state of the numbers of some nodes."""
     sizes = offset[nodes + 1] - offset[nodes]
     first = np.repeat(offset[nodes] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
     found: Indices = first + np.arange(len(first))
@@ -202,10 +196,10 @@ def places(offset: Indices, nodes: Indices) -> Indices:
 def tie_nodes(
     old: Condensed, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]
 ) -> Condensed:
-    """Merge landmarks of the factor into one node, exactly: the same cost where they are equal.
+    """Merge landmarks of the factor into one node: the same cost where they are equal.
 
-    sizes: numbers of each former node; node_of: its new node. becomes: the new number of each
-    renumbered landmark. The linearisation point is that of the first merged landmark.
+    node_of: new number of each former node. becomes: that of each renumbered landmark. The
+    linearisation point is that of the first merged landmark.
     """
     departed = old.departed
     if any(id_ in departed.believed for id_ in becomes):
@@ -246,9 +240,9 @@ def tie_nodes(
 
 
 def upper_of(upper: Matrix, chosen: Indices, size: int) -> Float[np.ndarray, "m m"]:
-    """Return the upper triangle among these ascending numbers, at the corner of a larger matrix.
+    """Return the upper triangle among ascending numbers, at the corner of a larger matrix.
 
-    Runs of consecutive numbers are copied as blocks, with what is below the diagonal.
+    Below the diagonal the result is undefined.
     """
     result = np.zeros((size, size))
     begins = np.flatnonzero(np.diff(chosen, prepend=-2) != 1).tolist()
@@ -275,9 +269,7 @@ def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
 
 
 def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
-    """Return the entries of these rows and columns of a symmetric matrix stored as upper
-    triangle.
-    """
+    """Return some rows and columns of a symmetric matrix stored as upper triangle."""
     entries: Float[np.ndarray, "r c"] = upper[
         np.minimum.outer(rows, columns), np.maximum.outer(rows, columns)
     ]

@@ -1,13 +1,12 @@
-"""The bounded fold: old submaps are condensed into one quadratic, selected by sequence number only.
+"""The bounded fold: old submaps become one quadratic, selected by sequence number only.
 
-The last `lag` submaps of each stream of the main island stay factors. Older ones are linearised at
-the current state with their current robust weights, and become one quadratic over landmarks, biases
-and the pose at each stream's boundary (`condensed_factor`). The cost of a tick therefore depends on
-the number of landmarks and robots, not on the duration of the run. A fold stays a pure function of
-its ticks.
+The last `lag` submaps of each stream of the main island stay factors. Older ones become one
+quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`), at the
+current state and robust weights. The cost of a tick depends on the number of landmarks and robots,
+not on the duration of the run.
 
-No submap is condensed before the fold has `begin` submaps, nor before its own robust scale is
-final, nor in an unmerged island, whose frame will still be transformed.
+No submap is condensed before the fold has `begin` submaps, before its own robust scale is final, or
+in an unmerged island, whose frame will still be transformed.
 """
 
 from collections import defaultdict
@@ -48,9 +47,8 @@ ALL_AWAKE = 2**62
 class Limits(NamedTuple):
     """The sizes by which a fold is condensed.
 
-    begin: largest number of submaps of a raw fold. lag: number of submaps of each stream that are
-    never condensed. first: number of landmarks without a raw submap from which landmarks come to
-    rest.
+    begin: largest raw fold. lag: submaps of each stream that are never condensed. first: number of
+    landmarks without a raw submap from which landmarks come to rest.
     """
 
     begin: int = 128
@@ -62,11 +60,11 @@ LIMITS = Limits()
 
 
 def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
-    """Condense the old submaps of the fold's main island; return the same fold if there are none.
+    """Condense the old submaps of the fold's main island.
 
-    Submaps whose poses cannot be eliminated stay raw. Unnamed landmarks stay nodes: a team that has
-    some condenses only once it has as many submaps as landmarks. Association keeps observations of
-    condensed submaps (`memory`), all of them while a closure can be undone; landmarks that few
+    Submaps whose poses cannot be eliminated stay raw. A team with unnamed landmarks, which stay
+    nodes, condenses only once it has as many submaps as landmarks. Association keeps observations
+    of condensed submaps (`memory`), all of them while a closure can be undone; landmarks that few
     submaps confirm are dropped.
     """
     key, (begin, lag, first) = fold.main_key, limits
@@ -110,8 +108,8 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
 def _extend_memory(
     graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold
 ) -> tuple[Memory, Indices]:
-    """Extend the graph's memory by the condensed submaps; return also the dropped landmarks: none
-    during the audit of a closure, and none that an operator has judged.
+    """Extend the graph's memory; return also the dropped landmarks: none during an audit, none that
+    an operator has judged.
     """
     counts, stays = np.zeros(len(graph.fixed), np.int64), np.zeros(len(graph.fixed), np.bool_)
     before = {} if graph.condensed is None else graph.condensed.departed.believed
@@ -145,7 +143,6 @@ def _attach_memory(smaller: Island, memory: Memory, before: Graph, *, forgets: b
 
 
 def _mark_leaving(island: Island, lag: int) -> Bool[np.ndarray, " F"]:
-    """Mark the submaps to condense: `lag` or more behind, at their final robust scale."""
     graph = island.graph
     last = {stream: graph.next_sequence(stream) - lag for stream in graph.streams}
     narrow = (island.scale <= 1.0) | (island.scale >= PLAIN)
@@ -211,7 +208,7 @@ def _condense_island(
 
 
 def _mark_eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
-    """Mark the nodes that no later factor can contain: poses of old submaps but the last one."""
+    """Mark the nodes that no later factor can contain."""
     eliminated = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(leaving):
         contribution, nodes, *_ = graph.submaps[f]

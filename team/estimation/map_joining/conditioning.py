@@ -1,20 +1,17 @@
 """The Gaussian back end of one robot: its own map, and its pose in the team's map.
 
-The own map joins the submaps one by one into one Gaussian: Hybrid-SLAM's map joining (Brooks &
-Bailey 2008, "HybridSLAM"), with the constraints of Williams' constrained local submap filter
-(2001). The whole map and the local map are independent Gaussians, and the identity of two landmarks
-is an observation without noise. Earlier submaps are not linearised again, so the map is
-overconfident after many joins.
+The own map joins the submaps one by one into one Gaussian (Brooks & Bailey 2008, "HybridSLAM";
+Williams 2001): map and submap are independent, and the identity of two landmarks is an observation
+without noise. Earlier submaps are not linearised again, so the map is overconfident after many
+joins.
 
-The pose in the team's map is the broadcast prior times the robot's later submaps. The prior (the
-joint marginal of the robot's last joined end pose and the landmarks) and the submaps after it are
-independent, so their product is exact, once the centre's estimates have corrected the errors that
-all submaps of a robot share. It is the centre's least-squares problem, with the prior in place of
-all earlier submaps, solved at once: joined one by one, the first submap would be linearised at the
-pose of a poor prior (decision 21).
+The pose in the team's map is the broadcast prior (joint marginal of the robot's last joined end
+pose and landmarks) times the robot's later submaps, solved at once as the centre does (decision
+21). The product is exact once the centre's estimates have corrected the errors that all submaps of
+a robot share.
 
-A landmark observation that everything else contradicts (a misread barcode) is left out, for this
-solution only. The result is for display and control; it never enters a message that is fused.
+A landmark observation that everything else contradicts (a misread barcode) is left out of this
+solution only. The result is for display and control; no message that is fused contains it.
 """
 
 import math
@@ -50,7 +47,7 @@ definite, or that of one landmark is singular.
 def initial_map(
     pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None
 ) -> WholeMap:
-    """Make a map with a pose only; covariance None: the pose is exactly known."""
+    """Make a map with a pose only; covariance None: exactly known."""
     spread = np.zeros((3, 3)) if covariance is None else covariance
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
@@ -58,7 +55,7 @@ def initial_map(
 def join_submap(whole: WholeMap, local: LocalMap) -> WholeMap:
     """Compose the local map onto the current pose: known landmarks fused, new ones added.
 
-    Raises NotACovarianceError where the known landmarks contradict the map numerically.
+    Raises NotACovarianceError.
     """
     local = local.without_nodes
     after, fault = whole.joined(local.ids, local.mean, local.covariance)
@@ -82,7 +79,6 @@ def remove_landmark(local: LocalMap, place: int) -> LocalMap:
 
 
 def _coordinates(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    """Indices of the coordinates of landmarks in a submap's mean, after its poses."""
     return len(local.mean) - 2 * len(local.ids) + _points(index)
 
 
@@ -115,20 +111,20 @@ SELF = ("self", 0)
 
 
 class SubmapCorrection(NamedTuple):
-    """The centre's corrections of a robot's submaps: a covariance factor f, and the shared biases.
+    """The centre's corrections of a robot's submaps: covariance factor f, shared biases b.
 
-    biases: name, estimate and standard deviation of each shared error b.
+    biases: name, estimate and standard deviation.
     """
 
     covariance_factor: float = 1.0
     biases: tuple[tuple[Bias, float, float], ...] = ()
 
     def taken(self, local: LocalMap) -> LocalMap:
-        """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D,
-        with the submap's sensitivity S and curvature D.
+        """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D, with
+        sensitivity S and curvature D.
 
-        The remaining uncertainty of b is taken as independent of the map; the true correlation
-        makes this covariance rather too large than too small. A bias without an estimate is zero.
+        The uncertainty of b is taken as independent of the map, which is conservative. A bias
+        without an estimate is zero.
         """
         if self.covariance_factor == 1.0 and not local.biases:
             return local
@@ -147,8 +143,8 @@ class SubmapCorrection(NamedTuple):
 class RobotPrior(NamedTuple):
     """A robot's last joined end pose and landmarks: the joint covariance of (x, y, θ, x₁, y₁, …).
 
-    In the frame of the robot's island [m, rad], landmark ids ascending; a row of zeros is a known
-    constant. shared: corrections of all the robot's submaps, those in the prior included.
+    In the frame of the robot's island [m, rad], ids ascending; a row of zeros is a known constant.
+    shared: corrections of all the robot's submaps.
     """
 
     pose: Float[np.ndarray, "3"]
@@ -166,11 +162,9 @@ class RobotPrior(NamedTuple):
 class Followed(NamedTuple):
     """A robot's map after its later submaps, with their agreement.
 
-    known: for each submap, the number of its landmarks that the map or another submap contains,
-    too. refused: the number of those that everything else contradicts. cost: χ² of the least
-    squares over map and submaps without the refused landmarks, in `dof` degrees of freedom.
-    disputed: that χ² is too large, or most of a submap would be refused: the error is larger than a
-    single landmark.
+    known: number of each submap's landmarks that the map or another submap contains. refused:
+    number of those that everything else contradicts. cost: χ² in `dof` degrees of freedom, without
+    the refused. disputed: that χ² is too large, or most of a submap would be refused.
     """
 
     whole: WholeMap
@@ -192,12 +186,10 @@ class Posed(NamedTuple):
 def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     """Join the submaps that follow the map's pose, in order, by least squares.
 
-    If a landmark of a submap lies beyond the gate, the landmarks are discounted one by one as the
-    gate narrows, those that end beyond it are left out, and the rest is solved again. Where most of
-    a submap would be left out, or the rest is still contradictory, no single landmark is at fault:
-    Cauchy's loss on whole submaps and on the map, with all landmarks, finds the factor that is, and
-    the covariance is that of its weights. Raises NotACovarianceError, or NotDeterminedError where
-    the normal equations cannot be solved.
+    If a landmark lies beyond the gate, the landmarks are discounted as the gate narrows and those
+    beyond it left out. Where that is most of a submap, or the rest is still contradictory, the
+    fault is in a whole factor: Cauchy's loss on whole submaps and on the map finds it. Raises
+    NotACovarianceError, NotDeterminedError.
     """
     submaps = [each.without_nodes for each in pending]
     if not submaps:
@@ -222,10 +214,6 @@ def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
 
 
 def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolution:
-    """Solve plain least squares of the map and the submaps, with all landmarks.
-
-    Raises NotACovarianceError, NotDeterminedError.
-    """
     chain = core.Chain(whole)
     for each in submaps:
         chain.append(each.ids, each.mean, each.covariance)
@@ -239,7 +227,6 @@ def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolu
 
 
 def _join_robustly(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
-    """Join submaps robustly: one as a whole may be wrong, or the map itself."""
     island, _, _ = solve_island(_make_island(whole, submaps, DISPUTED))
     graph = island.graph
     ids = sorted(graph.landmarks)
@@ -248,7 +235,7 @@ def _join_robustly(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
 
 
 def is_majority(refused: int, known: int) -> bool:
-    """Whether so many known landmarks are refused that the fault is not in single ones."""
+    """Whether too many landmarks are refused for a fault in single ones."""
     return refused >= FEWEST and 2 * refused > known
 
 
@@ -257,7 +244,6 @@ def _largest_cost(dof: int) -> float:
 
 
 def _make_island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
-    """Make the island of the map, as a submap that begins at its origin, and the submaps."""
     chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
     taken = [Contribution(*SELF, k, k, each) for k, each in enumerate(chain)]
     graph, state = add_submaps(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
@@ -278,11 +264,9 @@ def _remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalM
 def compose_pose(whole: WholeMap, open_window: WholeMap | None) -> Posed:
     """Compose a map's pose with the window in progress: N(pose, covariance) of the robot.
 
-    Only the marginal of the window's landmarks is taken from the map, which is exact.
-    Known landmarks whose constraints the others contradict by more than GATE are left out of the
-    window's map, worst first. By Baarda's test of a single constraint, T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with
-    the multiplier z = S⁻¹ y is the fall of the cost without that constraint; it is χ²-distributed
-    with two degrees of freedom. Raises NotACovarianceError as `join_submap`.
+    The map's marginal of the window's landmarks suffices. Landmarks whose constraints the others
+    contradict by more than GATE are left out, worst first: T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with z = S⁻¹ y is
+    χ² of two degrees of freedom (Baarda). Raises NotACovarianceError.
     """
     if open_window is None:
         return Posed(PoseGaussian(*whole.pose()))

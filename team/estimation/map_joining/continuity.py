@@ -1,15 +1,14 @@
 """Seams: places where a robot's view changes at once although its odometry measures no motion.
 
-The landmarks of the last scans before a place and of the first scans behind it are seen from about
-one pose. Where a robot was carried off, or its odometry slips by metres, all of them are replaced.
-The evidence for a seam, the log-likelihood ratio of a robot elsewhere against one that overlooks
-landmarks, is
+Where a robot was carried off, or its odometry slips by metres, the landmarks of the scans before
+and behind a place differ. The evidence is the log-likelihood ratio of a robot elsewhere against one
+that overlooks landmarks,
 
-  ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
+ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
 The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam is
-between two submaps, or inside one, which then is spoilt. Landmarks with identities have a test of
-their own (`central.carried_off`).
+between two submaps, or inside one, which then is spoilt. Landmarks with identities:
+`central.carried_off`.
 """
 
 import math
@@ -46,9 +45,9 @@ Indices = Int64[np.ndarray, " _"]
 class Seam(NamedTuple):
     """A place at which a stream is cut.
 
-    before, after: numbers of the last submap before it and of the first one behind it; one between
-    is spoilt. begin_ns, end_ns: end of the former and beginning of the latter. evidence:
-    log-likelihood ratio.
+    before, after: numbers of the last submap before it and the first one behind it; one between is
+    spoilt. begin_ns, end_ns: end of the former, beginning of the latter. evidence: log-likelihood
+    ratio.
     """
 
     stream: Stream
@@ -64,8 +63,8 @@ def find_seam(
 ) -> Seam | None:
     """Find a seam of at least this evidence before a submap of a stream, or inside it.
 
-    With fewer than LEAST_BEFORE submaps before it none is found: a sensor whose views often change
-    at once shows no seams.
+    None with fewer than LEAST_BEFORE submaps before it: a sensor whose views often change at once
+    shows no seams.
     """
     if sequence - first_of(stream) < LEAST_BEFORE:
         return None
@@ -93,7 +92,7 @@ def find_seam(
 
 
 def _compare_inside(island: Island, submap: Joined) -> float:
-    """Return the most evidence of a seam at a scan SCANS or more from the submap's ends."""
+    """Return the most evidence at a scan SCANS or more from the submap's ends."""
     scans = _count_scans(submap)
     found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):
@@ -108,7 +107,7 @@ def _count_scans(submap: Joined) -> int:
 
 
 class _Side(NamedTuple):
-    """Nodes of the landmarks in the scans beside a place, and in all scans of that side."""
+    """Nodes of the landmarks beside a place, and in all scans of that side."""
 
     beside: Indices
     all: Indices
@@ -134,7 +133,7 @@ def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2
 def _compare_sides(
     island: Island, before: _Side, after: _Side, place: Float[np.ndarray, "2"]
 ) -> float:
-    """Compute the evidence of a seam between two sides; none with two common landmarks."""
+    """Compute the evidence between two sides; none with two common landmarks."""
     one, two = before.beside, after.beside
     if not len(one) or not len(two) or len(np.intersect1d(before.all, after.all)) > 1:
         return 0.0
@@ -153,7 +152,7 @@ def _compare_sides(
 def _mark_possible(
     island: Island, nodes: Indices, one: Indices, two: Indices
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "a b"]]:
-    """Return the nodes' positions, and which landmarks of two sides may be one."""
+    """Return the nodes' positions, and which may be one landmark."""
     mean, covariance = joint_marginal(island, nodes.tolist())
     points = mean.reshape(-1, 2)
     joint = Joint(points, covariance, np.zeros((len(nodes), len(nodes)), np.bool_))
@@ -168,7 +167,6 @@ def _mark_possible(
 def _mark_in_sector(
     points: Float[np.ndarray, "n 2"], of: Float[np.ndarray, "m 2"], reach: float
 ) -> Bool[np.ndarray, " n"]:
-    """Mark the points within reach of the origin, in the sector of other points' directions."""
     directions = np.sort(core.atan2(of[:, 1], of[:, 0]))
     gaps = np.diff(np.append(directions, directions[0] + 2.0 * math.pi))
     near = core.hypot(*points.T) <= reach

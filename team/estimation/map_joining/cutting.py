@@ -1,8 +1,6 @@
 """Parts of streams that are cut at seams (`continuity`), each a stream of its own in the fold.
 
-A cut breaks the chain of a stream's poses: the later part has no initial pose. The submap inside
-which the robot was carried off is spoilt, and refused. The cuts are part of the fold, so they are a
-function of the set.
+The later part has no initial pose; the submap inside which the robot was carried off is refused.
 """
 
 from collections.abc import Sequence
@@ -22,7 +20,7 @@ Member = TypeVar("Member", Contribution, InterRobotFactor)
 
 
 def cut_tick(tick: Tick, cuts: Sequence[Seam]) -> Tick:
-    """Assign the members of a tick to the parts of cut streams, and refuse spoilt submaps."""
+    """Assign the members of a tick to the parts of cut streams; refuse spoilt submaps."""
     submaps = cut_members(tick.contributions, cuts)
     spoilt = {each.key: SPOILT for each in submaps if _is_spoilt(each, cuts)}
     return replace(
@@ -35,7 +33,7 @@ def cut_tick(tick: Tick, cuts: Sequence[Seam]) -> Tick:
 
 
 def cut_members(members: Sequence[Member], cuts: Sequence[Seam]) -> list[Member]:
-    """Assign submaps, or inter-robot measurements from them, to the parts of cut streams."""
+    """Assign submaps, or their inter-robot measurements, to the parts of cut streams."""
     parts = [find_part(each.stream, each.sequence, cuts) for each in members]
     return [
         each if part == each.stream else replace(each, incarnation=part[1])

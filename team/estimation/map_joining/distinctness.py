@@ -1,19 +1,17 @@
 """Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps
-that look there, or in a part of the map that repeats another one; and streams that were lost.
+that look there, or in a repeated part of the map; and lost streams.
 
-`teamslam.team.estimation.association.verification.find_possible_duplicates` finds duplicates.
-
-A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time,
-elsewhere. The set contains no contradiction: from there on only odometry connects its submaps with
-the rest. The shape of the copy remains. For each boundary between two submaps of a stream beyond
-which it observes hardly any landmark of the rest, the landmarks first observed beyond it are
-aligned with all others by a rigid motion (`voting`). With n of them, N others in an area A, and
-points that match within r, the expected number of motions that match m or more by chance is
+A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time without
+a contradiction: from there on only odometry connects its submaps with the rest. The shape of the
+copy remains. For each boundary between submaps beyond which a stream observes hardly any landmark
+of the rest, the landmarks first observed beyond it are aligned with all others by a rigid motion
+(`voting`). With n of them, N others in an area A, and points that match within r, the expected
+number of motions that match m or more by chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
-since each pair on a pair defines one motion. The set does not determine whether a robot was carried
-off or the building repeats itself.
+since each pair on a pair defines one motion. Whether the building repeats itself the set does not
+determine.
 """
 
 import math
@@ -39,11 +37,10 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 
 def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
-    """Find the landmarks among these that only submaps of an uncertain heading have, ascending.
+    """Find the landmarks that only submaps of an uncertain heading have, ascending.
 
-    A covariance is linear in the heading. A point at distance d turned by an error θ moves by d (1
-    − cos θ) in a direction that the linearised covariance takes as certain: d/3 at the limit for a
-    rigid alignment (`alignment_heading_sigma`) and three standard deviations.
+    A point at distance d turned by θ moves by d (1 − cos θ) in a direction that the linearised
+    covariance takes as certain: d/3 at `alignment_heading_sigma` and three standard deviations.
     """
     best: dict[int, float] = {}
     for submap in island.graph.submaps:
@@ -55,13 +52,13 @@ def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
 
 
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
-    """Find the landmarks among these that nearly all submaps miss which look at their place,
-    ascending; none that an operator has judged. All are of the main island.
+    """Find the landmarks of the main island that nearly all submaps miss which look at their place,
+    ascending; none that an operator has judged.
 
-    A landmark of n < MOST submaps is missed where each landmark of MOST or more that any of these
-    has beside it has been observed by MOST n, and at least half of these have one. (A running map
-    drops a landmark that is not found again: `memory`.) The number of false landmarks that two
-    submaps agree on grows with the number of submaps; the share of submaps that find them does not.
+    A landmark of n < MOST submaps is missed where each landmark of MOST or more beside it has been
+    observed by MOST n, and at least half of its submaps have one beside it. The number of false
+    landmarks that two submaps agree on grows with the number of submaps; the share of submaps that
+    find them does not.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)
@@ -86,8 +83,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
 
 
 def find_lost_streams(island: Island) -> dict[Stream, float]:
-    """Find the streams with a heading standard deviation above `alignment_heading_sigma`; return
-    the largest one [rad] of each.
+    """Find the streams with a heading standard deviation above `alignment_heading_sigma`, with the
+    largest one [rad].
     """
     worst = {
         stream: max(heading_sigma(island, node) for node in nodes)
@@ -116,10 +113,10 @@ TRIED = 4
 class Repetition(NamedTuple):
     """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
-    ids: all landmarks that only these submaps have. pairs: those of them that match another one.
-    begin_ns, end_ns: the end of the last submap before the boundary, and of the stream's last one.
-    place: of the stream at the boundary (x, y) [m]. displacement: the move (x, y) [m] and turn
-    [rad] of that place if the pairs were one landmark each.
+    ids: landmarks that only these submaps have; pairs: those that match another one. begin_ns,
+    end_ns: the end of the last submap before the boundary, and of the stream's last one. place: at
+    the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad] if each pair were one
+    landmark.
     """
 
     stream: Stream
@@ -133,7 +130,7 @@ class Repetition(NamedTuple):
 
 
 def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
-    """Find the repetitions among these landmarks of an island, at most one of each stream."""
+    """Find the repetitions among landmarks of an island, at most one of each stream."""
     unnamed = sorted(id_ for id_ in ids if id_ >= UNNAMED)
     if not 2 * LEAST_PAIRS <= len(unnamed) <= MOST_POINTS:
         return []

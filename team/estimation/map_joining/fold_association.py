@@ -1,7 +1,5 @@
-"""Data association applied to the fold: merges landmarks, closures and islands in its graph.
-
-The decisions are those of `teamslam.team.estimation.association`. Each step is a function of the
-fold alone, which is a function of the set of submaps in canonical order; so are the decisions.
+"""Data association (`team.estimation.association`) applied to the fold: merges landmarks, closures
+and islands. Each step is a function of the fold alone.
 """
 
 from collections.abc import Sequence
@@ -47,7 +45,7 @@ AMBIGUITY_GROWTH = 1.25
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
-    """Associate the landmarks of a tick's submaps, in a fold that has unnamed ones."""
+    """Associate the landmarks of a tick's submaps where some are unnamed."""
     fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
     arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
@@ -69,7 +67,7 @@ def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
 
 
 def view_island(island: Island, landmarks: Landmarks) -> IslandView:
-    """View an island's landmarks as a joint Gaussian, in the order of their nodes."""
+    """View landmarks as a joint Gaussian, in the order of their nodes."""
     graph = island.graph
     ordered = sorted(graph.landmarks.items(), key=lambda each: each[1])
     nodes = np.array([node for _, node in ordered], np.int64)
@@ -89,7 +87,7 @@ def view_island(island: Island, landmarks: Landmarks) -> IslandView:
 
 
 class _IslandViews:
-    """The views of the islands, each computed once while its island does not change."""
+    """The views of the islands, computed once while an island does not change."""
 
     def __init__(self) -> None:
         self._of: dict[Stream, tuple[Island, IslandView]] = {}
@@ -119,7 +117,7 @@ def _track_island(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> F
 
 
 def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
-    """Merge the nodes of the landmarks that a view has merged, and iterate once."""
+    """Merge the nodes of merged landmarks, and iterate once."""
     if not view.ties:
         return fold
     landmarks, becomes = merge_sets(fold.landmarks, view.ties)
@@ -190,7 +188,7 @@ def _decide(
     kind: str,
     sides: tuple[Stream, Stream],
 ) -> Decision:
-    """Decide on a closure: one that failed a test, or was undone before, is deferred ("waits")."""
+    """Decide on a closure; one that failed, or was undone before, "waits"."""
     why = found.why
     if not why and fold.landmarks.was_undone(pairs):
         why = "it was undone before"
@@ -216,9 +214,9 @@ def _record(
     newer: tuple[tuple[Stream, int, int], ...],
     between: tuple[Stream, Stream],
 ) -> Fold:
-    """Record a deferred decision, or open an accepted one for audit and remove its deferred ones.
+    """Record a deferred decision; open an accepted one for audit.
 
-    The pairs are recorded by their smallest members; pairs with a named landmark are left out.
+    Pairs are recorded by their smallest members, without those of named landmarks.
     """
     waits = fold.landmarks.waits
     if decision.why:
@@ -251,10 +249,8 @@ def _merge_islands(
     second_from_first: Float[np.ndarray, "3"],
     decision: Decision,
 ) -> Fold:
-    """Merge two islands; search the streams that change their frame for closures.
-
-    The frame is that of the first one by `precedence`. The fold is
-    unchanged where the merged island has no solution.
+    """Merge two islands in the frame of the first by `precedence`, and search the moved streams for
+    closures; unchanged without a solution.
     """
     landmarks, becomes = merge_sets(fold.landmarks, ties)
     renamed = {}

@@ -2,15 +2,13 @@
 rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
-prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g that a sound factor does not exceed, and
-g (2 − g/χ²) beyond, whose slope, the weight, is (g/χ²)². A factor enters with a wide gate that
-narrows with each iteration since it was added, so that a true loop closure is not taken for an
-outlier before the chain has adapted to it. The prior of a robot's own bias is Student's t of one
-degree of freedom, whose loss is 2 log(1 + χ²).
+prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g, and g (2 − g/χ²) beyond, whose slope,
+the weight, is (g/χ²)². The gate of a new factor is wide and narrows with each iteration, so that a
+true loop closure is not taken for an outlier before the chain has adapted to it. The prior of a
+robot's own bias is Student's t of one degree of freedom, with loss 2 log(1 + χ²).
 
-Each landmark of a submap has a gate and a weight of its own as well, so that a mistaken landmark
-does not break the robot's chain. The weight enters as additional variance of that landmark alone.
-`core.Estimate` computes all of these.
+Each landmark of a submap also has a gate and a weight, which enters as additional variance of that
+landmark alone. `core.Estimate` computes all of these.
 """
 
 import math
@@ -42,7 +40,7 @@ STUCK = math.inf
 
 
 def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Compute powers by repeated squares: a C library's differ from processor to processor."""
+    """Compute powers by repeated squares: a C library's differ between processors."""
     powers, rest = np.ones(len(exponents)), exponents
     while rest.any():
         powers = np.where(rest & 1, powers * base, powers)
@@ -53,7 +51,7 @@ def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray
 def robust_scale(
     age: Int64[np.ndarray, " k"], start: float, decay: float
 ) -> Float[np.ndarray, " k"]:
-    """Widening of the gates of factors after `age` iterations: max(1, start · decay^age)."""
+    """Widening of the gates after `age` iterations: max(1, start · decay^age)."""
     if decay >= 1.0:  # it never narrows
         return np.maximum(1.0, start * _powers(decay, age))
     narrowing = _narrowing(start, decay)
@@ -63,7 +61,7 @@ def robust_scale(
 
 @lru_cache
 def _narrowing(start: float, decay: float) -> Float[np.ndarray, " k"]:
-    """max(1, start · decay^age) of each age, up to the first one at which it is 1."""
+    """max(1, start · decay^age) of each age, up to the first 1."""
     count = 1
     while start * _powers(decay, np.array([count - 1]))[0] > 1.0:
         count += 1
@@ -95,22 +93,19 @@ FULL_AGE = 1_000_000
 class JoinSettings:
     """Settings of map joining.
 
-    iterations_per_tick: iterations of `fold_submaps`. robust: whether factors beyond their
-    gates are discounted; otherwise least squares. The gates of χ² are wider by robust_start² at
-    first, and by robust_decay² less with each iteration, until the factor is 1. submap_gate: factor
-    on the gate of a submap as a whole. landmark_gate: χ² of two numbers from which a submap's
-    landmark is discounted.
-    covariance_factor: factor on every submap's covariance. max_iterations, step_tolerance: a full
-    solve ends when no unknown changes by more than step_tolerance [m, rad], or after
-    max_iterations. alignment_confidence: quantile of the χ² test for a merge of islands.
-    alignment_heading_sigma: for the same, largest standard deviation [rad] of the heading from the
-    shape of the shared landmarks. bias_sigma: scale of Student's t prior on each error that a
-    robot's submaps share. common_bias_sigma: standard deviation of those that all robots share, in
-    addition; "marker": the share of the range by which all robots measure one landmark too far.
-    joined_ranges: whether errors of ranges are proportional to the range in the joined map
+    iterations_per_tick: of `fold_submaps`. robust: whether factors beyond their gates are
+    discounted. The gates of χ² are wider by robust_start² at first, and by robust_decay² less with
+    each iteration, down to 1. submap_gate: factor on the gate of a submap. landmark_gate: χ² of two
+    numbers from which a submap's landmark is discounted. covariance_factor: on every submap's
+    covariance. max_iterations, step_tolerance: end of a full solve, by number of iterations or
+    largest change [m, rad]. alignment_confidence: quantile of the χ² test for a merge of islands.
+    alignment_heading_sigma: for the same, largest `Alignment.heading_sigma` [rad]. bias_sigma:
+    scale of Student's t prior on each error of a robot's submaps. common_bias_sigma: standard
+    deviation of those that all robots share; "marker": share of the range. joined_ranges: whether
+    range errors are proportional to the range in the joined map
     (`core.SubmapFactor.at_joined_ranges`). landmark_sigma: standard deviation [m], per direction,
-    of the measured point, the same for all robots, about the landmark's place: part of a map's
-    covariance, not of the measurements' weights.
+    of the measured point about the landmark's place: part of a map's covariance, not of the
+    weights.
     """
 
     iterations_per_tick: int = 2
@@ -150,10 +145,9 @@ def ages(count: int) -> Int64[np.ndarray, " count"]:
 
 @dataclass(frozen=True, eq=False)
 class Island:
-    """One frame: its graph, the state (poses and landmarks by node) and the ages of the factors.
+    """One frame: its graph, the state by node, and the ages of the factors.
 
-    age, sighting_age: number of iterations since each submap and inter-robot measurement was added;
-    the robust scale follows from it.
+    age, sighting_age: iterations since each submap and inter-robot measurement was added.
     """
 
     graph: Graph
@@ -164,7 +158,7 @@ class Island:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " F"]:
-        """Widening of each submap's gates at its age; PLAIN for a saved map (see `saved_maps`)."""
+        """Widening of each submap's gates; PLAIN for a saved map (`saved_maps`)."""
         scale = self._scale_at(self.age)
         if self.settings.robust:
             scale[self.graph.saved_maps] = PLAIN
@@ -217,9 +211,7 @@ class Island:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
     def moved(self, step: Values, older: int = 1) -> "Island":
-        """Add `step` to the state, headings wrapped to (−π, π], and `older` iterations to every
-        factor.
-        """
+        """Add `step` to the state, headings wrapped to (−π, π], and `older` to the ages."""
         state = self.state + step
         headings = state[self.graph.headings]
         state[self.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
@@ -228,7 +220,7 @@ class Island:
 
     @cached_property
     def selected_covariance(self) -> Values:
-        """Entries of the covariance in the layout of the graph's pattern; fixed nodes: identity."""
+        """Covariance entries in the layout of the graph's pattern; fixed nodes: identity."""
         with self.determined():
             return self.estimate.selected_covariance
 
@@ -250,9 +242,7 @@ class Island:
 
     @cached_property
     def resting_spread(self) -> Float[np.ndarray, "r n"]:
-        """G R of the landmarks at rest, with their gain G and R Rᵀ of the nodes that they depend
-        on.
-        """
+        """G R of the landmarks at rest: gain G, R Rᵀ of the nodes that they depend on."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -271,7 +261,7 @@ class Island:
 
 
 def age_factors(island: Island, iterations: int | None) -> Island:
-    """Add iterations to the age of every factor; None: every factor begins anew."""
+    """Add iterations to the age of every factor; None: begin anew."""
     if iterations is None:
         age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
     else:
@@ -321,10 +311,9 @@ def likely_limit(dof: int) -> float:
 
 
 def is_solvable(island: Island) -> bool:
-    """Whether the island has a solution: finite numbers, every unknown determined.
+    """Whether the numbers are finite and every unknown determined.
 
-    The pivots of the factorisation are judged by their diagonal entries (`core.Cholesky`), so units
-    and the size of covariances have no influence.
+    Pivots are judged by their diagonal entries (`core.Cholesky`), so units have no influence.
     """
     try:
         with np.errstate(all="ignore"):
@@ -338,8 +327,7 @@ def iterate_tick(island: Island) -> Island:
     """Apply the iterations of one tick.
 
     With condensed submaps, iterations after the first are omitted whose step is shorter than STILL:
-    a function of the state, and condensing displaces the map by more. A robust scale that still
-    narrows continues at the next tick.
+    condensing displaces the map by more.
     """
     damping = 0.0
     bounded = island.graph.condensed is not None
@@ -351,17 +339,16 @@ def iterate_tick(island: Island) -> Island:
 
 
 def _stands_still(island: Island) -> bool:
-    """Whether a full step is shorter than STILL: gᵀA⁻¹g bounds how far any number moves."""
+    """Whether a full step is shorter than STILL, bounded by gᵀA⁻¹g."""
     with island.determined():
         return island.estimate.squared_length <= STILL * len(island.graph.submaps)
 
 
 def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
-    """Take one step: return the island, an iteration older, the next damping, and the full step's
-    largest change.
+    """Take one step: return the island, the next damping, and the full step's largest change.
 
     The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
-    of it; else a more damped one. Where no damping helps the state stays, and the next damping is
+    of it; else a more damped one. Where no damping helps the state stays and the next damping is
     STUCK, from which the next step begins undamped.
     """
     with island.determined():
@@ -378,9 +365,9 @@ def solve_island(island: Island) -> tuple[Island, int, float]:
     """Solve in full from this state; return also the number of iterations and the last change [m,
     rad].
 
-    Without robust weights first: where no factor of that solution is beyond its gate, it is the
-    robust solution. Else the gates of all factors narrow anew. A solve ends when converged, after
-    `max_iterations`, or where no step lowers the cost; the last change shows whether it converged.
+    Least squares first: it is the robust solution where no factor is beyond its gate. Else the
+    gates narrow anew. A solve ends when converged, after `max_iterations`, or where no step lowers
+    the cost.
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):
@@ -394,10 +381,7 @@ def solve_island(island: Island) -> tuple[Island, int, float]:
 
 
 def _has_outliers(island: Island) -> bool:
-    """Whether a factor or a landmark of a submap is beyond its gate.
-
-    Priors have none: their loss is the same in both solves.
-    """
+    """Whether a factor or landmark is beyond its gate; priors have none."""
     at = island.estimate
     weights = at.weights, at.landmark_weights, at.sighting_weights
     return any((each < 1.0).any() for each in weights)
@@ -422,10 +406,9 @@ def solve_with_fixed(
 ) -> Island:
     """Move one number of the state by `by` and solve for all others given that.
 
-    With the step p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose
-    component along w is the remaining displacement: the point on the constraint with the least cost
-    to second order. An iteration whose squared length (p + λ q)ᵀ A (p + λ q), in standard
-    deviations, is below `shortest` is the last one.
+    With p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose component along
+    w is the remaining displacement. The last one has a squared length (p + λ q)ᵀ A (p + λ q), in
+    standard deviations, below `shortest`.
     """
     missing = by
     for _ in range(iterations):
@@ -443,7 +426,7 @@ def solve_with_fixed(
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Compute mean and joint covariance of `nodes`, in order; a fixed node has covariance 0."""
+    """Compute mean and joint covariance of `nodes`; 0 for a fixed node."""
     graph = island.graph
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
     unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])

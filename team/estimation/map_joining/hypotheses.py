@@ -5,15 +5,14 @@ jumps between two submaps. Its evidence is the cost that they remove,
 
     e = min_x cost(x) − min_{x, θ} cost(x, θ),
 
-χ² with dim θ degrees of freedom where nothing is wrong. Both minima have the robust loss, so that
-one misfit does not hide another. Hypotheses are proposed by a scan of single submaps at the map's
-robust scales, then solved at the final ones. The best one by evidence per degree of freedom is
-accepted and stays in the graph, and the others are tested again beside it: what it explains is not
-reported twice.
+χ² with dim θ degrees of freedom where nothing is wrong; both minima have the robust loss.
+Hypotheses are proposed by a scan of single submaps, then solved at the final robust scales. The
+best one by evidence per degree of freedom stays in the graph while the others are tested again: its
+effects are not reported twice.
 
-Real data have errors beyond the model. The evidence is therefore divided by the covariance scale
-that the rest of the submaps shows (an F test but for the scatter of the scale), and an effect must
-also be larger than that which a single submap resolves.
+Real data have errors beyond the model, so the evidence is divided by the covariance scale of the
+other submaps (an F test but for the scatter of the scale), and an effect must be larger than a
+single submap resolves.
 """
 
 import math
@@ -90,7 +89,7 @@ ALL = slice(None)
 
 class Sights(NamedTuple):
     """Observations of one landmark, in order of time: the submap's place in the graph, position in
-    the map [m], and its covariance (xx, xy, yy) [m²] about the landmark's place.
+    the map [m], and its covariance (xx, xy, yy) [m²].
     """
 
     places: Places
@@ -100,9 +99,9 @@ class Sights(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A cause with the graph that has it, solved: what it removes, and its degrees of freedom.
+    """A cause: the solved graph, the cost that it removes, and its degrees of freedom.
 
-    robots: those that observe the less frequent place of a landmark, or jump.
+    robots: those that observe the less frequent place, or jump.
     """
 
     cause: SplitCause
@@ -117,8 +116,8 @@ class Hypothesis(NamedTuple):
 
 
 def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
-    """Tabulate the observations of each named landmark whose χ² about one place is above a
-    bound: no split removes more.
+    """Tabulate the observations of each named landmark whose χ² about one place is
+    above a bound.
     """
     graph = island.graph
     points, spread = island.estimate.observations
@@ -151,7 +150,6 @@ def _medians(
     first: Int64[np.ndarray, " g"],
     counts: Int64[np.ndarray, " g"],
 ) -> Float[np.ndarray, "g k"]:
-    """Compute the medians of consecutive groups of rows."""
     group = np.repeat(np.arange(len(first)), counts)
     ordered = np.column_stack([each[np.lexsort((each, group))] for each in values.T])
     middle: Values = 0.5 * (ordered[first + (counts - 1) // 2] + ordered[first + counts // 2])
@@ -159,7 +157,7 @@ def _medians(
 
 
 class _Two(NamedTuple):
-    """A proposal: the observations that have the second place, and its evidence in the scan."""
+    """The observations at the second place, and the scan's evidence."""
 
     second: Bool[np.ndarray, " n"]
     evidence: float
@@ -168,14 +166,12 @@ class _Two(NamedTuple):
 def _chi2_about(
     sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
 ) -> Costs:
-    """Evaluate the χ² of each of some observations about a place, or about each of k places (k × 1
-    × 2).
-    """
+    """Evaluate the χ² of observations about a place, or about k places (k × 1 × 2)."""
     return _chi2_of(sights.points[own] - point, sights.spread[own])
 
 
 def _chi2_of(away: Float[np.ndarray, "*k n 2"], spread: Float[np.ndarray, "n 3"]) -> Costs:
-    """Evaluate the χ² of differences, at most FAR."""
+    """χ² of differences, at most FAR."""
     x, y = away[..., 0], away[..., 1]
     xx, xy, yy = spread.T
     chi2: Costs = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
@@ -184,19 +180,18 @@ def _chi2_of(away: Float[np.ndarray, "*k n 2"], spread: Float[np.ndarray, "n 3"]
 
 
 def _centre(sights: Sights, own: Bool[np.ndarray, " n"]) -> Values:
-    """Median place of some observations [m]."""
     return median(sights.points[own])
 
 
 def median(values: Float[np.ndarray, "..."]) -> Values:
-    """Compute the median over the first axis, for a few values faster than `numpy.median`."""
+    """Median over the first axis; for a few values faster than `numpy.median`."""
     ordered, n = np.sort(values, axis=0), len(values)
     middle: Values = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
     return middle
 
 
 def _running_medians(values: Values) -> Values:
-    """Compute the medians of the first 1, 2, … n values."""
+    """Medians of the first 1, 2, … n values."""
     ordered: list[float] = []
     medians = []
     for k, value in enumerate(values.tolist()):
@@ -206,13 +201,13 @@ def _running_medians(values: Values) -> Values:
 
 
 def _least_side(n: int) -> int:
-    """Fewest of n observations at a place: a few misread ones are no second place."""
+    """Fewest of n observations at a place: fewer may be misread."""
     return max(LEAST_SIDE, math.ceil(STRAY * n))
 
 
 def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    """Whether both places have enough observations: a share of STRAY, or two that agree with each
-    other and are most of those that are elsewhere. Misread ones are scattered.
+    """Whether both places have enough observations: a share of STRAY, or two that agree and are
+    most of those elsewhere. Misread ones are scattered.
     """
     few = _less_frequent(second)
     count = int(few.sum())
@@ -226,12 +221,11 @@ def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
 
 
 def _less_frequent(second: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Return the observations of the less frequent of two places."""
     return second if 2 * int(second.sum()) <= len(second) else ~second
 
 
 def _price(second: Bool[np.ndarray, " n"]) -> float:
-    """Return the cost, as χ², of a choice of k of n: 2 log((n + 1) n!/(k! (n − k)!)).
+    """χ² of the choice of k of n: 2 log((n + 1) n!/(k! (n − k)!)).
 
     Every k is equally likely beforehand, and so is every choice with one k.
     """
@@ -241,7 +235,7 @@ def _price(second: Bool[np.ndarray, " n"]) -> float:
 
 
 def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _Two:
-    """Evaluate a split: χ² about one place, less χ² about two and the price of the choice."""
+    """χ² about one place, less χ² about two and the price of the choice."""
     everything = np.ones(len(second), np.bool_)
     one = float(_chi2_about(sights, _centre(sights, everything)).sum())
     parts = (
@@ -271,10 +265,9 @@ def change_of(sights: Sights) -> _Two | None:
 
 
 def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
-    """Find two places among a landmark's observations, whatever their order; None where none has
-    enough evidence.
+    """Find two places among a landmark's observations, whatever their order.
 
-    scale: the covariance scale, by which the χ² that free assignments remove by chance is larger.
+    scale: the covariance scale, which also scales the χ² that free assignments remove by chance.
     """
     n = len(sights.places)
     one = _chi2_about(sights, median(sights.points))
@@ -298,7 +291,7 @@ def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """The island in which all accepted causes are unknowns, and its covariance scale."""
+    """The island with all accepted causes as unknowns, and its covariance scale."""
 
     island: Island
     scale: float
@@ -315,7 +308,6 @@ def _solved(island: Island) -> _Solved:
 
 
 def _difference(island: Island, before: int, after: int) -> tuple[Values, Covariance]:
-    """Return the difference of two nodes of one size, with its covariance."""
     mean, P = joint_marginal(island, [before, after])
     k = len(mean) // 2
     difference = mean[k:] - mean[:k]
@@ -324,7 +316,7 @@ def _difference(island: Island, before: int, after: int) -> tuple[Values, Covari
 
 
 def _begin_ns(island: Island, place: int) -> int:
-    """Return when a submap began: the end of the one before it in its stream; 0 for the first."""
+    """Return the end of the preceding submap of the stream; 0 for the first."""
     own = island.graph.submaps[place].contribution
     ends = (
         each.contribution.end_ns
@@ -335,7 +327,7 @@ def _begin_ns(island: Island, place: int) -> int:
 
 
 def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    """Whether another named landmark is at the second place: its number was misread there."""
+    """Whether another named landmark is at the second place."""
     graph, state = base.island.graph, base.island.state
     gate = base.scale * LANDMARK_GATE
     return any(
@@ -346,12 +338,10 @@ def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, "
 
 
 def _robots_of(island: Island, places: Places) -> frozenset[str]:
-    """Return the robots of some submaps of the graph."""
     return frozenset(island.graph.submaps[at].contribution.robot for at in places.tolist())
 
 
 def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
-    """Solve the most likely hypotheses of a landmark with two places."""
     enough = base.scale * level
     sights = sights_of(base.island, enough)
     proposals: list[tuple[float, int, SplitCause, Bool[np.ndarray, " n"]]] = []
@@ -398,10 +388,9 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
-    """Solve the hypotheses that a robot was carried off in, before or after a submap that disagrees
-    with the rest.
+    """Solve the hypotheses of a jump before or after a submap that disagrees with the rest.
 
-    A jump at a seam removes no more cost than the graph without the submap, which is solved first.
+    A jump removes no more cost than the graph without the submap, which is solved first.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -453,7 +442,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 def _motion_beyond(
     island: Island, start: int, end: int, own: LocalMap
 ) -> tuple[Values, Covariance]:
-    """Return the motion from one pose to another less a submap's own, in the map's frame."""
+    """Return the motion between poses minus a submap's own, in the map's frame."""
     mean, P = joint_marginal(island, [start, end])
     predicted = compose(mean[:3], own.end_pose)
     s, c = core.sin_and_cos(float(mean[2]))
@@ -471,8 +460,8 @@ def _motion_beyond(
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     """Propose that one number of two landmarks spoils submaps that observed both.
 
-    Such a submap has the landmark between the two and its path bent: of the submaps with a landmark
-    elsewhere, most have the same one worst. The second place has two numbers in each of them.
+    Their path is bent and the landmark lies between the two: most of them have the same landmark
+    worst. The second place has two numbers in each.
     """
     island, graph = base.island, base.island.graph
     chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
@@ -515,7 +504,7 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
 
 
 def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
-    """Whether the evidence is beyond chance, and the effect beyond its standard deviations."""
+    """Whether the evidence is beyond chance, and the effect beyond its scatter."""
     sizes = [(math.hypot(*each.value[:2]), max(each.sigma[:2]))]
     sizes += [
         (abs(turn), sigma) for turn, sigma in zip(each.value[2:], each.sigma[2:], strict=True)
@@ -526,8 +515,8 @@ def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
 
 
 def explain(island: Island) -> tuple[list[Hypothesis], Island]:
-    """Find landmarks with two places, and robots that were carried off; return also the island in
-    which these are unknowns.
+    """Find landmarks with two places and robots that were carried off, and the island in which
+    these are unknowns.
     """
     base = _solved(robust(island))
     graph = base.island.graph
@@ -552,10 +541,9 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
 def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
     """Drop repetitions, and the apparent effects of another fault.
 
-    A robot that seems to have been carried off beside one number of two landmarks, which bends
-    paths, was not. Nor was one at several places, unless a submap before or after each agrees with
-    the map: its measurements were wild for a while, and a second place of a landmark that it
-    alone observes is one of them.
+    A jump beside one number of two landmarks is the bent path. A robot at several places was not
+    carried off unless a submap before or after each agrees with the map: its measurements were wild
+    for a while, as is a second place that it alone observes.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
     wild = {
@@ -575,9 +563,7 @@ def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list
 
 
 def _is_beside_sound(jump: Hypothesis, base: _Solved, level: float) -> bool:
-    """Whether a submap of the robot that ends or begins at a jump agrees with the map: the other
-    one may have a scan beyond the jump.
-    """
+    """Whether a submap beside a jump agrees with the map; the other may have a scan beyond it."""
     island = base.island
     costs = zip(island.graph.submaps, terms(island).submaps, strict=True)
     return any(

@@ -1,15 +1,14 @@
 """The team's map as a fold over its submaps in their canonical order.
 
-Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over all submaps of
-all robots, and over the inter-robot measurements between their pose nodes. The fold takes the
-submaps by ticks, each with the inter-robot measurements from it; it is a pure function of their
-order and of the ticks' boundaries. A stream with an unknown initial pose is an island of its own
+Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over the submaps of
+all robots, and over the inter-robot measurements between their pose nodes. The fold is a pure
+function of the order and the ticks' boundaries. A stream with an unknown initial pose is an island
 until shared landmarks and inter-robot measurements tie it to the main island.
 
-A tick of a fold with one island and named landmarks adds nodes and factors and iterates. The other
-steps run under a condition on the fold's contents: tests of saved maps (`Fold.has_maps`),
-association, cuts and audits (`Fold.has_unnamed`), condensed submaps (`Fold.condensed_count`),
-merging (several islands), and the search for another minimum (a suspicious cost).
+A tick of a fold with one island and named landmarks adds nodes and factors and iterates. Other
+steps have a condition: tests of saved maps (`Fold.has_maps`), association, cuts and audits
+(`Fold.has_unnamed`), condensed submaps (`Fold.condensed_count`), merging (several islands), and the
+search for another minimum (a suspicious cost).
 """
 
 import math
@@ -103,7 +102,7 @@ PATIENCE = 1.1
 
 
 class NotCanonicalError(ValueError):
-    """A submap does not follow the ones before it in the canonical order."""
+    """A submap is out of the canonical order."""
 
     def __init__(self, contribution: Contribution) -> None:
         super().__init__(
@@ -140,10 +139,10 @@ class LateStartError(ValueError):
 class Tick:
     """The contents of one tick, in canonical order.
 
-    contributions: the submaps. sightings: the inter-robot measurements from their poses. starts:
-    the initial poses of the streams whose first submap is among them. outside: reason for each
-    submap refused in advance (beyond a bound). set_aside: messages about other refusals. verdicts:
-    an operator's decisions on landmarks of these submaps or of earlier ones.
+    sightings: the inter-robot measurements from the submaps' poses. starts: initial poses of the
+    streams that begin here. outside: reason for each submap refused in advance. set_aside: messages
+    about other refusals. verdicts: an operator's decisions on landmarks of these submaps or earlier
+    ones.
     """
 
     contributions: Sequence[Contribution]
@@ -156,7 +155,7 @@ class Tick:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """A closure that may still be undone: the fold before it, and the ticks from it on."""
+    """A closure that may be undone: the fold before it, and the ticks since."""
 
     opened: Opened
     before: "Fold"
@@ -167,21 +166,19 @@ class Audit:
 class Fold:
     """The islands solved so far, and the bookkeeping of their submaps.
 
-    home: island (a key of `islands`) of each stream. reasons: why an island other than the main one
-    is not merged, by its frame. joined: each merge and its certainty, by the former frame.
-    warnings: signs of another minimum of the full solution. rival_m: distance [m] of another
-    minimum that is about as likely; None without one. waiting: inter-robot measurements
-    between two islands, in canonical order. judged: number of submaps of two islands at their last
-    failed merge attempt, and its reason. searched_at: number of submaps of an island at its last
-    failed search for a lower minimum. iterations, change: iterations and last step [m, rad] of the
-    main island's last full solution. refused: submaps that are not in the map, in canonical order,
-    with the reason (`refusal`). motion_only: submaps of which only the motion is in the map.
-    left_out: inter-robot measurements with which the map has no solution. set_aside: other refusals
-    in words. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
-    still be undone (`auditing`). ambiguous: number of submaps of a stream's island and another one
-    at their last attempt that several alignments passed.
-    cuts: seams at which streams are cut into parts, each a stream of
-    its own here (`continuity`).
+    home: island (a key of `islands`) of each stream. reasons: why an island is not merged, by its
+    frame. joined: each merge and its certainty, by the former frame. warnings: signs of another
+    minimum of the full solution. rival_m: distance [m] of another minimum that is about as likely.
+    waiting: inter-robot measurements between two islands. judged: number of submaps of two islands
+    at their last failed merge attempt, and its reason. searched_at: number of submaps of an island
+    at its last failed search for a lower minimum. iterations, change: of the main island's last
+    full solution [m, rad]. refused: submaps that are not in the map, with the reason (`refusal`).
+    motion_only: submaps of which only the motion is in the map. left_out: inter-robot measurements
+    with which the map has no solution. set_aside: other refusals in words. landmarks: the sets of
+    unnamed landmarks, with the evidence. audits: closures that may be undone (`auditing`).
+    ambiguous: number of submaps of a stream's island and another one at their last attempt that
+    several alignments passed. cuts: seams at which streams are cut into parts, each a stream here
+    (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -228,8 +225,8 @@ class Fold:
 
     @cached_property
     def main_key(self) -> Stream | None:
-        """Key of the island with a known initial pose and a robot, else of one with a saved map and
-        a robot, else of the one with the smallest stream, of a robot if there is any.
+        """Key of the island with a known initial pose and a robot, else with a saved map and a
+        robot, else with the smallest stream, of a robot if possible.
         """
         robots = sorted(stream for stream in self.home if not is_map(stream))
         placed = {self.home[robot] for robot in robots}
@@ -247,11 +244,10 @@ class Fold:
 
     @property
     def frame(self) -> Stream | None:
-        """The stream whose start fixes the main island's frame; None before any submap.
+        """The stream whose start fixes the main island's frame.
 
-        It is one with a known initial pose, else any one of the island; of several a saved map,
-        else the smallest. All known initial poses are given in one frame. That of a saved map with
-        a known start is the survey's.
+        One with a known initial pose (all are given in one frame), else one with a saved map, else
+        any; of several the smallest. That of a saved map with a known start is the survey's.
         """
         if self.main_key is None:
             return None
@@ -260,7 +256,7 @@ class Fold:
         return SURVEYED if is_map(frame) and frame in self.starts else frame
 
     def island(self, robot: str, incarnation: int) -> Island:
-        """Return the island of a stream. Raises KeyError for a stream without submaps."""
+        """Return the island of a stream. Raises KeyError."""
         return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
@@ -270,7 +266,7 @@ class Fold:
         return self.islands[self.home[stream]].graph.next_sequence(stream)
 
     def latest_part(self, stream: Stream) -> Stream:
-        """Return the newest part of a stream in the fold, the stream itself unless it is cut."""
+        """Return the newest part of a stream that may be cut."""
         return max((each for each in self.home if whole_of(each) == stream), default=stream)
 
 
@@ -293,10 +289,10 @@ def fold_submaps(
     """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands where
     possible.
 
-    contributions: submaps in canonical order, after all folded ones and without a gap in a stream;
-    else NotCanonicalError or GapError is raised. Islands without new submaps keep their state.
-    sightings: the inter-robot measurements from these submaps; each is a factor from the tick on in
-    which both of its pose nodes are in one island.
+    contributions: in canonical order, after all folded ones and without a gap in a stream; else
+    raises NotCanonicalError or GapError. sightings: the inter-robot measurements from these
+    submaps, each a factor from the tick on in which both of its nodes are in one island. Islands
+    without new submaps keep their state.
     """
     _check_order(fold, contributions)
     home = dict(fold.home)
@@ -342,10 +338,10 @@ def fold_submaps(
 
 
 def compact_fold(fold: Fold) -> Fold:
-    """Drop the values of a fold that can be computed again from it, for a checkpoint.
+    """Drop the values of a fold that can be computed again, for a checkpoint.
 
-    It shares the submaps with the folds before and after it. Of its own it has the state, the
-    graph's nodes and the condensed factor, whose symmetric matrices are packed.
+    The submaps are shared with other folds; the state, the graph's nodes and the packed condensed
+    factor remain.
     """
     islands = {}
     for key, island in fold.islands.items():
@@ -356,10 +352,9 @@ def compact_fold(fold: Fold) -> Fold:
 
 
 def solve_fold(fold: Fold, settings: JoinSettings) -> Fold:
-    """Solve every island in full; `iterations` and `change` describe the end of the solve.
+    """Solve every island in full.
 
-    `warnings` reports other minima, and islands without a full solution, which keep the state of
-    the last tick.
+    `warnings` reports other minima, and islands without a full solution, which keep their state.
     """
     if fold.main_key is None:
         return fold
@@ -403,8 +398,8 @@ def _separate_moved(
 ) -> Fold:
     """Separate the landmarks that have moved since a saved map from their former places.
 
-    The worst one first; its island is solved again before the next one is tested. newest: the
-    submaps whose landmarks are tested; None: all.
+    The worst first, with a solution before the next test. newest: the submaps whose landmarks are
+    tested; None: all.
     """
     islands = dict(fold.islands)
     for key, island in fold.islands.items():
@@ -423,7 +418,7 @@ def _separate_moved(
 
 
 def _test_saved_places(fold: Fold) -> Fold:
-    """Test the landmarks of saved maps anew, in a full solution: those apart, then the others."""
+    """Test the landmarks of saved maps anew, in a full solution, those apart first."""
     islands = dict(fold.islands)
     for key, island in fold.islands.items():
         with suppress(*UNSOLVABLE):
@@ -454,7 +449,7 @@ def _check_order(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _merge_all(fold: Fold, at_last: bool = False) -> Fold:
-    """Merge islands while any two can be merged, into the main one or the smallest frame.
+    """Merge islands while possible.
 
     A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
     """
@@ -484,8 +479,8 @@ def _merge_all(fold: Fold, at_last: bool = False) -> Fold:
 
 
 def precedence(fold: Fold, key: Stream) -> tuple[bool, bool, bool, Stream]:
-    """Order of the islands by whose frame stays in a merge: one with known initial poses, one with
-    a saved map, the main one, the smallest.
+    """Order of islands by whose frame stays in a merge: known initial poses, a saved map, the main
+    one, the smallest.
     """
     streams = fold.islands[key].graph.streams
     started, saved = any(s in fold.starts for s in streams), any(map(is_map, streams))
@@ -497,7 +492,7 @@ def _frame_of(streams: Collection[Stream]) -> Stream:
 
 
 def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
-    """Merge two islands; the record of the merge is filed under the vanished frame."""
+    """Merge two islands; record the merge under the vanished frame."""
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
     islands[key] = found.best.island
     streams = sorted(fold.islands[other_key].graph.streams)
@@ -518,9 +513,7 @@ def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> F
 
 
 def _search_suspicious(fold: Fold) -> Fold:
-    """Search islands of suspicious cost for a lower minimum, each time they have grown by
-    PATIENCE.
-    """
+    """Search islands of suspicious cost for a lower minimum, when grown by PATIENCE."""
     islands, searched_at = dict(fold.islands), dict(fold.searched_at)
     for key, island in fold.islands.items():
         size = len(island.graph.submaps)

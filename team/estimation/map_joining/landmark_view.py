@@ -1,8 +1,7 @@
 """Landmarks of an island by id, nodes and those at rest alike.
 
-For a landmark at rest, x = means + gain d + e with e ~ N(0, C): its mean follows from the state of
-the condensed factor's nodes, its covariances from theirs, Cov(x, z) = gain Cov(d, z) and Cov(x, x')
-= C + gain Cov(d, d) gainᵀ.
+For a landmark at rest, x = means + gain d + e with e ~ N(0, C): Cov(x, z) = gain Cov(d, z) and
+Cov(x, x') = C + gain Cov(d, d) gainᵀ.
 """
 
 from collections.abc import Sequence
@@ -105,9 +104,9 @@ def joints(
 def _with_resting(
     island: Island, covariance: Matrix, with_boundary: Float[np.ndarray, "n b"], at: Indices
 ) -> Float[np.ndarray, "m m"]:
-    """Extend the joint covariance of some numbers by landmarks at rest.
+    """Extend a joint covariance by landmarks at rest.
 
-    with_boundary: their covariance with the nodes of the condensed factor.
+    with_boundary: its covariance with the nodes of the condensed factor.
     """
     rest = resting_of(island)
     numbers = places(2 * np.arange(len(rest.ids) + 1), at)
@@ -120,7 +119,7 @@ def _with_resting(
 def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.ndarray, "n b"]]:
     """Compute the joint covariance of nodes, and that with the condensed factor's nodes.
 
-    It is known from the selected inverse among the latter; other nodes take a solution each.
+    The selected inverse has the latter; other nodes take a solution each.
     """
     graph, old = island.graph, island.graph.condensed
     assert old is not None
@@ -144,10 +143,7 @@ def _beside_boundary(island: Island, nodes: Indices) -> tuple[Matrix, Float[np.n
 def _sorted_out(
     island: Island, ids: Sequence[int]
 ) -> tuple[Bool[np.ndarray, " L"], Indices, Indices]:
-    """Split landmarks: marks of nodes, their nodes, and the places of the others at rest.
-
-    Raises KeyError for an unknown id.
-    """
+    """Split landmarks: marks of nodes, the nodes, places of those at rest. Raises KeyError."""
     landmarks = island.graph.landmarks
     found = np.array([landmarks.get(id_, -1) for id_ in ids], np.int64)
     awake = found >= 0

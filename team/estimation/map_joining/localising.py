@@ -1,8 +1,8 @@
-"""Place a robot without a start in the team's map, by the landmarks that both have.
+"""Place a robot without a start in the team's map, by shared landmarks.
 
-The robot's own map, a Gaussian over its pose p and its landmarks from its start on, is one submap
-whose start in the team's frame is unknown. The alignment of the shared landmarks gives the start;
-least squares over the team's landmarks and this submap then gives the pose with its covariance.
+The robot's own map, a Gaussian over its pose p and its landmarks, is one submap with an unknown
+start. The alignment of the shared landmarks gives the start; least squares over the team's
+landmarks and this submap gives the pose with its covariance.
 """
 
 from typing import NamedTuple
@@ -37,12 +37,12 @@ landmarks that give it are counted in the solution.
 
 
 def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) -> Posed | str:
-    """Estimate the pose of a robot in the frame of the team's landmarks, or give the reason why
-    they do not determine it.
+    """Estimate a robot's pose in the frame of the team's landmarks, or give the reason why they do
+    not determine it.
 
     own: the robot's map from its start on; window: the open one. Where landmarks disagree, the
-    largest set that one rigid motion places is used, if it is most of them. Raises
-    NotACovarianceError, NotDeterminedError.
+    largest set of one rigid motion is used, if it is most of them. Raises NotACovarianceError,
+    NotDeterminedError.
     """
     whole = own if window is None else join_submap(own, window.named)
     _, in_team, in_own = np.intersect1d(team.ids, whole.ids, return_indices=True)
@@ -68,7 +68,7 @@ def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None)
 
 
 class _Shared(NamedTuple):
-    """Landmarks of the team, N(a, A), and a robot's (pose, the same landmarks), N(mean, P)."""
+    """Shared landmarks: the team's N(a, A), and a robot's (pose, landmarks) N(mean, P)."""
 
     ids: UInt32[np.ndarray, " n"]
     a: Float[np.ndarray, "n 2"]
@@ -100,7 +100,7 @@ class _Shared(NamedTuple):
         return self.mean[3:].reshape(-1, 2)
 
     def fit(self) -> tuple[Alignment | None, str | None]:
-        """Align the landmarks; return the alignment, with the reason where it places nothing."""
+        """Align the landmarks, or give the reason why they do not."""
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
             fit = align(self.a, self.A, self.b, self.P[3:, 3:])

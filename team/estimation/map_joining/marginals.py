@@ -1,6 +1,6 @@
-"""Marginals of a joined map: means and covariances, and the agreement of its submaps.
+"""Marginals of a joined map, and the agreement of its submaps.
 
-All values are in the frame of an island: the main one, or the one of a stream.
+In the frame of an island: the main one, or that of a stream.
 """
 
 import math
@@ -69,10 +69,10 @@ class Trajectory(NamedTuple):
 
 
 class EndPoses(NamedTuple):
-    """End poses of a stream's submaps in order, each with its covariance.
+    """End poses of a stream's submaps, each with its covariance.
 
-    start, start_covariance: the start pose of the first submap. crosses: covariance of each pose
-    with the one before it, of the first one with the start.
+    start: of the first submap. crosses: covariance of each pose with the one before it, at first
+    the start.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -83,7 +83,7 @@ class EndPoses(NamedTuple):
 
 
 class BiasEstimate(NamedTuple):
-    """Estimate and standard deviation of an error that the submaps of a stream share."""
+    """Estimate and standard deviation of an error that a stream's submaps share."""
 
     stream: Stream
     bias: Bias
@@ -92,7 +92,7 @@ class BiasEstimate(NamedTuple):
 
 
 class SightingCost(NamedTuple):
-    """Unweighted χ² of an inter-robot measurement, which has 2 degrees of freedom at most."""
+    """Unweighted χ² of an inter-robot measurement, of at most 2 degrees of freedom."""
 
     robot: str
     teammate: str
@@ -100,13 +100,12 @@ class SightingCost(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Joint cost Σ w χ² and its degrees of freedom: in total, per robot and per submap; and the
-    unweighted χ² of the inter-robot measurements, oldest first.
+    """Joint cost Σ w χ² and its degrees of freedom, in total, per robot and per submap; unweighted
+    χ² of the inter-robot measurements, oldest first.
 
     An inter-robot measurement counts for its observer, a discounted landmark by its weight. Without
-    a robust loss the total dof is the sum of the dimensions of submaps, inter-robot measurements
-    and priors less the number of unknowns. A chi2/dof that stays above 1.1 is a warning; above 1.3
-    the covariances cannot be trusted.
+    a robust loss the total dof is the dimension of all factors less the number of unknowns. A
+    chi2/dof that stays above 1.1 is a warning; above 1.3 the covariances cannot be trusted.
     """
 
     chi2: float
@@ -117,9 +116,9 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """Estimate the errors that each stream's submaps share, in the stream's island.
+    """Estimate each stream's shared errors, in the stream's island.
 
-    Each is the sum of the robot's own error and the team's common one.
+    Each is the sum of the robot's own error and the team's.
     """
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
@@ -170,8 +169,7 @@ def scatter_of(fold: Fold, of: BiasEstimate) -> Scatter:
 
     With c = A⁻¹u, where u picks the bias, submap k moves the estimate by s_k = −c · ∇(w χ²_k)/2.
     Errors that last longer than a window correlate the s_k of a stream, here as an autoregressive
-    process of first order with the coefficient ρ: of all streams the variance and its degrees of
-    freedom are
+    process of first order with coefficient ρ: variance and degrees of freedom are
 
         g Σ_k s_k²,   (Σ_r v_r)²/(g Σ_r v_r²/n_r),   g = (1 + ρ)/(1 − ρ),
 
@@ -199,7 +197,7 @@ def scatter_of(fold: Fold, of: BiasEstimate) -> Scatter:
 
 
 def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
-    """Estimate the standard deviation of the sum of several autoregressive series of mean 0."""
+    """Estimate the standard deviation of the sum of autoregressive series of mean 0."""
     squares = np.array([(s * s).sum() for s in chains])
     total = float(squares.sum())
     if total == 0.0:
@@ -213,11 +211,11 @@ def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
-    """List the main island's landmarks in at least `submaps` believed submaps; for unnamed ones, in
-    the larger of `submaps` and `unnamed`.
+    """List the main island's landmarks in at least `submaps` believed submaps; unnamed ones in the
+    larger of `submaps` and `unnamed`.
 
-    A submap is believed where the robust loss does not discount its landmark below BELIEVED: of two
-    contradictory observations at most one is believed, and neither confirms the other.
+    A submap is believed where its landmark's weight is at least BELIEVED, so two contradictory
+    observations do not confirm each other.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -239,9 +237,7 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
-    """Return the main island's landmarks (all, or those given) with joint covariance,
-    `landmark_sigma` included.
-    """
+    """Return landmarks of the main island with joint covariance, `landmark_sigma` included."""
     chosen = known(fold.main) if ids is None else sorted(ids)
     mean, covariance = joint(fold.main, [], chosen)
     covariance = covariance + fold.main.settings.landmark_sigma**2 * np.eye(len(covariance))
@@ -249,8 +245,8 @@ def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """Return the main island's landmarks (all, or those given), each with its own covariance,
-    `landmark_sigma` included, by selected inversion of the information matrix.
+    """Return landmarks of the main island with one covariance each, `landmark_sigma` included, by
+    selected inversion.
     """
     island = fold.main
     own = island.settings.landmark_sigma**2 * np.eye(2)
@@ -269,7 +265,7 @@ def prior_for(
 
 
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
-    """Return the end pose of the stream's last submap, in its island's frame."""
+    """End pose of the stream's last submap, in its island's frame."""
     island = fold.islands[fold.home[stream]]
     return _mean(island, island.graph.streams[stream][-1])
 
@@ -280,11 +276,11 @@ def main_priors(
     most: int | None = None,
     chosen: Sequence[int] | None = None,
 ) -> dict[Stream, RobotPrior]:
-    """Make the priors (`prior_for`) of some streams of the main island.
+    """Make the priors (`prior_for`) of streams of the main island.
 
-    chosen: the landmarks by ascending id; None: all. most: largest number of landmarks of a prior,
-    those nearest to its pose. A landmark outside a robot's prior is new to the robot until the next
-    one: its pose is less accurate, and as consistent.
+    chosen: landmarks by ascending id; None: all. most: largest number in a prior, those nearest to
+    its pose. To the robot the others are new until the next prior: its pose is less accurate, and
+    as consistent.
     """
     island = fold.main
     ids = np.array(known(island) if chosen is None else chosen)
@@ -341,8 +337,7 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
 class Terms(NamedTuple):
     """The agreement of each factor, in the graph's order.
 
-    submaps: costs without discounting. counted, priors, sightings: (robot, w χ², dof) as they enter
-    the joint cost.
+    submaps: without discounts. counted, priors, sightings: (robot, w χ², dof) of the joint cost.
     """
 
     submaps: list[SubmapCost]
@@ -385,21 +380,21 @@ def _terms(island: Island) -> Terms:
 
 
 def scale_of(costs: Sequence[SubmapCost]) -> Scale | None:
-    """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
+    """Estimate the covariance scale; None with too few degrees of freedom."""
     return covariance_scale(*columns_of(costs))
 
 
 def columns_of(costs: Sequence[SubmapCost]) -> Float[np.ndarray, "3 n"]:
-    """List χ², degrees of freedom, and the median of χ² of some submaps."""
+    """List χ², degrees of freedom, and the median of χ²."""
     return np.array([(each.chi2, each.dof, each.median) for each in costs]).reshape(-1, 3).T.copy()
 
 
 def unbounded_costs(island: Island) -> list[SubmapCost]:
-    """Evaluate the agreement of the submaps where the robust loss does not distort it.
+    """Evaluate the agreement of the submaps without distortion by the robust loss.
 
-    Covariances that are far too small put sound submaps beyond their gates, and the solution
-    follows the few others. The island is therefore solved again with the covariances times the
-    scale that it shows; the costs are stated for its own covariances.
+    Covariances far too small put sound submaps beyond their gates, and the solution follows the few
+    others. The island is therefore solved with the covariances times its scale; the costs are for
+    its own covariances.
     """
     found, settings = terms(island).submaps, island.settings
     scale = scale_of(found)
@@ -413,7 +408,6 @@ def unbounded_costs(island: Island) -> list[SubmapCost]:
 
 
 def _widened(island: Island, factor: float) -> Island:
-    """Solve an island again with the submaps' covariances times a factor."""
     settings = replace(
         island.settings, covariance_factor=factor * island.settings.covariance_factor
     )
@@ -422,8 +416,8 @@ def _widened(island: Island, factor: float) -> Island:
 
 
 def widen_covariances(fold: Fold, factor: float) -> Fold:
-    """Solve the main island again with the submaps' covariances times a factor; return the fold as
-    it was where that has no solution, and where fixes may be what does not fit.
+    """Solve the main island with the submaps' covariances times a factor; unchanged without a
+    solution, and where fixes may be the cause.
     """
     if factor == 1.0 or fold.main_key is None:
         return fold
@@ -446,7 +440,7 @@ def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
 def joint_cost(fold: Fold) -> Agreement:
     """Evaluate the agreement of the main island's submaps, at the present estimate.
 
-    Condensed submaps count with their costs at condensing; only the newest of them are listed.
+    Condensed submaps count at condensing; the newest of them are listed.
     """
     found = terms(fold.main)
     old = fold.main.graph.condensed
@@ -496,9 +490,7 @@ def _sighting_costs(island: Island) -> list[SightingCost]:
 
 
 def _priors(island: Island) -> list[tuple[str, float, float]]:
-    """(robot, χ², dof) of each prior on an initial pose or a bias; a common bias counts for the
-    frame's robot.
-    """
+    """(robot, χ², dof) of each prior; a common bias counts for the frame's robot."""
     graph = island.graph
     robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
     robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}

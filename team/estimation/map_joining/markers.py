@@ -1,9 +1,9 @@
 """Marker errors of unnamed landmarks, as states of the full solution.
 
-A sensor that derives the distance from an object's size or height measures each landmark too far by
-a constant share of the range, the same for all robots (`CommonBiasSigmas.marker`). The states are
-added after association: before, each part of one landmark would have an error of its own, which
-would weaken the evidence that the parts are one landmark or two.
+A sensor that derives distance from an object's size measures each landmark too far by a constant
+share of the range, the same for all robots (`CommonBiasSigmas.marker`). The states are added after
+association: before, the parts of one landmark would have separate errors, which weaken the evidence
+that they are one or two.
 """
 
 from collections.abc import Mapping
@@ -23,9 +23,7 @@ from teamslam.team.estimation.map_joining.submap_graph import (
 
 
 def add_markers(island: Island) -> Island:
-    """Add a marker state to each unnamed landmark without one; an island with condensed submaps is
-    unchanged.
-    """
+    """Add a marker state to each unnamed landmark without one; with condensed submaps unchanged."""
     graph, number = island.graph, _find_unmarked(island)
     if not number or graph.condensed is not None:
         return island
@@ -47,7 +45,7 @@ def add_markers(island: Island) -> Island:
 
 
 def warn_of_unmarked(island: Island) -> list[str]:
-    """Warn of landmarks whose marker error is not a state of the full solution."""
+    """Warn of landmarks without a marker state in the full solution."""
     graph, count = island.graph, len(_find_unmarked(island))
     if not count or not any(bias == "range_scale" for _, bias in graph.biases):
         return []
@@ -78,8 +76,8 @@ def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
 def _add_rows(
     submap: Joined, errors: list[int], nodes: Mapping[CommonError, int], number: dict[int, int]
 ) -> Joined:
-    """Add a row of sensitivity to a submap for each of these markers: that of the scale of the
-    ranges, restricted to the landmark.
+    """Add a row of sensitivity for each marker: that of the ranges' scale, of the
+    landmark alone.
     """
     if not errors:
         return submap

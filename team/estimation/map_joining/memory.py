@@ -1,12 +1,10 @@
 """Observations of condensed submaps for association: landmarks seen together, viewed places.
 
-Only the newest MOST submaps of each landmark are stored, whole, so their number depends on the
-landmarks, not on the duration of the run. Of older ones the pairs of landmarks that they kept apart
-remain.
+Of each landmark the newest MOST submaps are stored whole, so their number does not depend on the
+duration of the run. Of older ones the pairs of landmarks that they kept apart remain.
 
-False detections create landmarks that would slow a team down. A landmark of n < MOST submaps is
-dropped when every landmark of MOST or more, observed with it when it was last observed, has been
-observed by MOST n submaps since.
+False detections would slow a team down: a landmark of n < MOST submaps is dropped when every
+landmark of MOST or more, last observed with it, has since been observed by MOST n submaps.
 """
 
 from collections.abc import Sequence
@@ -28,10 +26,9 @@ NO_COUNTS: Indices = np.zeros(0, np.int64)
 
 
 class Observed(NamedTuple):
-    """A submap, and the node of each of its landmarks; −1 for a dropped one.
+    """A submap, and the node of each landmark; −1 for a dropped one.
 
-    counts: number of condensed submaps with each landmark, this one included; empty if not
-    condensed.
+    counts: number of condensed submaps with each landmark; empty if not condensed.
     """
 
     observation: Observation
@@ -46,10 +43,10 @@ class Observed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """The stored condensed submaps, and the pairs of forgotten ones.
+    """The stored condensed submaps, oldest first, and the pairs of forgotten ones.
 
-    submaps: oldest first. pairs: two landmarks of one forgotten submap, by their nodes, the smaller
-    one first. distinct: which of them are known to be two (`LocalMap.distinct`).
+    pairs: nodes of two landmarks of one forgotten submap, ascending. distinct: which are known to
+    be two (`LocalMap.distinct`).
     """
 
     submaps: tuple[Observed, ...] = ()
@@ -57,7 +54,7 @@ class Memory:
     distinct: Bool[np.ndarray, " P"] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def renumbered(self, node_of: Indices) -> "Memory":
-        """Renumber the nodes, −1 for a dropped one; two landmarks that become one are no pair."""
+        """Renumber the nodes, −1 for a dropped one; landmarks that become one are no pair."""
         to = np.append(node_of, -1)
         submaps = tuple(each._replace(landmarks=to[each.landmarks]) for each in self.submaps)
         return replace(_unique(to[self.pairs], self.distinct), submaps=submaps)
@@ -69,7 +66,7 @@ class Memory:
     def given_up(self, counts: Indices, stays: Bool[np.ndarray, " nodes"], most: int) -> Indices:
         """List the nodes of the landmarks to drop, ascending.
 
-        counts: number of condensed submaps by node. stays: landmarks that are not dropped.
+        counts: condensed submaps by node. stays: landmarks to keep.
         """
         if not self.submaps:
             return np.zeros(0, np.int64)
@@ -89,10 +86,7 @@ class Memory:
         return np.unique(node[gone])
 
     def shortened(self, nodes: int, most: int) -> "Memory":
-        """Drop the submaps that are among the newest `most` of none of their landmarks.
-
-        nodes: number of nodes of the graph.
-        """
+        """Drop the submaps that are among the newest `most` of none of their landmarks."""
         newer = np.zeros(nodes, np.int64)
         remembered, forgotten = [], []
         for each in reversed(self.submaps):
@@ -117,7 +111,7 @@ NOTHING = Memory()
 
 
 def _unique(pairs: Int64[np.ndarray, "P 2"], distinct: Bool[np.ndarray, " P"]) -> Memory:
-    """Keep each pair once, ascending, distinct if any of its copies is."""
+    """Keep each pair once, distinct if any copy is."""
     if not len(pairs):
         return NOTHING
     pairs = np.sort(pairs, axis=1)

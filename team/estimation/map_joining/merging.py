@@ -1,13 +1,13 @@
 """Merge two islands when their common points leave a single likely place of one in the other.
 
 A merge is tried from every place that the shared points propose: all of them, the landmarks alone,
-the inter-robot measurements alone, and every heading at which they fit well. Each is solved in
-full, and so is a start independent of them (`minima`). The solution of lowest cost is accepted if
-the two maps agree there and no other place is about as likely; else the merge is deferred.
+the inter-robot measurements alone, and every heading at which they fit well. Each, and a start
+independent of them (`minima`), is solved in full. The solution of lowest cost is accepted if the
+maps agree and no other place is about as likely; else the merge is deferred.
 
 A shared point is a landmark of both, or a teammate observed from a pose node: in the observer's
-island it lies at pose ∘ (range, bearing), in its own island at its pose node. An inter-robot
-measurement and the reverse one are two points.
+island at pose ∘ (range, bearing), in its own at its pose node. An inter-robot measurement and the
+reverse one are two points.
 """
 
 import math
@@ -70,11 +70,10 @@ HOPELESS = 100.0
 
 
 class SharedPoint(NamedTuple):
-    """One point: its node in the main island and in the other, and the measurement that ties them.
+    """One point: its node in both islands, and the measurement that ties them.
 
-    seen: the inter-robot measurement; None for a shared landmark. from_main: the observer is in the
-    main island, whose node is then the observer's. The measured point is at `seen.point` of the
-    teammate.
+    seen: the inter-robot measurement, at `seen.point` of the teammate; None for a landmark.
+    from_main: the observer is in the main island.
     """
 
     main: int
@@ -84,9 +83,7 @@ class SharedPoint(NamedTuple):
 
 
 def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> list[SharedPoint]:
-    """List the shared landmarks by id, then the inter-robot measurements between the islands in
-    order.
-    """
+    """List the shared landmarks by id, then the inter-robot measurements."""
     shared = sorted(main.landmarks.keys() & other.landmarks.keys())
     found = [SharedPoint(main.landmarks[id_], other.landmarks[id_]) for id_ in shared]
     for each in sightings:
@@ -101,11 +98,10 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
 def sound_ties(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> tuple[list[SharedPoint], list[InterRobotFactor]]:
-    """Return the points by which islands are aligned, and the fixes that are left out of it.
+    """Return the points by which islands are aligned, and the fixes left out.
 
-    At most MOST_FIXES fixes are used, evenly spaced in time. Of these, those that no rigid motion
-    places together with most of the others are left out; the robust loss discounts them once the
-    islands are one.
+    At most MOST_FIXES fixes, evenly spaced in time, without those that no rigid motion places with
+    most of the others.
     """
     every = [each for each in tied if each.seen is not None and each.seen.is_fix]
     if len(every) <= LEAST_AGREEING:
@@ -125,7 +121,7 @@ def sound_ties(
 def aligned_by(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> alignment.Alignment | None:
-    """Align the other island with the main one; None where the points do not suffice."""
+    """Align the other island with the main one; None where points are too few."""
     if len(tied) < alignment.NEEDED:
         return None
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
@@ -134,8 +130,7 @@ def aligned_by(
 
 
 def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, bool]]) -> JointPoints:
-    """Return the positions of nodes, of the teammates measured from them, or of their own measured
-    points, with joint covariance.
+    """Positions of nodes, or of points measured from them or on them, with joint covariance.
 
     at: node, measurement, and whether the node is the observer's.
     """
@@ -170,9 +165,8 @@ def headings_that_fit(
 ) -> list[Float[np.ndarray, "3"]]:
     """Find every main_from_other whose heading is a local minimum of the shared points' χ².
 
-    The best translation at each heading of a grid follows in closed form from the joint covariance
-    of the points. Headings worse by more than HOPELESS are left out; with more than MOST_POINTS
-    points only the best one is returned.
+    The best translation at each heading of a grid is closed-form. Headings worse by more than
+    HOPELESS are left out; with more than MOST_POINTS points only the best stays.
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []
@@ -202,7 +196,7 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """Why two islands stay separate; after_search: whether it took a (slow) search over places."""
+    """Why two islands stay separate; after_search: after a (slow) search."""
 
     why: str
     after_search: bool
@@ -211,8 +205,8 @@ class Waits(NamedTuple):
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     """Merge the other island into the main one's frame, or return the reason to wait.
 
-    The merge also waits where the shared points allow no solution, and where submaps of the other
-    island are condensed, in a frame that cannot be transformed.
+    Waits also without a solution, and while submaps of the other island are condensed, in a frame
+    that cannot be transformed.
     """
     if other.graph.condensed is not None:
         return Waits("its submaps are condensed in a frame of their own", after_search=False)
@@ -264,7 +258,6 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
 
 
 def _separate_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:
-    """Separate the landmarks that have moved since a saved map from those of the other island."""
     island = main if maps_of(main.graph) else other
     saved = maps_of(island.graph)
     ids = sorted(main.graph.landmarks.keys() & other.graph.landmarks.keys())
@@ -312,7 +305,6 @@ def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _describe_ambiguity(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
-    """Word the reason to defer a merge with two likely places."""
     away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
     return (
         f"{shared} leave two places {core.hypot(away[0], away[1]):.1f} m apart: "

@@ -1,8 +1,8 @@
 """The search for the lowest minimum: one island solved from several starts.
 
 Headings give map joining many minima: after a long way without a landmark Gauss-Newton may fold a
-chain wrongly. A cost far above its degrees of freedom, or another start that ends lower, reveals
-that. A second minimum of about the same cost is a second map that the same submaps allow.
+chain wrongly. A cost far above its degrees of freedom, or a lower end of another start, reveals
+that. A second minimum of similar cost is a second map of the same submaps.
 """
 
 import math
@@ -51,7 +51,7 @@ WIDE = 30.0
 
 
 class Minimum(NamedTuple):
-    """A full solution with its number of iterations, last change [m, rad] and cost."""
+    """A full solution: number of iterations, last change [m, rad], cost."""
 
     island: Island
     iterations: int
@@ -60,9 +60,7 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; its cost below the first start's, and below a second minimum (None
-    without).
-    """
+    """The lowest minimum; its cost below the first start's, and below a second minimum."""
 
     best: Minimum
     gained: float
@@ -81,7 +79,7 @@ def solve_minimum(island: Island) -> Minimum:
 
 
 def likely_rise() -> float:
-    """Rise of the cost above which another place in the plane is unlikely: quantile of χ² of 3."""
+    """Quantile of χ² of 3: rise of the cost above which another place is unlikely."""
     return likely_limit(3)
 
 
@@ -89,10 +87,9 @@ def search_minima(starts: Sequence[Island]) -> Search:
     """Find the lowest minimum from several starts of one graph, and from the relaxation of its
     headings.
 
-    The first start is the one used without a search. While the lowest cost is suspicious, and
-    always with few landmarks, two more kinds of starts are tried: without the inter-robot
-    measurements, and with every factor's robust scale wide. A start without a solution is left out;
-    raises NotDeterminedError where none has one.
+    The first start is the one used without a search. While the cost is suspicious, and always with
+    few landmarks, starts without inter-robot measurements and with wide robust scales are tried
+    too. A start without a solution is left out; raises NotDeterminedError where none has one.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_solve_each(starts))
@@ -117,9 +114,8 @@ def _solve_each(starts: Iterable[Island]) -> Iterator[Minimum]:
 def widen_search(search: Search) -> Search:
     """Extend the search by the minima next to the best one, where landmarks are few.
 
-    Each uncertain heading of a first or last pose is moved as far as is likely, and each stream is
-    mirrored between two landmarks, since a chain may fold over to the other side of the line
-    through them. A solution that does not return to the best one has crossed into another valley.
+    Each uncertain heading of a first or last pose is moved as far as is likely, and each stream
+    mirrored at the line through two landmarks, to which a chain may fold over.
     """
     best = search.best.island
     if len(best.graph.landmarks) > FEW_LANDMARKS:
@@ -158,7 +154,7 @@ def _mirror_streams(island: Island) -> Iterator[Island]:
 
 
 def _list_passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """List pairs of landmarks, by index in the state, that a stream observes in succession."""
+    """List pairs of landmarks, by index in the state, observed in succession."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
     for submap in graph.submaps:
@@ -171,7 +167,7 @@ def _list_passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
 
 
 def _select_lowest(found: Sequence[Minimum]) -> Search:
-    """Select the lowest minimum of one graph; the first is from the start used without a search."""
+    """Select the lowest minimum; the first is from the start used without a search."""
     best = _settle_minimum(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
@@ -179,9 +175,9 @@ def _select_lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _make_starts(island: Island) -> Iterator[Island]:
-    """Make starts independent of the island's state, the most promising first.
+    """Make starts independent of the state, the most promising first.
 
-    There are none with condensed submaps, whose factor depends on that state.
+    None with condensed submaps, which depend on that state.
     """
     graph = island.graph
     if graph.condensed is not None:
@@ -213,10 +209,8 @@ def _settle_minimum(best: Minimum) -> Minimum:
 
 
 def is_another_minimum(one: Minimum, best: Minimum) -> bool:
-    """Whether a minimum is another map, rather than a state within the best one's covariance.
-
-    With the difference d of the states and the information A at the best one, A alone predicts a
-    rise of the cost by dᵀAd between them.
+    """Whether a minimum is another map, rather than a state within the best one's covariance, which
+    predicts a rise of the cost by dᵀAd.
     """
     difference = _difference(one.island, best.island)
     return _quadratic(best.island, difference) > likely_rise()
@@ -236,8 +230,8 @@ def _quadratic(island: Island, x: Values) -> float:
 
 
 def rival_distance(search: Search) -> float | None:
-    """Return how far the second minimum is from the best one [m], at most, if it is about as likely
-    and some number of it is beyond its standard deviation.
+    """Distance [m] of the second minimum from the best one, if about as likely and beyond its
+    standard deviation.
     """
     if search.second is None or not search.ambiguous:
         return None
@@ -251,7 +245,7 @@ def rival_distance(search: Search) -> float | None:
 
 
 def warnings(search: Search) -> list[str]:
-    """Warn the map's user about its minimum; empty where it is the only one."""
+    """Warn the map's user about other minima."""
     island, found = search.best.island, []
     dof = degrees_of_freedom(island)
     if is_suspicious(island, search.best.cost):

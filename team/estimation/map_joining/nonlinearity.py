@@ -1,9 +1,9 @@
 """Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
-One heading is displaced and everything else is solved for given that: the profile of the cost
-(Bates & Watts 1988, chapter 6). For a quadratic cost its rise equals the χ² of the displacement by
-the pose's own covariance. After a long way without a landmark that χ² may be ten times the rise:
-the robot may be at a place that its covariance excludes, though the minimum is right.
+One heading is displaced and everything else solved given that: the profile of the cost (Bates &
+Watts 1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement. After a long
+way without a landmark that χ² may be ten times the rise: the robot may be at a place that its
+covariance excludes.
 """
 
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ quantile of χ² of 1.
 
 
 class UnderstatedUncertainty(NamedTuple):
-    """A displacement [m] of a pose, the rise of the cost there, and χ² by the pose's covariance."""
+    """Displacement [m] of a pose, rise of the cost there, χ² by the pose's covariance."""
 
     distance: float
     rise: float
@@ -52,7 +52,7 @@ class UnderstatedUncertainty(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """χ² by the covariance over the rise of the cost; 1 where the cost is quadratic."""
+        """χ² over the rise of the cost; 1 where the cost is quadratic."""
         return self.chi2 / max(self.rise, 1.0)
 
 
@@ -65,7 +65,7 @@ def heading_sigma(island: Island, node: int) -> float:
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
-    """Profile the cost: likely islands with one pose's heading displaced, and the rise of each.
+    """Profile the cost: likely islands with one heading displaced, and each rise.
 
     Empty where the heading is known too well for a curved valley.
     """
@@ -87,7 +87,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
 
 
 def ends(island: Island) -> list[tuple[Stream, str, int]]:
-    """List the first and last pose of every stream unless given, each with the word for it."""
+    """List the first and last pose of every stream unless given, each with its word."""
     return [
         (stream, where, nodes[k])
         for stream, nodes in sorted(island.graph.streams.items())
@@ -97,9 +97,7 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
 
 
 def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
-    """Find the likely place of a pose that its covariance underrates most, for an island at its
-    minimum; None where the covariance allows for all of them.
-    """
+    """Find the likely place of a pose that its covariance underrates most, at a minimum."""
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
@@ -122,10 +120,7 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
 
 
 def nonlinearity_warnings(island: Island) -> list[str]:
-    """Warn where the covariance of a first or last pose understates its uncertainty.
-
-    Examines every stream without a given initial pose.
-    """
+    """Warn where the covariance of a first or last pose understates its uncertainty."""
     texts = []
     for stream, where, node in ends(island):
         if island.graph.fixed[island.graph.streams[stream][0]]:

@@ -1,8 +1,8 @@
 """The quadratic of factors at the present state, with the old poses eliminated run by run.
 
-A run of a stream's old poses is connected with the landmarks seen along it and the poses at its
-ends only. Each run is eliminated from a dense quadratic over its neighbours, and the rest is a
-factor of the next run (George 1973, SIAM J. Numer. Anal. 10(2), by blocks).
+A run of old poses touches only the landmarks seen along it and the poses at its ends. Each is
+eliminated from a dense quadratic over these, whose rest is a factor of the next run (George 1973,
+SIAM J. Numer. Anal. 10(2), by blocks).
 """
 
 from collections import defaultdict
@@ -45,9 +45,9 @@ def eliminate_paths(
     island: Island, union: Indices, factors: MarkedFactors, eliminated: Bool[np.ndarray, " _"]
 ) -> tuple[Indices, Matrix, Values, float]:
     """Eliminate poses from the factors' quadratic; return its nodes, A, half the gradient and the
-    cost, lowered by the elimination. The graph must have no condensed factor.
+    lowered cost. The graph must have no condensed factor.
 
-    union: the factors' nodes, but for constants. eliminated: marks of nodes; landmarks stay.
+    union: the factors' nodes but constants. eliminated: marks of nodes; landmarks stay.
     """
     graph = island.graph
     sizes, total = np.diff(graph.offset), 0.0

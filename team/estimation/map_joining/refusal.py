@@ -1,13 +1,11 @@
 """Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
-A tick is added as a whole; if that has no solution its members are added one by one in canonical
-order, and those that make the normal equations unsolvable are left out. The outcome depends on the
-fold before and on the tick's members alone, hence on the set (law 2).
+A tick without a solution as a whole is added one by one in canonical order, without the members
+that make the normal equations unsolvable. The outcome depends on the set alone (law 2).
 
-If a whole submap allows no solution, its motion alone is tried, the marginal of its end pose, so
-that the robot's later submaps keep their place. Where that fails too, the robot's chain ends: later
-submaps are not in the map. An initial pose that allows no solution is treated as unknown; an
-inter-robot measurement is left out.
+Of a refused submap the motion alone is tried, the marginal of its end pose, which keeps the place
+of the robot's later submaps. Where that fails too, the robot's chain ends. An unsolvable initial
+pose becomes unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,8 +30,8 @@ T = TypeVar("T")
 
 
 def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Add the tick's members; `refused`, `motion_only`, `left_out` and `set_aside` of the fold list
-    the exceptions.
+    """Add the tick's members; list exceptions in `refused`, `motion_only`, `left_out` and
+    `set_aside`.
     """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
     fold, members = _select_reachable(fold, tick.contributions, tick.outside)
@@ -48,9 +46,7 @@ def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def describe_refusals(fold: Fold) -> list[str]:
-    """Describe, for each chain, the submap at which it ended and how many follow, then other
-    refusals.
-    """
+    """Describe the submap at which each chain ended and how many follow, then other refusals."""
     ended: dict[Stream, list[int]] = {}
     for _, robot, incarnation, sequence in fold.refused:
         ended.setdefault((robot, incarnation), []).append(sequence)
@@ -110,9 +106,7 @@ def _attempt(
 
 
 class _Selection:
-    """Selects the members with which a fold has a solution, one by one in canonical order, from a
-    tick that has none as a whole.
-    """
+    """Selects the solvable members of a tick one by one, in canonical order."""
 
     def __init__(
         self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, InitialPoseFactor]
@@ -180,7 +174,7 @@ class _Selection:
             self._grow_by_less(fold, block[0])
 
     def _grow_by_less(self, fold: Fold, whole: Contribution) -> None:
-        """Add a part of one submap: without its initial pose, then its motion alone, else none."""
+        """Add a submap without its initial pose, its motion alone, or none."""
         start = self._starts.pop(whole.stream, None) if whole.sequence == 0 else None
         if start is not None and self._solves(fold, [*self._members, whole]):
             self._members.append(whole)
@@ -206,7 +200,7 @@ class _Selection:
 def _select_greatest(
     items: Sequence[T], works: Callable[[Sequence[T]], bool]
 ) -> tuple[list[T], list[T]]:
-    """Add items while `works`, by halves; return the accepted and the rejected ones."""
+    """Add items while `works`, by halves; return the accepted and the rejected."""
     accepted: list[T] = []
     bad: list[T] = []
 

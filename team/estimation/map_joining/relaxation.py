@@ -1,13 +1,11 @@
-"""A first guess of a whole graph without an earlier one: headings as free vectors.
+"""A first guess of a whole graph: headings as free vectors.
 
 With (c, s) = (cos θ, sin θ) of each pose as two free numbers, a submap's equations are linear,
 
     p − p_s − [[c_s, −s_s], [s_s, c_s]] z = 0,   (c, s)_e − R(z_θ) (c, s)_s = 0,
 
-so least squares over all of them has one minimum, however long the way without a landmark (the
-chordal relaxation: Martinec & Pajdla 2007, Carlone et al. 2015). Headings follow from the
-solution's vectors. Weights are the variances of each point, correlations left out: it is a start,
-not an estimate.
+so least squares has one minimum, however long the way without a landmark (chordal relaxation:
+Martinec & Pajdla 2007, Carlone et al. 2015). Weights leave correlations out.
 """
 
 import math
@@ -25,7 +23,7 @@ Indices = Int64[np.ndarray, " _"]
 
 
 class _Rows(NamedTuple):
-    """R linear equations Σ coefficient · number = right, of T terms each, with weights 1/σ."""
+    """R equations Σ coefficient · number = right, of T terms, with weights 1/σ."""
 
     numbers: Int64[np.ndarray, "R T"]
     coefficients: Float[np.ndarray, "R T"]
@@ -34,9 +32,7 @@ class _Rows(NamedTuple):
 
 
 def relax_headings(graph: Graph, state: Values) -> Values | None:
-    """Relax the graph to a new state; fixed nodes and biases keep their values; None if
-    undetermined.
-    """
+    """Relax the graph to a new state; fixed nodes and biases stay; None if undetermined."""
     sizes = np.diff(graph.offset).tolist()
     at = np.concatenate([[0], np.cumsum([4 if size == 3 else size for size in sizes])])
     numbers = np.zeros(at[-1])
@@ -92,9 +88,7 @@ def _least_squares(
 
 
 def _list_equations(graph: Graph, at: Indices) -> Iterator[_Rows]:
-    """List the equations of submaps, inter-robot measurements and priors; `at`: first number of
-    each node.
-    """
+    """List the equations; `at`: first number of each node."""
     for contribution, nodes, *_ in graph.submaps:
         local, start = contribution.local, int(at[nodes[0]])
         variances = np.diag(local.covariance)

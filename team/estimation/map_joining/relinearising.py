@@ -1,8 +1,8 @@
 """Restore condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
 
-Submaps linearised at different headings contradict each other: the map becomes overconfident. At
-begin · GROWTH^k submaps, up to SETTLED, all condensed submaps are therefore restored, solved, and
-condensed at the new state. A tick that moves them further is folded with all of them restored.
+Submaps linearised at different headings make the map overconfident. At begin · GROWTH^k submaps, up
+to SETTLED, and at a tick that moves them further, all condensed submaps are restored, solved, and
+condensed anew.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,7 @@ SOLVED = 3
 
 
 def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
-    """Whether the fold passes a size at which all of it is linearised again."""
+    """Whether the fold passes a size at which it is linearised again."""
     size = begin * GROWTH
     while size <= min(after, SETTLED):
         if before < size:
@@ -52,10 +52,10 @@ def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
 
 
 def is_contradicted(before: Fold, after: Fold) -> bool:
-    """Whether a tick changes the condensed submaps by more than their linearisation allows.
+    """Whether a tick changes the condensed submaps beyond their linearisation.
 
-    That is a closure of unnamed landmarks, the first unnamed landmarks (which may be landmarks of
-    condensed submaps), and a new main island, into whose frame the former one will be transformed.
+    So do a closure of unnamed landmarks, the first unnamed landmarks, and a new main island, into
+    whose frame the former one will be transformed.
     """
     begins = after.has_unnamed and not before.has_unnamed
     return bool(after.landmarks.opened) or begins or before.main_key != after.main_key
@@ -64,10 +64,10 @@ def is_contradicted(before: Fold, after: Fold) -> bool:
 def restore_submaps(
     fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
 ) -> Fold:
-    """Restore the condensed submaps as factors, and solve their islands from the present state.
+    """Restore the condensed submaps as factors, and solve their islands; unchanged without a
+    solution.
 
-    contributions, sightings: all members of the fold in canonical order, refused ones included. An
-    island without a solution then is unchanged.
+    contributions, sightings: all members of the fold in canonical order, refused ones included.
     """
     contributions = cut_members(contributions, fold.cuts)
     sightings = cut_members(sightings, fold.cuts)
@@ -129,7 +129,7 @@ def _raw(
     paths: Mapping[Stream, EliminatedPath],
     numbers: Mapping[Key, Sequence[int]],
 ) -> Island:
-    """Build the graph of all submaps, each node at its state in the island or at condensing."""
+    """Build the graph of all submaps, at the state of the island or of condensing."""
     graph, settings = island.graph, island.settings
     full, state = add_submaps(
         EMPTY_GRAPH,

@@ -1,10 +1,10 @@
 """Landmarks come to rest, and become nodes again where a submap observes them.
 
-A landmark that no raw submap contains has, given the condensed factor's other nodes, a Gaussian
-that later submaps of other places cannot change (`Resting`). It is eliminated from the quadratic
-like an old pose, so the cost of a tick depends on the landmarks near the robots only. The inverse
-is exact: with e = x − means − gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the other resting
-landmarks are conditioned on it.
+A landmark that no raw submap contains is, given the condensed factor's other nodes, a Gaussian that
+submaps of other places cannot change (`Resting`). It is eliminated like an old pose, so the cost of
+a tick depends on the landmarks near the robots only. The inverse is exact: with e = x − means −
+gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the other resting landmarks are conditioned on
+it.
 """
 
 from collections.abc import Collection
@@ -33,9 +33,9 @@ nodes.
 
 
 class Elimination(NamedTuple):
-    """A quadratic A, g whose numbers `out` are eliminated: x_out ~ N(step + gain d, (L Lᵀ)⁻¹).
+    """A quadratic A, g with `out` eliminated: x_out ~ N(step + gain d, (L Lᵀ)⁻¹).
 
-    lowered: gᵀA⁻¹g over them. slope, information: the quadratic over the others.
+    lowered: gᵀA⁻¹g over `out`. slope, information: over the others.
     """
 
     out: Marks
@@ -64,10 +64,10 @@ def eliminate(H: Matrix, g: Values, out: Marks) -> Elimination:
 
 
 def find_idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) -> Indices:
-    """List the nodes of landmarks that come to rest, ascending: in no submap that stays, nor in
-    another island, whose landmarks are `apart`.
+    """List the nodes of landmarks that come to rest, ascending: in no submap that stays nor in
+    another island (`apart`).
 
-    None, while no landmark rests yet and there are fewer than `first`.
+    The first ones come to rest only `first` at once.
     """
     seen = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(stays):
@@ -80,8 +80,8 @@ def find_idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) ->
 def put_to_rest(
     island: Island, union: Indices, parts: Elimination, nodes: Indices
 ) -> Resting | None:
-    """Make the resting landmarks given the nodes of `union` that remain, with the eliminated
-    landmarks `nodes`; None if there are none.
+    """Make the resting landmarks, given the nodes of `union` that remain, from the eliminated
+    `nodes`.
     """
     graph, old = island.graph, island.graph.condensed
     if not len(nodes) and (old is None or old.resting is None):

@@ -1,14 +1,14 @@
 """Saved maps of earlier days in an island: tests of their landmarks, and landmarks that moved.
 
-A saved map is a Gaussian over its landmarks in a free frame. Landmark i of it may be elsewhere
-today. Adding a displacement e of it to the map's measured place z_i lowers the joint cost by
+A saved map is a Gaussian over its landmarks in a free frame. Adding a displacement e of landmark i
+to its place z_i in it lowers the joint cost by
 
     χ²_i = g_iᵀ M_ii⁻¹ g_i,   g = W r,   M = W − W J Σ Jᵀ W,
 
-with the map's residual r, its information W, its Jacobian J and the island's covariance Σ; e is
-then M_ii⁻¹ g_i with covariance M_ii⁻¹ (Baarda 1968). If the landmark is where it was, χ²_i has two
-degrees of freedom. A landmark beyond the limit gets a second node, its former place, which the map
-alone has; the others are tested again without it, the worst first.
+with the map's residual r, information W and Jacobian J, and the island's covariance Σ; e = M_ii⁻¹
+g_i with covariance M_ii⁻¹ (Baarda 1968). Without a displacement χ²_i has two degrees of freedom. A
+landmark beyond the limit gets a second node, its former place, which the map alone has; the others
+are tested again, the worst first.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -47,9 +47,9 @@ MOST_PAIRS = 2000
 
 
 class Displacement(NamedTuple):
-    """The displacement [m] of a landmark since a saved map, in the island's frame.
+    """Displacement [m] of a landmark since a saved map, in the island's frame.
 
-    chi2: of two degrees of freedom, that it is where it was. is_apart: its former place has a node.
+    chi2: of two degrees of freedom. is_apart: its former place has a node.
     """
 
     landmark: int
@@ -65,7 +65,7 @@ class Displacement(NamedTuple):
 
 
 def maps_of(graph: Graph) -> list[Joined]:
-    """List the saved maps of an island, by name, without the station of fixes."""
+    """List the saved maps of an island by name, without the station of fixes."""
     found = (
         each
         for each in graph.submaps
@@ -79,8 +79,8 @@ def displacements(
 ) -> list[Displacement]:
     """Estimate the displacement of each landmark of a saved map that others observed, by id.
 
-    among: the nodes of landmarks to test, without those that are apart; None: all. Landmarks of
-    which the rest of the map gives no test are left out.
+    among: the nodes to test, without those apart; None: all. Landmarks that the rest of the map
+    does not determine are left out.
     """
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     nodes = saved.landmarks.tolist()
@@ -98,7 +98,7 @@ def displacements(
 
 
 def displacements_apart(island: Island, stream: Stream) -> list[Displacement]:
-    """Estimate the displacements of the landmarks whose places in a saved map are apart."""
+    """Estimate the displacements of landmarks apart from a saved map."""
     landmarks = island.graph.landmarks
     return [
         _apart(island, id_, former, landmarks[id_])
@@ -115,8 +115,8 @@ def _observed_by_others(graph: Graph, saved: Joined) -> set[int]:
 def _tests(
     island: Island, saved: Joined, tested: Sequence[int]
 ) -> list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float] | None]:
-    """Compute (displacement, covariance, χ²) of landmarks, by their indices in the saved map; None
-    where the rest of the map does not determine it.
+    """Compute (displacement, covariance, χ²) of landmarks, by index in the saved map; None where
+    undetermined.
     """
     if not tested:
         return []
@@ -178,7 +178,7 @@ def _apart(island: Island, id_: int, former: int, present: int) -> Displacement:
 
 
 def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
-    """Give landmarks of a saved map a node of their former place, apart from today's."""
+    """Give landmarks of a saved map a node of their former place."""
     graph, state = island.graph, island.state
     stream = saved.contribution.stream
     nodes = {node: k for k, node in enumerate(saved.landmarks.tolist())}
@@ -193,7 +193,7 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
 
 
 def reunite(island: Island, stream: Stream, id_: int) -> Island:
-    """Make a landmark's former place in a saved map and its present one the same again."""
+    """Make a landmark's former place and its present one the same again."""
     graph = island.graph
     former = {at: node for at, node in graph.former.items() if at != (stream, id_)}
     node = graph.former[stream, id_]
@@ -207,10 +207,7 @@ def reunite(island: Island, stream: Stream, id_: int) -> Island:
 def next_change(
     island: Island, chance: float, nodes: Collection[int] | None = None
 ) -> tuple[Joined, Displacement] | None:
-    """Find the landmark that disagrees most with its place in a saved map, beyond chance.
-
-    nodes: the landmarks to test; None: all.
-    """
+    """Find the landmark that disagrees most with its place in a saved map, beyond chance."""
     limit = chi2_limit(2, chance)
     found = [
         (each.chi2, saved, each)
@@ -225,7 +222,7 @@ def next_change(
 
 
 def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
-    """List the landmarks apart from their former places although both are one within chance."""
+    """List the landmarks apart whose two places are one within chance."""
     limit = chi2_limit(2, chance)
     return [
         (saved.contribution.stream, each.landmark)
@@ -236,8 +233,8 @@ def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
 
 
 class Replaced(NamedTuple):
-    """An error of a robot that contradicts the one in a saved map: both, and χ² of one degree of
-    freedom that they are equal.
+    """An error of a robot today and in a saved map; χ² of one degree of freedom that they are
+    equal.
     """
 
     error: RobotBias
@@ -248,7 +245,7 @@ class Replaced(NamedTuple):
 
 
 def replaced_sensors(island: Island) -> list[Replaced]:
-    """List the robots' errors that differ from those in a saved map beyond chance."""
+    """List the robots' errors that differ from a saved map beyond chance."""
     graph, limit = island.graph, chi2_limit(1, FALSE_ALARM)
     saved_at = {node: of for of, node in graph.remembered.items()}
     found = []
@@ -265,7 +262,7 @@ def replaced_sensors(island: Island) -> list[Replaced]:
 
 
 def contradiction(island: Island) -> tuple[Stream, str] | None:
-    """Find a saved map of which most of the landmarks seen today are elsewhere, with the reason."""
+    """Find a saved map with most of today's landmarks elsewhere, with the reason."""
     for saved in maps_of(island.graph):
         stream = saved.contribution.stream
         moved = sum(of == stream for of, _ in island.graph.former)
@@ -282,9 +279,9 @@ def contradiction(island: Island) -> tuple[Stream, str] | None:
 def disagreeing(
     main: Island, other: Island, ids: Sequence[int], confidence: float
 ) -> list[int] | str:
-    """Find the landmarks of two islands, one with a saved map, that moved between them.
+    """Find the landmarks that moved between two islands, one with a saved map.
 
-    Returns the reason if no more than half of the landmarks agree within `confidence`.
+    Returns the reason if no more than half agree within `confidence`.
     """
     n = len(ids)
     in_main = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
@@ -306,9 +303,8 @@ def agreeing(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the landmarks of two maps, N(a, A) and N(b, B), that one rigid motion places.
 
-    Where not all agree within the limit of χ², the largest set that the motion of a pair places is
-    taken; then those that disagree with the rest are removed, the worst first, and those that agree
-    are added again.
+    Starts at the largest set by the motion of a pair; then those that disagree are removed, the
+    worst first, and those that agree added again.
     """
     agree = np.ones(len(a), np.bool_)
     if _disagreements(a, A, b, B, agree).max() > limit:
@@ -346,9 +342,8 @@ def _largest_agreement(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the most landmarks that the rigid motion of one pair places within the limit.
 
-    The motion from landmarks i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps the middle to the middle. A
-    landmark's difference has the covariance of both its places, less what they have in common with
-    those of the pair.
+    The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle. A difference has the
+    covariance of both places, less what they share with the pair.
     """
     n = len(a)
     best = np.zeros(n, np.bool_)
@@ -377,7 +372,7 @@ def _largest_agreement(
 
 
 def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, "n 2 2"]:
-    """Covariance of each landmark relative to the middle of landmarks i and j."""
+    """Covariance of each landmark relative to the middle of i and j."""
     n = len(P) // 2
     grid = P.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
     own = grid[np.arange(n), np.arange(n)]
@@ -404,11 +399,11 @@ def _disagreements(
     B: Float[np.ndarray, "m m"],
     agree: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """χ² of two degrees of freedom of each landmark against the others that agree.
+    """χ² of two degrees of freedom of each landmark against those that agree.
 
-    With the differences d = a − (R b + t) at the motion of the landmarks I that agree, their
-    covariance D and their Jacobian J by the motion of covariance N: of one in I it is that of the
-    module's equation; another one k is predicted as D_kI D_II⁻¹ d_I.
+    With d = a − (R b + t) at the motion of the agreeing landmarks I, their covariance D and
+    Jacobian J by the motion of covariance N: in I by the module's equation; any other k is
+    predicted as D_kI D_II⁻¹ d_I.
     """
     n, inside = len(a), np.repeat(agree, 2)
     of = np.ix_(inside, inside)

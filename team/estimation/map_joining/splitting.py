@@ -1,8 +1,8 @@
 """Split a node of a graph between its submaps, and drop a submap: hypotheses about a misfit.
 
-A landmark that was moved is two landmarks, one of the submaps before and one of those after. A
-robot that was carried off at a seam ends one submap at another pose than that at which it starts
-the next. Where its own submap is spoilt, the graph is solved without it.
+A moved landmark is two landmarks, before and after; a robot carried off at a seam ends one submap
+at another pose than the next one's start. Where its own submap is spoilt, the graph is solved
+without it.
 """
 
 from collections.abc import Collection
@@ -31,7 +31,7 @@ TOLERANCE = 1e-4
 
 
 def robust(island: Island) -> Island:
-    """Solve an island with a robust loss, from its state, if it has none."""
+    """Solve an island with a robust loss, if it has none."""
     settings = island.settings
     if settings.robust:
         return island
@@ -42,8 +42,8 @@ def robust(island: Island) -> Island:
 def split(
     island: Island, node: int, submaps: Collection[int], value: Float[np.ndarray, " k"]
 ) -> Island:
-    """Give some submaps, by place in the graph, a node of their own in place of `node`, the last
-    one, at a value.
+    """Give some submaps, by place in the graph, a node of their own, the last one, in place of
+    `node`.
     """
     grown, state, new = append_nodes(island.graph, island.state, [value])
     split_up = tuple(
@@ -56,7 +56,7 @@ def split(
 
 
 def without(island: Island, places: Collection[int]) -> Island:
-    """Drop the submaps at some places in the graph; a pose that nothing measures is fixed."""
+    """Drop submaps by place in the graph; a pose that nothing measures is fixed."""
     graph = island.graph
     keep = np.array([at not in places for at in range(len(graph.submaps))], np.bool_)
     left = tuple(each for at, each in enumerate(graph.submaps) if keep[at])
@@ -73,9 +73,7 @@ def without(island: Island, places: Collection[int]) -> Island:
 
 
 def resolved(island: Island) -> tuple[Island, float] | None:
-    """Solve from the state, at final robust scales; return the solution and its cost; None without
-    one.
-    """
+    """Solve at final robust scales; return the solution and its cost."""
     island, damping = age_factors(island, FULL_AGE), 0.0
     try:
         for _ in range(ITERATIONS):

@@ -1,8 +1,8 @@
-"""The factor graph of one frame: poses, landmarks and biases; submaps, inter-robot measurements and
+"""The factor graph of one frame: poses, landmarks, biases; submaps, inter-robot measurements,
 priors.
 
-A `Graph` is the structure, independent of the state. Every function returns new values. The value
-of an added node is composed from the nodes already in the graph.
+A `Graph` is the structure, independent of the state. An added node's value is composed from the
+nodes already in the graph.
 """
 
 from collections.abc import Mapping, Sequence
@@ -66,8 +66,8 @@ NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 class Prior(NamedTuple):
     """A pose (x, y, theta), or biases jointly, ~ N(mean, information⁻¹).
 
-    rank: of the information, which may be singular, as of a difference of biases. is_of_robot:
-    whether it is of one robot's bias, so that its loss is that of Student's t.
+    rank: of the information, singular as of a difference of biases. is_of_robot: one robot's bias,
+    with the loss of Student's t.
     """
 
     nodes: tuple[int, ...]
@@ -89,12 +89,11 @@ class Prior(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """A submap in the graph: its start, end and pose nodes, its landmarks by id, its biases.
+    """A submap in the graph: its start, end and pose nodes, landmarks by id, biases.
 
-    biases: the error of each row of `sensitivity`; those with a node of the whole team stand last.
-    sensitivity: ∂mean/∂b, one row for each bias node: a robot's own error and the team's common one
-    add up. The row of a marker is that of the scale of the ranges, restricted to that marker's
-    landmark.
+    biases: the error of each row of `sensitivity`; those of the whole team stand last. sensitivity:
+    ∂mean/∂b of each bias node: a robot's own error and the team's add up. A marker's row is that of
+    the ranges' scale, restricted to its landmark.
     """
 
     contribution: Contribution
@@ -110,7 +109,7 @@ class Joined(NamedTuple):
         own: tuple[Bias, ...],
         common: tuple[CommonError, ...],
     ) -> "Joined":
-        """Make a submap whose `common` errors have a node of the whole team. Those of single robots
+        """Make a submap whose `common` errors have a node of the whole team; those of single robots
         in a saved map stand first.
         """
         biases = (*own, *common)
@@ -136,7 +135,7 @@ class Joined(NamedTuple):
 
     @property
     def curvature(self) -> Float[np.ndarray, "B _"]:
-        """∂²mean/∂b² of each bias; zero of errors that the team has in common."""
+        """∂²mean/∂b² of each bias; zero of common errors."""
         local, rows = self.contribution.local, np.zeros_like(self.sensitivity)
         for at, error in enumerate(self.biases):
             if isinstance(error, str) and self.biases.count(error) == 1:
@@ -170,7 +169,7 @@ def _scaling(error: SharedError) -> Bias:
 
 
 class Encounter(NamedTuple):
-    """An inter-robot measurement in the graph, between the pose nodes of observer and teammate."""
+    """An inter-robot measurement between the pose nodes of observer and teammate."""
 
     sighting: InterRobotFactor
     observer: int
@@ -181,17 +180,15 @@ class Encounter(NamedTuple):
 class Graph:
     """The nodes in the order of their addition, and the factors between them.
 
-    streams: nodes of each stream: its start, then the end pose of submap 0, 1, … landmarks: node of
-    each landmark id. poses: node of each further pose, by (stream, stamp). biases: node of each
-    error that the submaps of a stream share. common: node of each error that all streams share;
-    these and `biases` have one number. remembered: node of each error of a robot on the days of a
-    saved map, by the map. offset: index in the state of each node's first number; the last entry is
-    the state's length. fixed: nodes that are constants (exactly known initial poses,
-    the gauge). submaps, sightings: in the order of their addition. condensed: the quadratic that
-    replaces older submaps, if any (`condensing`). gone: sequence behind a stream's submaps in
-    `condensed`; `streams` begins after them. former: the node of a moved landmark's old place, by
-    (saved map, id); the id is that of its present place. memory: observations of the condensed
-    submaps for data association, where landmarks have no names.
+    streams: start, then end pose of submap 0, 1, … of each stream. landmarks: node of each id.
+    poses: node of each further pose, by (stream, stamp). biases: node of each error that a stream's
+    submaps share; common: of each error that all streams share, in one number with `biases`;
+    remembered: of each error of a robot on the days of a saved map, by the map. offset: index in
+    the state of each node's first number; the last entry is the state's length. fixed: constant
+    nodes (exactly known initial poses, the gauge). condensed: the quadratic that replaces older
+    submaps (`condensing`). gone: sequence behind a stream's submaps in `condensed`, at which
+    `streams` begins. former: the node of a moved landmark's old place, by (saved map, id). memory:
+    observations of the condensed submaps for data association.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -249,7 +246,7 @@ class Graph:
 
     @cached_property
     def landmark_start(self) -> Indices:
-        """The first landmark of each submap among those of all submaps, and their number."""
+        """First landmark of each submap among those of all submaps, and their number."""
         return _starts([len(each.contribution.local.ids) for each in self.submaps])
 
     @cached_property
@@ -333,12 +330,12 @@ EMPTY_GRAPH = Graph(
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
-    """Return the offsets of consecutive pieces of these lengths, and the end."""
+    """Offsets of consecutive pieces, and the end."""
     return np.cumsum(np.array([0, *lengths], dtype=np.int64))
 
 
 class _Growth:
-    """The nodes being added to a graph, with their values; used inside `add_submaps` only."""
+    """The nodes being added to a graph, inside `add_submaps` only."""
 
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
@@ -375,13 +372,13 @@ def add_submaps(
     common_bias_sigma: Mapping[CommonBias, float] = NONE_IN_COMMON,
     numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
 ) -> tuple[Graph, Values]:
-    """Add submaps to a graph, in the given order; a stream without an initial pose begins at 0.
+    """Add submaps to a graph, in order.
 
-    A new end pose is start ∘ local end pose, a pose node likewise; a new landmark is placed by the
-    first submap that observes it. A stream without an initial pose is fixed at (0, 0, 0): the gauge
-    of its frame. A bias has scale bias_sigma about 0 (submaps with one that has no scale are taken
-    without biases), a common error is N(0, common_bias_sigma²). numbers: for
-    submaps with unnamed landmarks, the team's number of each landmark; other submaps contain them.
+    A new end pose or pose node is start ∘ local pose; the first submap that observes a landmark
+    places it. A stream without an initial pose is fixed at (0, 0, 0), the gauge of its frame. A
+    bias has scale bias_sigma about 0 (submaps with an unscaled one are taken without biases), a
+    common error is N(0, common_bias_sigma²). numbers: the team's number of each landmark, for
+    submaps with unnamed ones.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -441,7 +438,7 @@ def _add_errors(
     bias_sigma: Mapping[Bias, float],
     common: Mapping[CommonError, float],
 ) -> list[Prior]:
-    """Add the nodes that a submap's own and common errors lack; return their priors."""
+    """Add the nodes of errors that a submap lacks; return their priors."""
     priors = []
     for bias in own:
         if (stream, bias) not in growth.biases:
@@ -457,8 +454,8 @@ def _add_errors(
 def _remember(
     growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> tuple[list[int], list[Prior]]:
-    """Add the nodes of the errors of single robots in a saved map; return them with their priors,
-    and with their likelihood by the map's measurements.
+    """Add the nodes of the errors of single robots in a saved map; return them with their priors
+    and the map's likelihood of them.
     """
     own, stream = contribution.own, contribution.stream
     nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
@@ -476,10 +473,10 @@ def _remember(
 
 
 def _tie_biases(graph: Graph) -> Graph:
-    """Tie each robot's biases to those of its name in a saved map.
+    """Tie each robot's biases to those of its name in a saved map, by name the first.
 
     b = b₁ + d with the drift d since then of scale DRIFT, Student's t like the prior, which it
-    replaces: b₁ has that prior. Of several saved maps the first by name counts.
+    replaces: b₁ has that prior.
     """
     if not graph.remembered:
         return graph
@@ -504,7 +501,6 @@ def _tie_biases(graph: Graph) -> Graph:
 def _drop_unscaled_biases(
     contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> Contribution:
-    """Take a submap with a bias that has no scale without biases."""
     if contribution.own.errors or bias_sigma.keys() >= {*contribution.local.biases}:
         return contribution
     return replace(contribution, local=contribution.local.without_biases)
@@ -513,9 +509,9 @@ def _drop_unscaled_biases(
 def _common_errors(
     contribution: Contribution, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
-    """Return the common errors of a submap with their sigmas, in order.
+    """Return the common errors of a submap with their sigmas.
 
-    The markers of unnamed landmarks are states of the full solution alone (`markers`); those of an
+    Markers of unnamed landmarks are states of the full solution alone (`markers`); those of an
     earlier day are part of a saved map's covariance.
     """
     local = contribution.local
@@ -536,10 +532,8 @@ def remove_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> tuple[Graph, Indices]:
-    """Remove eliminated poses and landmarks, keep the marked factors; return each node's new
-    number.
-
-    The eliminated poses of a stream are its first ones. Condensed factors are left out.
+    """Remove eliminated poses (a stream's first ones) and landmarks, keep the marked factors;
+    return each node's new number. Condensed factors are left out.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
     streams, gone, out = {}, dict(graph.gone), eliminated.tolist()
@@ -563,10 +557,9 @@ def remove_nodes(
 
 
 def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
-    """Renumber the nodes of a graph; some are removed or become one.
+    """Renumber the nodes of a graph but for condensed factors.
 
-    node_of: new number of each node. stays: origins of the new nodes, ascending. Condensed factors
-    keep their numbers.
+    node_of: new number of each node. stays: origins of the new nodes, ascending.
     """
     new = node_of.tolist()
     return replace(
@@ -592,8 +585,8 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
 def append_nodes(
     graph: Graph, state: Values, values: Sequence[Values], fixed: Sequence[bool] = ()
 ) -> tuple[Graph, Values, range]:
-    """Append nodes at these values, free ones unless `fixed` marks them; return the graph, the
-    state and the new nodes, which no factor contains yet.
+    """Append nodes at these values, which no factor contains yet; return the graph, the state and
+    the nodes.
     """
     marks = np.array(fixed or [False] * len(values), np.bool_)
     grown = replace(
@@ -610,8 +603,8 @@ def add_former_place(
 ) -> tuple[Graph, Values]:
     """Separate a landmark's place in a saved map from its present one.
 
-    The map's factor gets a node of its own at `value`; with no other observation (`shared`) it
-    keeps the node, which is no landmark of today any more.
+    The map's factor gets a node at `value`; with no other observation (not `shared`) it keeps the
+    node, which is no present landmark any more.
     """
     node = graph.landmarks[id_]
     if not shared:
@@ -629,29 +622,27 @@ def add_former_place(
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
-    """Return the robot's pose node at this stamp, in its first incarnation that has one, or
-    None.
-    """
+    """Return the robot's pose node at this stamp, in its first incarnation with one."""
     incarnations = sorted(incarnation for name, incarnation in graph.streams if name == robot)
     found = (graph.poses.get(((robot, incarnation), stamp_ns)) for incarnation in incarnations)
     return next((node for node in found if node is not None), None)
 
 
 def encounter_of(graph: Graph, sighting: InterRobotFactor) -> Encounter | None:
-    """Make the inter-robot measurement between its pose nodes; None while the graph lacks one."""
+    """Tie the inter-robot measurement to its nodes; None while one is missing."""
     observer, teammate = observer_of(graph, sighting), teammate_of(graph, sighting)
     return None if observer is None or teammate is None else Encounter(sighting, observer, teammate)
 
 
 def observer_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
-    """Return the observer's node, the station's for a fix; None if the graph lacks it."""
+    """Return the observer's node, the station's for a fix."""
     if sighting.is_fix:
         return graph.streams[STATION][0] if STATION in graph.streams else None
     return graph.poses.get((sighting.stream, sighting.stamp_ns))
 
 
 def teammate_of(graph: Graph, sighting: InterRobotFactor) -> int | None:
-    """Return the node of the measured pose; None if the graph lacks it."""
+    """Return the node of the measured pose."""
     if sighting.is_fix:
         return graph.poses.get((sighting.stream, sighting.stamp_ns))
     return pose_node(graph, sighting.teammate, sighting.stamp_ns)
@@ -667,7 +658,7 @@ def merge_graphs(
     """Join both graphs in the main frame; landmarks with equal ids become one, at the main graph's
     value.
 
-    The other frame's fixed nodes (its gauge) become free, so none of its submaps may be condensed.
+    The other frame's gauge becomes free, so none of its submaps may be condensed.
     """
     assert other.condensed is None, "a condensed factor is linearised in its own frame"
     common = {
@@ -711,8 +702,6 @@ def merge_graphs(
 def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
     """Renumber landmarks; those with the same new number become one node, at the value of the
     first.
-
-    becomes: the new number of each renumbered landmark.
     """
     first: dict[int, int] = {}
     remaining = np.ones(len(graph.fixed), np.bool_)
