@@ -3,9 +3,8 @@
     python -m tests.across                 waypoints, a piece of thesis, a piece of a data set
     python -m tests.across --only thesis   the cases whose name begins so
 
-The measurements are made once. Each class of processors is a process that is told by its
-environment which one to take for its own: the core, NumPy's loops, the C library and OpenBLAS all
-listen. A class that this processor has not got can not be tried.
+One process for each class, selected by environment variables of the core, NumPy, the C library and
+OpenBLAS. The processor must have the class.
 """
 
 import argparse
@@ -52,13 +51,13 @@ def begun(scenario: Scenario, seconds: float) -> Scenario:
 
 
 def measured(name: str, path: Path) -> None:
-    """Writes a case's scenario and measurements, made by this process."""
+    """Write a case's scenario and measurements."""
     scenario = CASES[name]()
     path.write_bytes(pickle.dumps((scenario, bits.streams_of(scenario))))
 
 
 def digests(path: Path) -> dict[str, str]:
-    """Hash all messages of each channel in a run on these measurements."""
+    """Hash the messages of each channel in a run on these measurements."""
     scenario, streams = pickle.loads(path.read_bytes())
     found: dict[str, hashlib._Hash] = {}
     for sample in bits.run_team(scenario, streams):
@@ -68,7 +67,7 @@ def digests(path: Path) -> dict[str, str]:
 
 
 def compared(name: str, classes: int) -> list[str]:
-    """List the channels that differ between the classes of processors, one a line."""
+    """List the channels that differ between the classes, one a line."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "case"
         measured(name, path)
@@ -97,7 +96,7 @@ def _elsewhere(path: Path, extra: Mapping[str, str]) -> dict[str, str]:
 
 
 def main() -> int:
-    """1 where the bits of two classes differ."""
+    """Return 1 where the bits of two classes differ."""
     parser = argparse.ArgumentParser(description="The bits of a run on other processors.")
     parser.add_argument("--only", default="", metavar="NAME", help="the cases that begin so")
     parser.add_argument("--classes", type=int, default=len(CLASSES), help="how many of them")

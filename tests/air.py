@@ -1,4 +1,4 @@
-"""A seeded, simulated radio in team time: reach, delay, loss, duplicates, and link capacity."""
+"""Seeded radio in team time: reach, delay, loss, duplicates, link capacity."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,6 @@ Reach = Callable[[str, str, int], bool]
 
 
 def always(one: str, other: str, now_ns: int) -> bool:
-    """Reach between all nodes."""
     return True
 
 
@@ -40,7 +39,7 @@ def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
 
 
 def meetings(windows: Sequence[Meeting]) -> Reach:
-    """Reach within the given meetings only."""
+    """Reach within these meetings only."""
 
     def reach(one: str, other: str, now_ns: int) -> bool:
         return any(
@@ -52,9 +51,7 @@ def meetings(windows: Sequence[Meeting]) -> Reach:
 
 @dataclass
 class Air:
-    """loss, duplicates: probabilities per message. delay_ns: least and greatest; messages overtake.
-    bytes_per_s: per link.
-    """
+    """delay_ns: (least, greatest), so that messages overtake. bytes_per_s: per link."""
 
     reach: Reach = always
     loss: float = 0.0
@@ -67,7 +64,6 @@ class Air:
     _number: int = 0
 
     def arrivals(self, sender: str, to: str, size: int, now_ns: int) -> list[int]:
-        """Arrival times of a message: none if lost, two if duplicated."""
         if not self.reach(sender, to, now_ns):
             return []
         self.sent[sender, to] = self.sent.get((sender, to), 0) + size

@@ -1,13 +1,11 @@
-"""The bits of final maps: what a change that is only about structure must not move.
+"""Bits of final maps, which a change of structure alone must not move.
 
     python -m tests.bits                 computes every case and compares it with the table
     python -m tests.bits --only pair     the cases whose name begins so
     python -m tests.bits --rewrite       writes what was computed into the table
 
-A row holds three hashes: of the encoded final map (another version of a message or of a
-configuration changes it), of its means and covariance alone, and of each robot's last own pose and
-map. The table names the libraries whose random numbers and sums it depends on, and no level of a
-processor: the rows are equal with `NPY_DISABLE_CPU_FEATURES` of all that is above SSE.
+A row hashes the encoded final map, its means and covariance alone, and each robot's last own pose
+and map. The rows depend on the libraries that the table names, not on the processor's features.
 """
 
 import argparse
@@ -41,7 +39,7 @@ Row = Mapping[str, str]
 
 
 def world(name: str, seed: int = 1, **changes: object) -> Scenario:
-    """A built-in scenario with this seed and other fields of its world."""
+    """A built-in scenario with this seed and these fields of its world."""
     scenario = with_options(load(name), seed=seed)
     return msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, **changes)
@@ -49,19 +47,16 @@ def world(name: str, seed: int = 1, **changes: object) -> Scenario:
 
 
 def pair(estimator: str, fusion: str) -> Scenario:
-    """A small world for an estimator and a rule."""
     return with_options(world("thesis", steps=PAIR_STEPS), estimator=estimator, fusion=fusion)
 
 
 def outliers() -> Scenario:
-    """Three measurements in ten are outliers."""
     scenario = world("thesis", outlier_share=0.3)
     central = msgspec.structs.replace(scenario.central, landmark_submaps=2)
     return msgspec.structs.replace(scenario, central=central)
 
 
 def utias(number: int) -> Scenario:
-    """A UTIAS data set beside the project."""
     return with_options(load("utias"), dataset=SETS / f"MRCLAM_Dataset{number}.zip")
 
 
@@ -86,12 +81,11 @@ CASES: Mapping[str, Callable[[], Scenario]] = {
 
 
 def is_here(name: str) -> bool:
-    """Whether the data that a case needs is beside the project."""
     return not name.startswith("utias") or (SETS / f"MRCLAM_Dataset{name[-1]}.zip").is_file()
 
 
 def computed(name: str) -> Row:
-    """The hashes of a case, computed in memory."""
+    """Compute a case's hashes in memory."""
     scenario = CASES[name]()
     samples = list(run_team(scenario, streams_of(scenario)))
     fused = final_map(samples)
@@ -103,7 +97,7 @@ def computed(name: str) -> Row:
 
 
 def _own_estimates(samples: list[Sample]) -> Iterator[bytes]:
-    """The numbers of each robot's last own pose and last own map."""
+    """Numbers of each robot's last own pose and own map."""
     last = {s.key: s for s in samples if s.key.endswith(("/own/pose", "/own/map"))}
     for key in sorted(last):
         _, _, message = opened(last[key])
@@ -116,7 +110,6 @@ def _hash(data: bytes) -> str:
 
 
 def machine() -> dict[str, str]:
-    """Processor and libraries on which the bits depend."""
     return {
         "processor": platform.machine(),
         "numpy": np.__version__,
@@ -125,12 +118,12 @@ def machine() -> dict[str, str]:
 
 
 def table() -> dict[str, dict[str, str]]:
-    """The committed rows, and `machine`: what they were computed with."""
+    """The committed rows; `machine`: processor and libraries of their computation."""
     return json.loads(TABLE.read_text("utf-8")) if TABLE.is_file() else {}
 
 
 def differences(names: list[str]) -> Iterator[tuple[str, Row, str]]:
-    """Each case as it is now, and what differs from the table; empty: nothing."""
+    """Cases that differ from the table, with the differences."""
     committed = table()
     for name in names:
         now = computed(name)
@@ -140,7 +133,7 @@ def differences(names: list[str]) -> Iterator[tuple[str, Row, str]]:
 
 
 def main() -> int:
-    """1 where an estimate differs from the table."""
+    """Return 1 where an estimate differs from the table."""
     parser = argparse.ArgumentParser(description="The bits of final maps against the table.")
     parser.add_argument("--only", default="", metavar="NAME", help="the cases that begin so")
     parser.add_argument("--rewrite", action="store_true", help="write what was computed")

@@ -1,4 +1,4 @@
-"""A headless Chromium, driven over its DevTools protocol: as much of it as our tests need."""
+"""Headless Chromium, driven over the DevTools protocol."""
 
 import base64
 import json
@@ -24,12 +24,11 @@ START_S = 60.0
 
 
 def chromium() -> str | None:
-    """The path of a Chromium on this machine; None where there is none."""
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
 class Page:
-    """One page: go somewhere, ask it, press a key or the mouse, take its picture."""
+    """A page of the browser."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -40,7 +39,6 @@ class Page:
         self.call("Log.enable")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """One command of the protocol; its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
@@ -60,14 +58,12 @@ class Page:
                 self.errors.append(f"{entry['text']} {entry.get('url', '')}")
 
     def size(self, width: int, height: int, ratio: float = 1.0, *, touch: bool = False) -> None:
-        """The window's size in CSS pixels."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=ratio, mobile=touch,
         )  # fmt: skip
 
     def open(self, url: str) -> None:
-        """Go there; returns when the page has been loaded."""
         self.call("Page.navigate", url=url)
         there = f"location.href === {json.dumps(url)} && document.readyState === 'complete'"
         end = time.monotonic() + START_S
@@ -79,7 +75,6 @@ class Page:
         raise AssertionError(f"{url} was not loaded within {START_S} s; {self.errors}")
 
     def ask(self, expression: str) -> Any:
-        """The value of a JavaScript expression, awaited."""
         result = self.call(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -88,11 +83,9 @@ class Page:
         return result["result"].get("value")
 
     def text(self, selector: str) -> str:
-        """Text of an element."""
         return str(self.ask(f"document.querySelector({json.dumps(selector)})?.textContent ?? ''"))
 
     def wait(self, expression: str, timeout_s: float = 60.0) -> Any:
-        """Until the expression holds; its value."""
         end = time.monotonic() + timeout_s
         while not (value := self.ask(expression)):
             assert time.monotonic() < end, f"not within {timeout_s} s: {expression}; {self.errors}"
@@ -100,7 +93,6 @@ class Page:
         return value
 
     def drag(self, begin: tuple[float, float], end: tuple[float, float]) -> None:
-        """Press the mouse, move it in steps, let go."""
         mouse = {"button": "left", "buttons": 1, "clickCount": 1}
         self.call("Input.dispatchMouseEvent", type="mousePressed", x=begin[0], y=begin[1], **mouse)
         for k in range(1, 11):
@@ -109,7 +101,6 @@ class Page:
         self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], **mouse)
 
     def click(self, selector: str) -> None:
-        """Press the mouse on an element's middle."""
         x, y = self.ask(
             f"(() => {{ const b = document.querySelector({json.dumps(selector)})"
             ".getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
@@ -117,14 +108,13 @@ class Page:
         self.drag((x, y), (x, y))
 
     def picture(self, path: Path, *, whole: bool = False) -> None:
-        """Write the visible part, or the whole page, as PNG."""
         data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         path.write_bytes(base64.b64decode(data["data"]))
 
 
 @contextmanager
 def browsing(program: str) -> Iterator[Page]:
-    """A page of a Chromium of its own, that ends with the context."""
+    """Open a page in a Chromium that ends with the context."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [program, *_FLAGS, f"--user-data-dir={profile}", "about:blank"],
@@ -149,7 +139,7 @@ def browsing(program: str) -> Iterator[Page]:
 
 
 def _port(profile: Path, process: subprocess.Popen[bytes]) -> int:
-    """Where the browser listens: it writes a file when it does."""
+    """Port of the browser, from the file that it writes."""
     file = profile / "DevToolsActivePort"
     end = time.monotonic() + START_S
     while not (file.exists() and file.read_text().strip()):

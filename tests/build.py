@@ -1,4 +1,4 @@
-"""Builders of messages for tests: every field that a test does not state has an ordinary value."""
+"""Builders of messages, with an ordinary value for each field not given."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +25,7 @@ ORDINARY: dict[str, Any] = {
 
 
 def _built(kind: Callable[..., M], **fields: object) -> M:
-    """A message of this class; its node is the robot's, where a test names no other."""
+    """Build a message; its node is the robot's unless given."""
     names: tuple[str, ...] = getattr(kind, "__struct_fields__")  # noqa: B009 - msgspec's
     required = names[: len(names) - len(getattr(kind, "__struct_defaults__"))]  # noqa: B009
     values = {name: ORDINARY[name] for name in required if name in ORDINARY} | fields
@@ -73,7 +73,7 @@ requested = partial(_built, m.Requested)
 
 
 def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
-    """The end of the run: the number of measurements of each robot's stream."""
+    """The end of the run, with the number of measurements of each stream."""
     streams = (
         m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
         for robot, count in measurements.items()
@@ -82,7 +82,7 @@ def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
 
 
 def version(**last: int) -> tuple[m.VersionEntry, ...]:
-    """Version vector of a set: the last sequence of each robot's first incarnation."""
+    """Version vector of a set: last sequence of each robot's first incarnation."""
     return tuple(
         m.VersionEntry(robot=robot, incarnation=1, sequence=sequence)
         for robot, sequence in last.items()

@@ -1,7 +1,4 @@
-"""Settings of every test run: one BLAS thread, checked shapes, repeatable examples.
-
-Two workers run system tests one by one, beside the others.
-"""
+"""Settings of every test run: one BLAS thread, checked shapes, repeatable examples."""
 
 import os
 from pathlib import Path
@@ -35,7 +32,6 @@ install_import_hook(tests.shapes.modules_with_shapes(), f"{tests.shapes.__name__
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before a test's own fixtures; those of a module are checked with its first test."""
     tests.shapes.begin_test()
     from teamslam.team.wire.logs import LIMITS  # behind the import hook
 
@@ -63,9 +59,7 @@ BESIDE = 5
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Of a run of all tests each worker collects another part first: what one has compiled to byte
-    code in a fresh clone, the others read.
-    """
+    """Let each worker of a full run collect another part first, so that they share byte code."""
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     if number and config.args == config.getini("testpaths"):
         (folder,) = config.args
@@ -78,7 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Those of FIRST in its order, then the others by their files."""
+    """Order the tests of FIRST before the others."""
 
     def rank(item: pytest.Item) -> tuple[int, str]:
         first = (k for k, at in enumerate(FIRST) if item.nodeid.startswith(at))
@@ -93,10 +87,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class Shares(LoadScopeScheduling):
-    """A worker gets a file, whose tests share what is made for them.
+    """Scheduler that gives a worker whole files, whose fixtures are shared.
 
-    Files of tests/system go to the first TEAMS workers while there are others for the rest, so that
-    many teams do not starve each other. Much of their time they wait.
+    Files of tests/system go to the first TEAMS workers while other files are left, so that few
+    teams
+    run at a time.
     """
 
     def _split_scope(self, nodeid: str) -> str:
@@ -113,6 +108,6 @@ class Shares(LoadScopeScheduling):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Shares:
-    """Shares are given out in the order of the tests, not by how many tests they hold."""
+    """Distribute files in the order of the tests."""
     config.option.loadscopereorder = False
     return Shares(config, log)

@@ -1,7 +1,6 @@
-"""`python -m pytest -p tests.cost …`: the CPU seconds of each file, and of the dearest tests.
+"""`python -m pytest -p tests.cost …`: CPU seconds of each file and of the most expensive tests.
 
-On a busy machine wall time says little. What a test's processes took counts once they were waited
-for; what is made for a file counts with its first test.
+A test's processes count once they were waited for; a file's fixtures count with its first test.
 """
 
 import resource
@@ -17,7 +16,7 @@ _costs: Counter[str] = Counter()
 
 
 def cpu_s() -> float:
-    """CPU time [s] of this process and of its children that have ended."""
+    """CPU time [s] of this process and its ended children."""
     used = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in used)
 
@@ -30,7 +29,7 @@ def pytest_runtest_logstart() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(call: pytest.CallInfo[Any]) -> Generator[None, Any, Any]:
-    """The last report of a test carries its cost to whoever prints it, over xdist too."""
+    """Attach a test's cost to its last report, which xdist transfers."""
     report = yield
     if call.when == "teardown":
         report.user_properties.append(("cpu_s", cpu_s() - _began))

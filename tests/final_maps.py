@@ -10,15 +10,10 @@ NEVER_S = 1e6
 
 
 def final_only(scenario: Scenario) -> Scenario:
-    """The scenario without running maps but the first, and without poses: half of a run's time.
-
-    The final map is that of the set of submaps, whatever was published before (law 2).
-    """
     robots = tuple(msgspec.structs.replace(each, pose_s=NEVER_S) for each in scenario.robots)
     central = msgspec.structs.replace(scenario.central, broadcast_s=NEVER_S)
     return msgspec.structs.replace(scenario, robots=robots, central=central)
 
 
 def scenario_in(folder: Path) -> Scenario:
-    """The scenario of a data set's folder, on these data."""
     return with_options(load(folder / "scenario.toml"), dataset=folder)

@@ -1,7 +1,7 @@
-"""Network namespaces for the processes of a team: what a container has of a network.
+"""Network namespaces for the processes of a team.
 
-All of it hangs on a bridge in the router's namespace: nothing of this machine's network changes,
-and nothing that is sent can leave. Needs root and `ip` (Linux).
+All hang on a bridge in the router's namespace, apart from this machine's network. Needs root and
+`ip` (Linux).
 """
 
 import os
@@ -22,10 +22,11 @@ def ip(*words: str) -> None:
 
 @contextmanager
 def network(nodes: Sequence[str]) -> Iterator[dict[str, str]]:
-    """A namespace for the router with a bridge, and one on it for each node; their names.
+    """Make a namespace with a bridge for the router, and one on it for each node; yield their
+    names.
 
-    In each the names of the router and of the nodes resolve. Raises subprocess.CalledProcessError
-    where namespaces are not permitted.
+    The names resolve in each. Raises subprocess.CalledProcessError where namespaces are not
+    permitted.
     """
     names = {node: f"teamslam-{os.getpid()}-{k}" for k, node in enumerate(["router", *nodes])}
     hosts = "".join(f"{NET}.{k} {node}\n" for k, node in enumerate(names, 1))

@@ -1,7 +1,4 @@
-"""A team without a centre in one process: real peer nodes, a simulated radio, team time.
-
-The world reaches every robot, as its own sensors do; robots reach each other as `Air` determines.
-"""
+"""A team without a centre in one process: peer nodes, a simulated radio, team time."""
 
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -31,15 +28,14 @@ Make = Callable[[Scenario, RobotConfig], PeerRobot]
 
 
 def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
-    """Make a robot of a scenario without a centre."""
     names = [each.id for each in scenario.robots]
     return PeerRobot(config, scenario.central, names, scenario.exchange)
 
 
 @dataclass
 class _Seat:
-    """listens, overhears: channels of its subscriptions under its own name (a centre: any), and
-    under every name.
+    """listens, overhears: channels subscribed under its own name (a centre: any), and under every
+    name.
     """
 
     node: PeerRobot | PeerCentre
@@ -55,7 +51,7 @@ class _Seat:
 
 
 class PeerTeam:
-    """Peers in a world, and the radio between them; `run` yields a recorder's samples.
+    """Peers in a world, with a radio between them.
 
     seats: robots and centre by name. complete_ns: team time of each robot's final map.
     """
@@ -76,12 +72,12 @@ class PeerTeam:
         self._latest: dict[str, tuple[ch.Channel, Sample]] = {}
 
     def seat(self, config: RobotConfig) -> None:
-        """Add a robot with an empty set: at the start, or after a death."""
+        """Add a robot with an empty set."""
         node = self._make(self.scenario, config)
         self.seats[config.id] = _Seat(node, Boundary(node.name))
 
     def seat_centre(self, restored: Iterable[Member] = ()) -> None:
-        """Add a centre, one more peer, with its set from disk."""
+        """Add a centre, as a peer with its set from disk."""
         names = [each.id for each in self.scenario.robots]
         seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
         seat.node.keep(restored)
@@ -90,7 +86,7 @@ class PeerTeam:
         self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
-        """Remove a robot or the centre; returns its stored set."""
+        """Remove a robot or the centre; return its stored set."""
         seat = self.seats.pop(name)
         for other in self.seats.values():
             other.reached.discard(name)
@@ -99,7 +95,7 @@ class PeerTeam:
     def run(
         self, world: World, steps: Callable[["PeerTeam"], None] | None = None
     ) -> Iterator[Sample]:
-        """Run until all peers have the same final map and no message is in flight; yields the
+        """Run until all peers have the same final map and no message is in flight; yield the
         messages.
 
         steps: called every round; may remove and add peers.
@@ -135,7 +131,7 @@ class PeerTeam:
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
-        """Restart a robot with its stored set; it requests later measurements."""
+        """Restart a robot with its stored set."""
         world = self._world
         assert isinstance(world, WorldNode)
         self.seat(config)
@@ -178,7 +174,7 @@ class PeerTeam:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _catch_up(self, robot: str, seat: _Seat) -> None:
-        """Send a new node the world's last messages."""
+        """Deliver the world's last messages to a new node."""
         for channel, sample in self._latest.values():
             if channel.name in seat.listens:
                 self._say(robot, seat.boundary.take(seat.node, sample))
@@ -188,7 +184,7 @@ class PeerTeam:
         self._world_boundary.take(self._world, sample)
 
     def _say(self, robot: str, outgoing: Sequence[Outgoing]) -> None:
-        """Deliver a robot's messages to the world, and to others in radio reach."""
+        """Deliver a robot's messages to the world and to the nodes in reach."""
         for out in outgoing:
             if out.channel is ch.MEMBERS:
                 request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
@@ -226,7 +222,7 @@ class PeerTeam:
             self._say(to, seat.boundary.take(seat.node, sample))
 
     def _see(self) -> None:
-        """Deliver liveliness of nodes that came into reach or left it."""
+        """Deliver changes of liveliness by reach."""
         for robot, seat in self.seats.items():
             for other in self.seats:
                 if other == robot:
@@ -241,7 +237,6 @@ class PeerTeam:
 
     @property
     def _agree(self) -> bool:
-        """Whether all have a final map and the same set, and no message is in flight."""
         finals = [seat.node.final for seat in self.seats.values()]
         if len(self.seats) < len(self.scenario.robots):
             return False
@@ -259,7 +254,7 @@ class PeerTeam:
 
 
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:
-    """The world of a team without a centre; it does not wait for robots that join late."""
+    """The world of a team that does not wait for robots that join late."""
     names = [each.id for each in scenario.robots if each.id not in late]
     announced = announce_configuration("world", 0, 0, scenario)
     return WorldNode(

@@ -1,9 +1,7 @@
-"""The checker of types and shapes that tests/conftest.py puts around functions on arrays.
+"""Run-time checks of types and shapes, which tests/conftest.py puts around functions on arrays.
 
-Modules without arrays are left to mypy: to wrap their functions takes a sixth of a worker's start.
-
-An int is taken where a float is announced, as mypy does. `Self` is not looked at: beartype knows it
-in decorated classes only, and the import hook decorates their methods one by one.
+Modules without arrays are left to mypy, which saves a sixth of a worker's start. An int passes for
+a float, as in mypy. `Self` is not checked: beartype resolves it in decorated classes only.
 """
 
 import inspect
@@ -43,7 +41,7 @@ def modules_with_shapes() -> list[str]:
 
 
 def begin_test() -> None:
-    """Every function is checked again."""
+    """Check every function again."""
     _calls.clear()
     for function in _through:
         del function.__no_type_check__
@@ -51,10 +49,11 @@ def begin_test() -> None:
 
 
 def checked(function: F) -> Callable[..., object]:
-    """The function with its arguments and its result checked, as far as CALLS goes.
+    """Check a function's arguments and result, as often as CALLS allows.
 
-    jaxtyping calls it twice for a function: for what checks the arguments, and for what checks the
-    result with them. The check is made at the first call: no worker calls every function.
+    jaxtyping calls it twice for a function: for the arguments, and for the result with them. The
+    check
+    is built at the first call.
     """
     name = (function.__module__, function.__qualname__)
     check: Callable[..., object] | None = None
@@ -74,7 +73,7 @@ def checked(function: F) -> Callable[..., object]:
 
 
 def _let_through(module: str, qualname: str) -> None:
-    """Mark a function as one that jaxtyping leaves alone; one within a function is not found."""
+    """Exempt a function from jaxtyping; a nested one is not found."""
     found: Any = sys.modules.get(module)
     for part in qualname.split("."):
         found = inspect.getattr_static(found, part, None)

@@ -1,4 +1,4 @@
-"""Shared helpers: waiting for a condition, a link that can be cut, sample messages."""
+"""Shared helpers: waiting, a link that can be cut, sample messages."""
 
 import contextlib
 import socket
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0, what: str = "") -> None:
-    """Return as soon as the condition holds; fail when it does not within the time."""
+    """Return once the condition holds; fail after the time."""
     wake = threading.Event()
     end = time.monotonic() + timeout_s
     while not condition():
@@ -32,7 +32,7 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0, what: str
 
 
 def received(bus: Bus, count: int, timeout_s: float = 60.0) -> list[Sample]:
-    """The first `count` samples or more; fails when fewer arrive within the time."""
+    """Receive at least `count` samples; fail after the time."""
     samples: list[Sample] = []
 
     def enough() -> bool:
@@ -45,16 +45,16 @@ def received(bus: Bus, count: int, timeout_s: float = 60.0) -> list[Sample]:
 
 @contextlib.contextmanager
 def nobody_listens() -> Iterator[str]:
-    """An endpoint that refuses all connections, and that nobody else on this machine can take."""
+    """An endpoint that refuses all connections and that no other process can take."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         yield f"tcp/127.0.0.1:{taken.getsockname()[1]}"
 
 
 class Link:
-    """A TCP link to `endpoint` that a test can cut, stall and mend.
+    """TCP link to `endpoint` that a test can cut, stall and mend.
 
-    A stalled link accepts connections and passes nothing on, as that to a stopped process.
+    A stalled link accepts connections and forwards nothing, like a stopped process.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -125,12 +125,11 @@ def _pump(source: socket.socket, sink: socket.socket, flows: threading.Event) ->
 
 
 def spd(n: int) -> np.ndarray:
-    """A symmetric positive definite n × n matrix."""
     return 2.0 * np.eye(n) + 0.5 ** (1 + np.abs(np.subtract.outer(np.arange(n), np.arange(n))))
 
 
 def packed(matrix: np.ndarray) -> bytes:
-    """The upper triangle, row by row."""
+    """Upper triangle, row by row."""
     return from_floats(matrix[np.triu_indices(len(matrix))])
 
 
@@ -163,7 +162,7 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 
 
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
-    """The message with the node that publishes on the channel's key for this name."""
+    """The message with the node that publishes on this key."""
     publisher = channel.publisher(name)
     says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault | m.SetSummary
     return (
@@ -203,7 +202,7 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
 
 
 def examples() -> Iterator[m.Message]:
-    """One message of every class, with every array filled."""
+    """One message of every class, every array filled."""
     two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
@@ -562,7 +561,7 @@ K = TypeVar("K", bound=m.Message)
 
 
 def example(kind: type[K], **fields: object) -> K:
-    """The example of a class, with these fields in place of its own."""
+    """Example of a class with these fields replaced."""
     found = next(each for each in examples() if isinstance(each, kind))
     return msgspec.structs.replace(found, **fields)
 

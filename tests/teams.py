@@ -1,4 +1,4 @@
-"""Tiny teams of nodes, and a network between them that delivers in any order it likes."""
+"""Tiny teams of nodes, and a network that delivers in random order."""
 
 import random
 from collections import defaultdict, deque
@@ -52,10 +52,11 @@ def stream(
     known: bool = True,
     y: float = 0.0,
 ) -> RobotStream:
-    """A robot that drives along the x axis and sees what is near.
+    """A robot that drives along the x axis and observes near landmarks.
 
-    off_ns: observations come so long before the end of their interval. beyond: so many more come
-    after the last odometry.
+    off_ns: time of observations before the end of their interval. beyond: number of observations
+    after
+    the last odometry.
     """
     rng = np.random.default_rng([seed, steps, *robot.encode()])
     ends = step_ns * np.arange(1, steps + 1)
@@ -117,7 +118,7 @@ def world_of(*streams: RobotStream) -> WorldStreams:
 
 
 def published(each: RobotStream) -> list[m.Measurement]:
-    """The measurements of one stream as the world publishes them."""
+    """Messages of the world for one stream."""
     world = WorldNode(world_of(each), frozenset(), build.configuration(node="world", incarnation=0))
     out: list[Outgoing] = []
     while not world.ended:
@@ -128,7 +129,7 @@ def published(each: RobotStream) -> list[m.Measurement]:
 def driven(
     node: RobotNode, measurements: Sequence[m.Message], *, end: bool = True
 ) -> list[Outgoing]:
-    """Run a robot on these measurements without a centre; `end`: with the end of the stream."""
+    """Run a robot without a centre; `end`: with the end of the stream."""
     out = [o for measurement in measurements for o in node.handle(measurement, 0)]
     if end:
         last = measurements[-1]
@@ -146,12 +147,11 @@ def of(out: Sequence[Outgoing], channel: ch.Channel) -> list[m.Message]:
 
 
 def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
-    """Submaps of a robot without a centre."""
     return of(driven(robot_node(config(each.robot, **options)), published(each)), ch.SUBMAP)
 
 
 class Submaps(Mapping[str, list[m.Submap]]):
-    """Submaps of robots without a centre, computed when a test first uses them."""
+    """Submaps of robots without a centre, computed on first use."""
 
     def __init__(self, streams: Sequence[RobotStream]) -> None:
         self._streams = {each.robot: each for each in streams}
@@ -169,15 +169,15 @@ class Submaps(Mapping[str, list[m.Submap]]):
         return len(self._streams)
 
     def every(self) -> list[m.Submap]:
-        """Those of all robots, one robot after the other."""
+        """All submaps, robot by robot."""
         return [submap for submaps in self.values() for submap in submaps]
 
 
 @dataclass
 class Team:
-    """World, robots and centre, joined by one queue per receiver and key.
+    """World, robots and centre, with one queue per receiver and key.
 
-    Each key keeps its order, as Zenoh promises; between keys and receivers `rng` decides.
+    Each key keeps its order, as in Zenoh; `rng` chooses among keys and receivers.
     """
 
     streams: WorldStreams
@@ -224,9 +224,9 @@ class Team:
                     self.queues.setdefault((to, o.key), deque()).append(o.message)
 
     def kill(self, robot: str, *, patience: bool = False) -> None:
-        """The process is gone, and so is its token; what it has sent is on its way.
+        """End the robot's process; messages it sent still arrive.
 
-        patience: the centre's shell holds the news back, since the robot may come again.
+        patience: the centre's shell delays the news.
         """
         node = ch.robot_node(robot)
         del self.nodes[node]
@@ -236,7 +236,7 @@ class Team:
             self.queues[("central", ch.ALIVE.key(node))].pop()
 
     def resume(self, robot: RobotConfig) -> None:
-        """The process is there again: it takes over the submaps that the centre has."""
+        """Restart the robot, with the submaps of the centre."""
         name, node = ch.robot_node(robot.id), robot_node(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
         request = encoded(build.submaps_request(robot=robot.id))
@@ -252,7 +252,7 @@ class Team:
         self.send(name, node.begin())
 
     def step(self) -> bool:
-        """One delivery, or one look of the world; False when nothing is left to do."""
+        """Make one delivery or one step of the world; return False at rest."""
         ready = [key for key, queue in self.queues.items() if queue]
         if not ready or self.rng.random() < 0.2:
             out = self.world.publish(0.0)
@@ -266,7 +266,7 @@ class Team:
         return True
 
     def mend(self) -> bool:
-        """Robots ask their source for what they miss, as their shells do."""
+        """Let robots request missing measurements."""
         found = False
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.request()

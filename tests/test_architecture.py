@@ -27,7 +27,7 @@ PATHS = re.compile(rf"`((?:{'|'.join(FOLDERS)})/[\w.-]+(?:/[\w.-]+)*(?:\.\w+|/))
 
 @cache
 def names_of(path: Path) -> frozenset[str]:
-    """Names that a module defines, and `Class.member` of its classes; headings of a page."""
+    """Names and `Class.member`s that a module defines; headings of a page."""
     text = path.read_text()
     if path.suffix == ".md":
         return frozenset(re.findall(r"^#+ (.+)$", text, re.MULTILINE))
@@ -68,7 +68,7 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
 
 
 def dangling(page: Path) -> list[str]:
-    """Links to files or headings that are not there; what the site generates is not looked at."""
+    """Links to missing files or headings, generated pages excepted."""
     found = []
     for target, anchor in LINK.findall(page.read_text()):
         file = page.parent / target if target else page
@@ -80,7 +80,7 @@ def dangling(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """The headings of a page as links spell them."""
+    """Headings of a page as links spell them."""
     plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in names_of(page))
     return {each.strip().replace(" ", "-") for each in plain}
 
@@ -116,9 +116,9 @@ CLI = typer.main.get_command(app)
 
 
 def unknown(line: str) -> str | None:
-    """A command or an option of a command line that the program lacks.
+    """Unknown commands or options of a command line.
 
-    Three dots stand for any command of a group, or for arguments.
+    `...` stands for any command of a group, or for arguments.
     """
     commands: list[Any] = [CLI]
     words = line.split()

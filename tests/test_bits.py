@@ -1,4 +1,4 @@
-"""The bits of final maps are those of the table: the cheap part of `python -m tests.bits`."""
+"""Bits of final maps equal the table: the cheap part of `python -m tests.bits`."""
 
 import pytest
 

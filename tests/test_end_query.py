@@ -1,4 +1,4 @@
-"""The end of a team is taken from its author only, whatever is replied to who asks for it."""
+"""The end of a team is accepted from its author only."""
 
 import pytest
 
@@ -17,7 +17,7 @@ OF_R1, OF_R2 = (ch.TEAM_FINAL.key(robot) for robot in ("r1", "r2"))
 
 @pytest.fixture
 def bus():
-    """A bus on which everyone's end is replied, and garbage, whatever was asked for."""
+    """A bus that replies everyone's end and garbage to any request."""
 
     def kept(key: str, payload: bytes) -> bytes:
         return encoded(build.kept(stamp_ns=3, key=key, payload=payload, wall_ns=4, counter=5))

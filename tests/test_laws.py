@@ -1,4 +1,4 @@
-"""The four laws of the design, held against whole teams.
+"""The four laws of the design, tested on whole teams.
 
 1 a measurement is used once; 2 a map is a pure function of a set of submaps; 3 every message names
 its inputs; 4 a node does no I/O and reads no clock.
@@ -49,7 +49,7 @@ def team_of(streams, rng, **options):
 
 @pytest.fixture
 def scarce(monkeypatch):
-    """Little credit and small portions, so that everybody waits for somebody."""
+    """Little credit and small portions, so that nodes wait for each other."""
     monkeypatch.setattr(teamslam.sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
     monkeypatch.setattr(teamslam.sim.publisher.node, "BATCH", 5)
     monkeypatch.setattr(teamslam.team.robot.node, "PROGRESS_MEASUREMENTS", 4)
@@ -60,7 +60,7 @@ def scarce(monkeypatch):
 
 
 def assert_each_measurement_once(samples):
-    """Submaps part each robot's measurements, and its ledger adds up to what was published."""
+    """Check that submaps partition each robot's measurements, and that its ledger adds up."""
     messages = [opened(sample) for sample in samples]
     counted = {}
     for _, name, message in messages:
@@ -90,7 +90,7 @@ def assert_each_measurement_once(samples):
 
 @pytest.fixture(scope="module")
 def utias(tmp_path_factory):
-    """Three robots of a UTIAS data set, with keyframes, observed between the odometry's stamps."""
+    """Three robots of a UTIAS data set, with observations between the odometry's stamps."""
     folder = tmp_path_factory.mktemp("utias") / "MRCLAM_Dataset0"
     scenario = load("waypoints")
     world = msgspec.structs.replace(scenario.world, steps=45)
@@ -132,7 +132,7 @@ def test_a_robots_submaps_are_the_same_bytes_without_a_centre(utias):
 
 
 def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
-    """The mutant: what the centre sends does change what such a robot publishes for fusion."""
+    """Mutant: the centre's messages change such a robot's contributions."""
     robot = config(fusion="kalman")
     measurements = published(PAIR.streams[0])
     maps = []
@@ -172,7 +172,7 @@ EXPECTED = {}
 
 
 def expected_final(streams=PAIR):
-    """The final map of a team that nothing happens to."""
+    """Final map of an undisturbed team."""
     if not EXPECTED:
         calm = team_of(streams, random.Random(0))
         calm.run()
@@ -206,7 +206,6 @@ def test_a_robot_that_dies_and_comes_back_changes_no_bit_of_it(seed, when, victi
 
 @cache
 def messages():
-    """All messages that a centre receives of the pair."""
     return [
         *(published(each)[0] for each in PAIR.streams),
         *(
@@ -230,7 +229,7 @@ def messages():
     ),
 )
 def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order, again):
-    """Duplicates of submaps and progress come at any time, also long after or before."""
+    """Duplicates of submaps and progress come at any time."""
     heard = [messages()[i] for i in order]
     for i, at in again:
         if isinstance(messages()[i], m.Submap | m.Progress):
@@ -334,7 +333,7 @@ def imports_of(path: Path) -> set[str]:
 
 
 def reached_from(module: str) -> set[str]:
-    """Every module that a module's import brings in, ours followed."""
+    """All modules that importing a module loads."""
     seen, ahead = set(), [module]
     while ahead:
         name = ahead.pop()
@@ -357,7 +356,6 @@ def test_a_node_reaches_no_clock_no_socket_and_no_file(module):
 
 
 def test_a_shell_does_reach_them():
-    """The mutant: the search above can find what it looks for."""
     assert {name.split(".")[0] for name in reached_from("teamslam.team.robot.main")} >= {
         "time",
         "threading",
@@ -393,7 +391,7 @@ SEEDS = {
 
 
 def played(seed, estimator, fusion):
-    """A team to its rest; in some a robot dies; half of those come back, the rest are given up."""
+    """Run a team in which a robot may die, and then restarts or is given up."""
     rng = random.Random(seed)
     team = team_of(unequal(rng), rng, estimator=estimator, fusion=fusion)
     if rng.random() < 0.4:
@@ -428,6 +426,6 @@ def test_every_team_comes_to_its_end_in_whatever_order_things_happen(estimator, 
 
 @pytest.mark.usefixtures("scarce")
 def test_a_waiting_robot_that_gives_no_credit_stalls_its_team(monkeypatch):
-    """The mutant: this search finds a stall where there is one."""
+    """Mutant: the search finds a stall."""
     monkeypatch.setattr(ExchangingRobot, "consume", RobotNode.consume)
     assert not all(played(seed, "hybrid", "kalman").centre.finished for seed in range(40))

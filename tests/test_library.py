@@ -1,4 +1,4 @@
-"""The library's face, and the programs in examples/ that use nothing else of ours."""
+"""The library's public names, and the programs in examples/."""
 
 import ast
 import json
@@ -27,7 +27,7 @@ LANDMARKS = np.array([[2.0, 4.0], [6.0, -3.0], [9.0, 4.0], [13.0, 1.0], [4.0, 1.
 
 
 def driven(start, keyframes, rng):
-    """The true pose at the end and what was measured on the way."""
+    """The true end pose, and the measurements on the way."""
     pose, taken = start, []
     for _ in range(keyframes):
         increment = teamslam.increment_of(MOTION, 1.0, 1.0, 0.05)
@@ -128,7 +128,6 @@ def test_submaps_of_a_log_join_to_its_final_map(log):
 
 
 def ran(name: str, *arguments: str, capsys: pytest.CaptureFixture[str], monkeypatch) -> str:
-    """Output of an example."""
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(EXAMPLES / name))
     return capsys.readouterr().out

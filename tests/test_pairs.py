@@ -1,4 +1,4 @@
-"""Pairs of estimator and rule, and recipes of new ones."""
+"""Pairs of estimator and rule; recipes of new ones."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The project's own files: versions, pins, extras, compose file, baselines."""
+"""Versions, pins, extras, compose file, baselines."""
 
 import os
 import re
@@ -26,7 +26,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def closure(*roots: str) -> set[str]:
-    """The names of all distributions that the requirements need, through all levels."""
+    """Names of all distributions that the requirements need, recursively."""
     found: set[str] = set()
     pending = [Requirement(root) for root in roots]
     seen = set()
@@ -47,7 +47,7 @@ def closure(*roots: str) -> set[str]:
 
 
 def tracked() -> list[Path]:
-    """The files under version control; skips where this is no checkout."""
+    """Files under version control; skips without a checkout."""
     git = shutil.which("git")
     if git is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout: nothing is tracked")
@@ -70,7 +70,7 @@ def test_constraints_pin_every_distribution_by_version_alone():
 
 
 def test_every_pinned_distribution_has_its_hashes():
-    """`make setup` and the image install distributions with a listed hash alone."""
+    """`make setup` and the image install only distributions with a listed hash."""
     pin = re.compile(
         r"^([\w.-]+==[\w.]+)(?: ;.*)? \\\n((?:    --hash=sha256:[0-9a-f]{64}(?: \\)?\n)+)", re.M
     )
@@ -109,7 +109,7 @@ def test_no_data_set_and_no_log_is_committed():
 
 
 def commands(page: Path, program: str) -> set[str]:
-    """The sub-commands of `program` in the page's indented and fenced code."""
+    """Sub-commands of `program` in the page's code."""
     found = re.findall(rf"^\s*(?:\$ )?{program} ([a-z][\w-]*)", page.read_text(), re.MULTILINE)
     return set(found)
 
@@ -124,7 +124,6 @@ def test_every_make_target_that_a_page_names_exists(page):
 
 
 def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command():
-    """Each costs every robot of a team memory and time."""
     code = (
         "import sys; sys.argv = ['teamslam', 'robot', 'waypoints', 'r9']\n"
         "from teamslam.sim.cli.entry import main\n"
@@ -142,7 +141,6 @@ def test_a_robots_process_loads_no_checker_of_shapes_and_no_other_command():
 
 
 def test_a_launch_and_its_report_need_no_scipy():
-    """SciPy is half of an environment that has no need of it."""
     parts = (
         "sim.launch.launch", "sim.cli.main", "sim.in_memory.team", "central.main",
         "central.peers.main", "team.robot.main", "team.recording.shell", "central.desk.report.page",
@@ -207,7 +205,7 @@ def compose():
 
 
 def test_the_compose_file_is_valid_by_the_compose_specification():
-    """The schema is the one that check-jsonschema carries: nothing is fetched."""
+    """The schema is in check-jsonschema: nothing is fetched."""
     schema = ["--builtin-schema", "vendor.compose-spec"]
     command = [sys.executable, "-m", "check_jsonschema", *schema, str(COMPOSE)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""The checker of shapes: at work in this run, no longer than it needs, anew in every test."""
+"""The checker of shapes runs in every test, at bounded cost."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A node's shell: its reports while the node waits, and its end."""
+"""A node's shell: reports while waiting, and its end."""
 
 import logging
 import signal
@@ -49,7 +49,7 @@ def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(monkeypatc
 
 
 class Slow(MemoryBus):
-    """A bus on which a look takes a while: `clock` goes on, and things happen at their times."""
+    """A bus on which a look takes time: `clock` advances, and events happen at their times."""
 
     def __init__(self, network: MemoryNetwork, clock: list[float]) -> None:
         super().__init__(network)
@@ -65,7 +65,7 @@ class Slow(MemoryBus):
 
 @pytest.mark.parametrize("case", ["nobody records", "all is there", "lacks", "away", "back"])
 def test_a_process_stays_while_who_records_may_still_ask_for_something(case, monkeypatch):
-    """Without a recorder, or with one that has everything, it leaves at once."""
+    """It leaves at once without a recorder, or when the recorder has everything."""
     clock = [100.0]
     monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
     network = MemoryNetwork()
@@ -90,7 +90,7 @@ def test_a_process_stays_while_who_records_may_still_ask_for_something(case, mon
 def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_not(
     case, monkeypatch
 ):
-    """Without a report a recorder has not read it yet: that ends nothing."""
+    """A missing report means that the recorder has not read it yet."""
     clock = [100.0]
     monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
     network = MemoryNetwork()

@@ -1,4 +1,4 @@
-"""Whole teams that use sightings of each other: the laws hold, and the log reproduces the run."""
+"""Teams with sightings: the laws hold, and the log reproduces the run."""
 
 import random
 
@@ -114,7 +114,7 @@ def test_each_measurement_of_a_run_with_sightings_has_one_disposition(samples, t
 
 
 def test_sightings_whose_node_never_comes_are_rejected_at_the_end():
-    """The stream ends half a second before the node: the sighting is not in a factor."""
+    """The stream ends half a second before the node."""
     config = SCENARIO.robots[0]
     measurements = published(STREAMS.streams[0])
     wanted = next(

@@ -1,5 +1,3 @@
-"""The set of submaps is a union; a misfit is refused with its reason and changes nothing."""
-
 import copy
 
 import msgspec

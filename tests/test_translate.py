@@ -1,5 +1,3 @@
-"""Estimation values to messages and back: nothing is lost, nothing is added."""
-
 import hashlib
 
 import numpy as np

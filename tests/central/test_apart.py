@@ -1,4 +1,4 @@
-"""While robots contradict each other, no robot's submaps enter another one's prior."""
+"""While robots contradict each other, no prior contains another robot's submaps."""
 
 import math
 from functools import cache
@@ -26,9 +26,7 @@ from tests.trials.stress_world import StressWorld, write
 
 @cache
 def mirrored_run(robot: str) -> tuple[Sample, ...]:
-    """A team of three with known initial poses, in which one robot's bearings have the wrong
-    sign.
-    """
+    """A team of three with known initial poses, one robot's bearings with the wrong sign."""
     with TemporaryDirectory() as place:
         world = StressWorld(seed=3, seconds=60.0, mirrored=(robot,) if robot else ())
         of = scenario_in(write(world, Path(place) / "world"))
@@ -36,7 +34,6 @@ def mirrored_run(robot: str) -> tuple[Sample, ...]:
 
 
 def worst_error(samples: tuple[Sample, ...], robot: str) -> float:
-    """Largest distance [m] of a robot's online poses in the team's frame from the true ones."""
     times, places = [], []
     for each in messages(samples, m.Truth):
         if each.robot == robot:
@@ -54,7 +51,7 @@ def worst_error(samples: tuple[Sample, ...], robot: str) -> float:
 
 @pytest.mark.parametrize("wrong", ["r1", "r2", "r3"])
 def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong):
-    """Its first submaps can not yet be told from the others'. r1 fixes the frame."""
+    """Its first submaps do not show it yet. r1 fixes the frame."""
     samples = mirrored_run(wrong)
     assert final_map(list(samples)).withdrawn == (wrong,)
     for robot in {"r1", "r2", "r3"} - {wrong}:
@@ -73,7 +70,7 @@ def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_a
 
 
 def test_too_small_covariances_by_themselves_are_no_contradiction():
-    """Everybody claims a fifth of its standard deviations: each disagrees with itself as much."""
+    """All robots state a fifth of their standard deviations."""
     ticks = of_set(team_run())
     for each in messages(team_run(), m.Submap):
         covariance = floats(each.covariance, "covariance") / 25.0
@@ -93,8 +90,9 @@ def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path):
 
 
 def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch):
-    """The number of folded ticks is at most that of the nominal run for each robot left out, for
-    each robot alone, and for a restart with each of the few suspensions.
+    """Folded ticks: at most those of the nominal run for each robot left out, each robot alone,
+    and a
+    restart with each of the few suspensions.
     """
     counts = []
     for robot in ("", "r2"):

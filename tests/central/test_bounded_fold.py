@@ -1,4 +1,4 @@
-"""The running fold of a long run: bounded, a pure function of the set, and the final map is not."""
+"""The running fold of a long run: bounded, and a pure function of the set."""
 
 import numpy as np
 import pytest
@@ -114,7 +114,7 @@ def test_the_full_solution_is_that_of_the_raw_set_and_folds_no_tick_again(monkey
 
 
 def assert_same_solution(one, other):
-    """The same raw submaps, and the same map up to the iterations of the solver."""
+    """The same raw submaps, and the same map up to the solver's iterations."""
     assert one.condensed_count == other.condensed_count == 0
     assert one.main.graph.streams.keys() == other.main.graph.streams.keys()
     assert [c.key for c in one.contributions] == [c.key for c in other.contributions]
@@ -124,7 +124,7 @@ def assert_same_solution(one, other):
 
 
 def test_a_refused_submap_is_not_restored(monkeypatch):
-    """The heading of r2's submap 11 is beyond a full turn: its chain ends there."""
+    """The heading of r2's submap 11 exceeds a full turn: its chain ends there."""
     members = SUBMAPS.every()
     at = next(k for k, each in enumerate(members) if (each.robot, each.sequence) == ("r2", 11))
     turned = floats(members[at].mean, "mean").copy()
@@ -167,7 +167,7 @@ def test_a_submap_with_its_motion_alone_is_restored_so(monkeypatch):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_new_main_island_merges_with_the_condensed_one(known):
-    """r1 appears late: its start gives the frame, or its name does; r2 is condensed by then."""
+    """r1 appears late and fixes the frame, by its start or its name; r2 is condensed by then."""
     late = [
         replace(each, stamp_ns=each.stamp_ns + LATER_NS, start_ns=each.start_ns + LATER_NS)
         for each in SUBMAPS["r1"]

@@ -1,4 +1,4 @@
-"""The running fold of landmarks without names: bounded, and a pure function of the set."""
+"""The bounded running fold of landmarks without identities."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ SMALL = Limits(begin=24, lag=3)
 
 @pytest.fixture(scope="module")
 def world():
-    """Laps of a ring; the second lap closes on the first when most of that is condensed."""
+    """Two laps of a ring; the second closes on the first when most of that is condensed."""
     rng = np.random.default_rng(5)
     path = circle((0.0, 0.0), 20.0, 72, 2.0)
     submaps, truth = drive("r1", path, ring(rng, 32), rng, reach=9.0)
@@ -32,8 +32,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def cluttered():
-    """A robot that sees the same sixteen landmarks all the time, with a false one in every other
-    submap."""
+    """A robot that always sees the same sixteen landmarks, with clutter in every other submap."""
     rng = np.random.default_rng(6)
     angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
     landmarks = 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -45,7 +44,7 @@ def cluttered():
 
 
 def with_clutter(local, rng):
-    """The submap with one landmark more, that is none."""
+    """The submap with one false landmark."""
     n = len(local.ids) + 1
     at = rng.uniform(-5.0, 5.0, 2)
     return LocalMap(
@@ -78,7 +77,7 @@ def ticks(world, _small):
 
 @pytest.fixture(scope="module")
 def all_said(cluttered, _small):
-    """The running fold of all submaps of the other robot."""
+    """The running fold of the other robot's submaps."""
     messages, _ = cluttered
     return folded(messages)
 
@@ -195,7 +194,7 @@ def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_the_first_unnamed_landmarks_meet_all_named_ones(bounded):
-    """The same sixteen landmarks with their names in the first lap, and without in the second."""
+    """Sixteen landmarks, with identities in the first lap and without in the second."""
     rng = np.random.default_rng(7)
     angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
     landmarks = 20.0 * np.column_stack([np.cos(angle), np.sin(angle)])

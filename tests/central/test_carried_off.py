@@ -1,4 +1,4 @@
-"""A robot that was carried off stays, and time and motion are named; a wrong one is withdrawn."""
+"""A robot that was carried off stays, with time and motion reported; a wrong one is withdrawn."""
 
 import math
 
@@ -30,7 +30,7 @@ def chain() -> list[m.Submap]:
 
 
 def carried() -> list[m.Submap]:
-    """The submaps of r3, as if it had been carried the way of those that are left out."""
+    """Submaps of r3, as if carried past those left out."""
     own = [each for each in chain() if not FIRST <= each.sequence <= LAST]
     gone = LAST + 1 - FIRST
     return [
@@ -43,7 +43,7 @@ def renumbered(submap: m.Submap, sequence: int) -> m.Submap:
 
 
 def mirrored() -> list[m.Submap]:
-    """The submaps of r3, as if its camera and its gyro had the wrong sign."""
+    """Submaps of r3, as if its camera and gyro had the wrong sign."""
     found = []
     for each in chain():
         poses = 1 + len(stamps(each.nodes, "nodes"))
@@ -61,7 +61,7 @@ def mirrored() -> list[m.Submap]:
 
 
 def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
-    """The fold of the team's submaps with these of r3 in the place of its own."""
+    """The fold of the team's submaps with these in place of r3's."""
     ticks = TickFold(scenario().central)
     for start in messages(team_run(), m.InitialPose):
         ticks.add_start(translate.start_of(start))
@@ -72,7 +72,7 @@ def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
 
 
 def jumps(ticks: TickFold) -> list[m.Diagnosis]:
-    """The robots that the diagnosis of the final map says were carried off."""
+    """Robots that the final map's diagnosis reports as carried off."""
     fold = ticks.solve()
     biases = bias_estimates(fold)
     left_out = ticks.submaps_of_withdrawn()
@@ -114,7 +114,7 @@ def test_nothing_is_said_of_a_robot_whose_wheels_are_a_third_too_large():
 
 
 def test_the_final_map_says_when_a_robot_was_carried_off_and_by_how_much(tmp_path):
-    """A scan of the stress world every 0.5 s: none lies between the seam at 50 s and 50.2 s."""
+    """A scan every 0.5 s: none lies between the seam at 50 s and 50.2 s."""
     off = CarriedOff("r2", 4.0, 0.6, 50.2)
     folder = write(StressWorld(seed=5, seconds=100.0, carried_off=(off,)), tmp_path)
     of = final_only(scenario_in(folder))

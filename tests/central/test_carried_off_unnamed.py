@@ -1,5 +1,5 @@
-"""A robot among landmarks without names that is carried off: its stream is cut at the seam, its
-submaps before it stay, and the later ones join the map by their shape.
+"""A robot without landmark identities that is carried off: its stream is cut at the seam, earlier
+submaps stay, and later ones join by their shape.
 """
 
 import math
@@ -30,9 +30,9 @@ INSIDE = CarriedOff("r2", 15.0, 2.0, AT_S + 4.3)
 
 
 class Run:
-    """A run of a world with hidden identities: its samples, the true landmarks, r2's true path.
+    """A run with hidden identities: samples, true landmarks, r2's true path.
 
-    Running maps and poses are published where r2 is carried far, whose poses are judged.
+    Running maps and poses are published only where r2 is carried far.
     """
 
     def __init__(self, seed: int, *off: CarriedOff) -> None:

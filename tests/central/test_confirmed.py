@@ -1,4 +1,4 @@
-"""A landmark that one submap alone has does not enter the map where that may be an outlier."""
+"""A landmark that a single submap observed stays out of the map where it may be an outlier."""
 
 import msgspec
 import numpy as np
@@ -21,13 +21,13 @@ END_NS = 15_000_000_000
 
 
 def misread(submap: m.Submap) -> m.Submap:
-    """The submap with its last landmark taken for another one, which no other submap has."""
+    """The submap with its last landmark read as one that no other submap has."""
     seen = ids(submap.ids, "ids")
     return msgspec.structs.replace(submap, ids=from_ids(np.array([*seen[:-1], FALSE], np.uint32)))
 
 
 def rule(spoilt: set[tuple[str, int]], **options: object) -> MapPublisher:
-    """The submaps of both robots, some misread, joined."""
+    """Join the submaps of both robots, some misread."""
     config = CentralConfig(tick_s=3.0, broadcast_s=3.0, **options)
     found = MapPublisher(SubmapFold(config, b"settings"))
     for each in STREAMS.values():

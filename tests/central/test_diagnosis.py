@@ -1,4 +1,4 @@
-"""The final map names the cause of its misfit, with its size; and none where nothing is wrong."""
+"""The final map names the cause and the size of its misfit, and none without a fault."""
 
 import math
 from dataclasses import replace
@@ -32,7 +32,7 @@ def scenario(world: StressWorld, place: Path) -> Scenario:
 
 @cache
 def noisy(noise: float) -> list[Sample]:
-    """The log of a team whose noise is so many times the stated one."""
+    """Log of a team whose noise is so many times the stated one."""
     with TemporaryDirectory() as place:
         of = scenario(replace(TEAM, noise=noise), Path(place))
         return list(run_team(of, streams_of(of)))
@@ -120,8 +120,9 @@ def test_noise_that_is_stated_too_small_widens_the_covariance_of_the_final_map()
 
 
 def test_errors_that_change_slowly_are_noise_and_no_error_that_the_submaps_share(tmp_path):
-    """The stated sigmas leave the offset of a robot's bearings many of them from 0: the scatter of
-    its submaps shows that it is no constant.
+    """The offset of a robot's bearings is many stated sigmas from 0; the scatter of its submaps
+    shows that
+    it is not constant.
     """
     (found,) = diagnosed(scenario(replace(TEAM, correlated_s=20.0), tmp_path))
     assert found.cause == "noise_underestimated"

@@ -1,4 +1,4 @@
-"""Fixes that contradict the map are named, with the delay or antenna that explains them."""
+"""Fixes that contradict the map are reported with the delay or antenna that explains them."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ STEP_S = 0.05
 
 
 def path():
-    """Poses every STEP_S of a winding path at 0.6 to 4 m/s: delay and antenna can be told apart."""
+    """Poses every STEP_S of a winding path at 0.6 to 4 m/s, which separates delay from antenna."""
     t = np.arange(0.0, NODE_S * (NODES + 2), STEP_S)
     speed, turn = 2.3 + 1.7 * np.sin(0.5 * t), 2.0 * np.sin(0.11 * t)
     x, y = np.cumsum([speed * np.cos(turn), speed * np.sin(turn)], axis=1) * STEP_S

@@ -1,4 +1,4 @@
-"""Absolute positions (GNSS) of the robots make the map absolute."""
+"""Absolute positions (GNSS) make the map absolute."""
 
 import dataclasses
 from functools import cache
@@ -34,7 +34,7 @@ UTM = np.array([399_000.0, 5_756_000.0])
 
 
 def with_fixes(stream, seed, origin, jumps):
-    """Fixes every 2 s by the true path, at the antenna; jumps: displaced by 15 m, by index."""
+    """A fix every 2 s at the antenna; jumps: indices of fixes displaced by 15 m."""
     at = np.arange(0, len(stream.truth), 2)
     x, y, turn = stream.truth[at].T
     s, c = np.sin(turn), np.cos(turn)
@@ -55,7 +55,7 @@ def day(
     jumps=(),
     live=False,
 ):
-    """The samples of a team with fixes, and its world; live: with running maps and poses."""
+    """Samples of a team with fixes, and its world; live: with running maps and poses."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=250)
     robots = tuple(

@@ -1,4 +1,4 @@
-"""A robot with false submaps is detected whichever robot fixes the frame, and moves no other."""
+"""A robot with false submaps is detected, whichever robot fixes the frame, and moves no other."""
 
 import math
 from collections.abc import Collection, Iterator
@@ -34,7 +34,7 @@ BEFORE = 3
 
 
 def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:
-    """The lie in the place of a true submap, with the landmarks of an earlier one."""
+    """A false submap in place of a true one, with the landmarks of an earlier one."""
     poses = 1 + len(stamps(true.nodes, "nodes"))
     base_poses = 1 + len(stamps(base.nodes, "nodes"))
     points = floats(base.mean, "mean")[3 * base_poses :].copy()
@@ -62,7 +62,7 @@ def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:
 
 
 class Liar(RobotNode):
-    """A robot's node whose submaps behind the first ones are lies."""
+    """A robot's node with false submaps after the first ones."""
 
     kind = ""
     _base: m.Submap | None = None
@@ -91,8 +91,6 @@ class Liar(RobotNode):
 
 @cache
 def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
-    """The small team in which one robot lies."""
-
     def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:
         node = (Liar if config.id == liar else RobotNode)(config, exchange)
         if isinstance(node, Liar):
@@ -106,7 +104,7 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
 
 
 def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
-    """Distances [m] of the other robots' poses in the team's frame from their true ones."""
+    """Errors [m] of the other robots' poses in the team's frame."""
     true: dict[tuple[str, int], np.ndarray] = {}
     for each in messages(samples, m.Truth):
         poses = floats(each.poses, "poses").reshape(-1, 3)
@@ -125,7 +123,7 @@ def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
 
 @pytest.mark.parametrize(("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "modest")])
 def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
-    """r1 is the robot that names the frame."""
+    """r1 fixes the frame."""
     samples = run_with(liar, kind)
     final = final_map(list(samples))
     assert final.withdrawn == (liar,)
@@ -141,7 +139,7 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
 
 
 def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
-    """r1 lies for a while; what is folded depends on the set, not on when it was asked for."""
+    """r1 lies for a while; the fold depends on the set alone."""
     samples = run_with("r1", "still")
     ticks = of_set(samples)
     ticks.fold_until(30e9)
@@ -159,7 +157,7 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
 
 @pytest.mark.parametrize("kind", ["micrometre", "swap"])
 def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind):
-    """Most of its newest submaps contradict the map, however little they weigh."""
+    """Most of its newest submaps contradict the map, despite their small weight."""
     samples = run_with("r1", kind)
     ticks = of_set(samples, central=scenario().central)
     ticks.fold_until(30e9)
@@ -192,7 +190,7 @@ def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grow
 
 
 def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again():
-    """Three of its first submaps exchange the landmarks' names; the true ones outvote them."""
+    """Three of its first submaps exchange landmark ids; the true ones outvote them."""
     samples = team_run()
     ticks = of_set(samples)
     for each in messages(samples, m.Submap):
@@ -209,7 +207,7 @@ def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again():
 
 @pytest.mark.parametrize("until_s", [20.0, 30.0, math.inf])
 def test_one_wrong_submap_costs_no_robot(until_s: float):
-    """A motion that is wrong by 0.8 m: the robust loss discounts it, and everybody stays."""
+    """A motion wrong by 0.8 m: the robust loss discounts it."""
     samples = team_run()
     (wrong,) = (s for s in messages(samples, m.Submap) if (s.robot, s.sequence) == ("r1", 2))
     mean = floats(wrong.mean, "mean").copy()
@@ -224,7 +222,7 @@ def test_one_wrong_submap_costs_no_robot(until_s: float):
 
 
 def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map():
-    """All submaps are there, of which the first tick and a half is closed."""
+    """All submaps are there, but only the first tick and a half is closed."""
     samples = run_with("r1", "still")
     rule = MapPublisher(SubmapFold(scenario().central, bytes(8)))
     for start in messages(samples, m.InitialPose):

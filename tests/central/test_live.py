@@ -27,8 +27,6 @@ ORDER = m.TeamEnd(stamp_ns=0, by="operator", reason="it rains")
 
 
 class Live:
-    """A centre with the messages of its robots and drivers."""
-
     def __init__(self, *robots, admit=False):
         self.centre = CentralNode(CentralConfig(), robots, admit=admit)
         self.said = self.centre.begin()
@@ -40,7 +38,7 @@ class Live:
         return self
 
     def robot(self, name, *, state="ended"):
-        """A robot that has consumed all of its stream."""
+        """A robot that has consumed its whole stream."""
         measured = published(STREAMS[name])
         self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
         node = RobotNode(config(name))

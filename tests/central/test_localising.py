@@ -1,4 +1,4 @@
-"""Robots without a start are placed in a saved map at once; `localise` leaves the map as it is."""
+"""Robots without a start are placed in a saved map; `localise` leaves the map unchanged."""
 
 import json
 from functools import cache
@@ -33,7 +33,7 @@ SECOND_NS = 1_000_000_000
 
 @cache
 def short_day(*, localise=False, wrong=False, length_s=60):
-    """The first minute of a second day of robots without a start."""
+    """First minute of a second day of robots without a start."""
     scenario = with_options(load("thesis-b"), seed=1001, localise=localise)
     whole = streams_of(scenario)
     first_ns = min(first for first, _ in whole.spans_ns.values())

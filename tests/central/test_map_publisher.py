@@ -111,7 +111,7 @@ def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
 
 
 def test_no_map_has_less_than_the_one_before_it():
-    """r2 is slow: a map goes ahead of the watermark, then r2 comes, two windows behind r1."""
+    """A map goes ahead of the watermark, then r2 comes, two windows behind r1."""
     found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []
     for k in range(5):
         found.store.add_submap(SUBMAPS["r1"][k])
@@ -168,7 +168,7 @@ def test_a_refused_submap_changes_no_bit_and_says_why():
 
 
 def sequences(found, robot):
-    """The submaps that are kept for a robot which starts again."""
+    """Submaps kept for a robot that restarts."""
     return [each.sequence for each in found.store.messages_of(robot) if isinstance(each, m.Submap)]
 
 
@@ -221,7 +221,7 @@ ROBOT = ("r1", 1)
 
 
 def blocks(shift=0.0, variance=0.01, count=40, sigmas=0.0):
-    """Landmarks in a row, a metre apart; the third moved by so many metres, all by `sigmas`."""
+    """Landmarks in a row, a metre apart; the third moved by `shift` [m], all by `sigmas`."""
     ids = np.arange(count, dtype=np.uint32)
     means = np.column_stack([np.arange(count) * 1.0, np.zeros(count)])
     means[2, 1] += shift

@@ -1,4 +1,4 @@
-"""The consistency monitor: quiet where covariances are true, and it names who claims too much."""
+"""The consistency monitor: quiet where covariances are right; it names the overconfident robot."""
 
 from dataclasses import replace
 
@@ -64,7 +64,9 @@ def test_a_robot_that_halves_its_sigmas_is_named_in_every_seed_of_ten():
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROBUST])
 def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
-    """Whatever the loss; the factors 25 are what the bounded cost takes for nearly right."""
+    """With any loss; 25 is the factor up to which the bounded cost treats a residual as nearly
+    right.
+    """
     for seed in range(4):
         for factor in (1.0, 0.5, 2.0):
             found = watched(seed, with_covariance_times(factor, lambda _: True), settings)
@@ -89,7 +91,7 @@ def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])
 def test_the_covariance_scale_of_drawn_terms_is_theirs(dof, scale):
-    """The scale's mean and scatter over draws equal its claimed ones."""
+    """Mean and scatter of the scale over draws equal the stated ones."""
     rng = np.random.default_rng(0)
     draws = scale * rng.chisquare(dof, (400, 60))
     found = [covariance_scale(terms, np.full(60, dof)) for terms in draws]

@@ -1,4 +1,4 @@
-"""The centre's node: ticks, the end, exchanges; the attendance of robots."""
+"""The centre's node: ticks, the end, exchanges, attendance of robots."""
 
 import random
 
@@ -47,7 +47,7 @@ def done(name, submaps=4, incarnation=1):
 
 
 class Centre:
-    """A centre and all its publications."""
+    """A centre and its publications."""
 
     def __init__(self, config=CONFIG, robots=("r1", "r2")):
         self.node = make_centre(config, robots)
@@ -286,7 +286,7 @@ def done_attendance(robot: str, submaps: int) -> m.Done:
 
 
 class Looking:
-    """An attendance, and how many submaps of each robot are here."""
+    """An attendance, and the number of submaps of each robot."""
 
     def __init__(self, robots: list[str]) -> None:
         self.attendance = TeamAttendance.of(robots, self.dealt, self.count)

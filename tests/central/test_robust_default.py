@@ -1,4 +1,4 @@
-"""A team with default settings survives wrong measurements and a robot that is carried off."""
+"""With default settings a team survives outliers and a robot that is carried off."""
 
 from dataclasses import replace
 from pathlib import Path

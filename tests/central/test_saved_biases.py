@@ -1,4 +1,4 @@
-"""A saved map carries the robots' own errors, which tie those of the same robots on a later day."""
+"""A saved map carries the robots' biases, tied to those of the same robots on a later day."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ OF_OWN = ("own_means", "own_covariance", "own_cross", "own_sensitivity", "likeli
 
 
 def days(seed, count, own=OWN, common=COMMON):
-    """The submaps of each day of the same robots, a day is an incarnation; starts, errors."""
+    """Submaps of each day, an incarnation, of the same robots; starts, biases."""
     submaps, starts, errors = carts(seed, submaps=count * SUBMAPS, own=own, common=common)
     found = [[] for _ in range(count)]
     for each in submaps:
@@ -63,7 +63,7 @@ def landmarks(island):
 
 
 def raw(submaps, starts):
-    """The island of all days' submaps, each robot's errors tied to those of the day before."""
+    """The island of all days' submaps, each robot's biases tied to the day before."""
     island = fold_of(submaps, starts).main
     graph, priors = island.graph, []
     of_node = {node: of for of, node in graph.biases.items()}
@@ -127,7 +127,7 @@ def test_an_old_file_without_errors_is_still_read_and_leaves_todays_less_sure():
 
 
 def test_the_conditional_of_the_errors_is_the_saved_marginal():
-    """Marginalised over the errors, the factors are the landmarks of the file."""
+    """Marginalised over the biases, the factors are the landmarks of the file."""
     first, _, starts, _ = two_days(2)
     saved = saved_map(fold_of(first, starts))
     own, plain = translate.own_biases_of(saved), translate.local_map_of(submap_of(saved))
@@ -138,7 +138,7 @@ def test_the_conditional_of_the_errors_is_the_saved_marginal():
 
 
 def test_a_sensor_that_was_replaced_loses_the_tie_and_is_named():
-    """Between seeds 1 and 2 the error of r0 changes by 0.40, that of r1 by 0.01."""
+    """Between seeds 1 and 2 the bias of r0 changes by 0.40, that of r1 by 0.01."""
     first, _, starts, _ = two_days(1, own=0.3, common=0.0)
     _, second, _, errors = two_days(2, own=0.3, common=0.0)
     fold = fold_of([contribution(saved_map(fold_of(first, starts))), *second])

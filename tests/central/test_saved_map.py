@@ -1,4 +1,4 @@
-"""A saved map of an earlier day joins that of a later one, shows what moved, and may be wrong."""
+"""A saved map joins that of a later day, shows moved landmarks, and may be wrong."""
 
 import dataclasses
 import json
@@ -39,7 +39,7 @@ ALL = ("*",)
 
 
 def day(seed, maps=(), *, moved=(), unknown=(), scenario="thesis-b", streams=None):
-    """The samples, the centre and the truth of one day; moved: landmarks by number."""
+    """Samples, centre and truth of one day; moved: landmarks by number."""
     day_of = msgspec.structs.replace(load(scenario), seed=seed) if streams is None else scenario
     if streams is None:
         day_of = final_only(day_of)
@@ -73,7 +73,6 @@ def second_day(loaded=True, moved=(), unknown=()):
 
 
 def errors(fused: m.FusedMap, streams: WorldStreams):
-    """RMSE [m] after alignment, and NEES per degree of freedom of the map's shape."""
     found = ids(fused.ids, "ids")
     truth = streams.landmarks[np.searchsorted(streams.landmark_ids, found)]
     n = 2 * len(found)
@@ -133,7 +132,7 @@ def test_a_day_that_the_map_contains_is_named_and_gives_no_advice_about_sigmas(l
 
 @pytest.mark.parametrize("moved", [((15, (0.5, 0.0)),), tuple((k, (3.0, 2.0)) for k in (2, 8, 11))])
 def test_what_has_moved_is_found_and_nothing_else(moved):
-    """It is separated: both days stay right, and the map is as accurate as without the old one."""
+    """The moved landmark is separated, and the map is as accurate as without the old one."""
     samples, _, streams = second_day(moved=moved)
     fused = final_map(samples)
     found = changed(fused)
@@ -158,7 +157,7 @@ def test_a_landmark_that_is_not_seen_again_is_gone_and_is_not_saved_again():
 
 @pytest.mark.parametrize("detections", [1, 40])
 def test_one_misread_number_does_not_move_a_landmark_that_is_gone(detections):
-    """As an outlier in a submap, or as the place that this submap has; the old one can be told."""
+    """As an outlier in a submap, or as this submap's place."""
     _, _, streams = second_day(moved=((15, (-900.0, -900.0)),))
     first, *rest = streams.streams
     seen = first.landmark_detections
@@ -207,7 +206,7 @@ def test_a_running_centre_saves_the_map_of_its_present_set():
 
 
 def test_two_saves_of_a_day_count_once_though_an_earlier_robot_came_between():
-    """Each names the streams in it: the second save has the first one's among others."""
+    """Each save names its streams; the second contains those of the first."""
     samples, centre, _ = second_day(loaded=False)
     fold = type(centre.maps.fold)(centre.config, centre.config_digest)
     saves = []
@@ -225,7 +224,7 @@ def test_two_saves_of_a_day_count_once_though_an_earlier_robot_came_between():
 
 
 def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
-    """An error of 4 sigma that is called a move would replace years of sure observations."""
+    """An error of 4 sigma must not replace years of measurements as a move."""
     _, centre, _ = second_day()
     fold, fused = centre.maps.fold._final
     by = np.array([0.5, -0.2])
@@ -316,7 +315,7 @@ def test_the_saved_map_of_a_log_is_the_centres():
 
 
 def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
-    """Each day's map contains the earlier ones: fewer errors, a covariance that fits them."""
+    """Each day's map contains the earlier ones."""
     figures, sizes = [], []
     for seed in (1, 2):
         maps = []
@@ -402,7 +401,7 @@ def test_two_maps_with_a_day_in_common_would_count_it_twice():
 
 
 def classed(seed, classes):
-    """A day without identities; classes: the class of a landmark that is reported, by number."""
+    """A day without identities; classes: reported class of a landmark, by number."""
     day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
     world = streams_of(final_only(day_of))
     streams = []
@@ -439,7 +438,7 @@ def test_the_submap_of_a_map_has_landmarks_and_no_motion():
 
 
 def test_the_commands_save_show_and_load_a_map(tmp_path):
-    """`map save` of a log, `map show` of the file; `rerun --map` of a later day loads it."""
+    """`map save`, `map show`, and `rerun --map` of a later day."""
     log, later, site = (tmp_path / name for name in ("log.mcap", "later.mcap", "site.map"))
     for path, samples in ((log, first_day()[0]), (later, second_day(loaded=False)[0])):
         with Recorder(path, "small", {"seed": "1"}) as recorder:
@@ -467,7 +466,7 @@ def test_the_commands_save_show_and_load_a_map(tmp_path):
 
 
 def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> WorldStreams:
-    """The measurements of a time; `begins`: with the known starts."""
+    """Measurements of an interval of time; `begins`: with the known starts."""
     streams = []
     for each in world.streams:
         of = each.intervals

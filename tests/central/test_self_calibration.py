@@ -1,5 +1,3 @@
-"""A robot that differs from its configuration is found, corrected for and named; others are not."""
-
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,7 @@ CAUSES = ("clock_offset", "odometry_scale", "bearing_offset", "range_offset")
 
 
 def mapped(world: StressWorld, place: Path, *, blind: bool = False) -> MapResult:
-    """The team's final map of this world; blind: without the states of calibration errors."""
+    """The final map of this world; blind: without bias states."""
     scenario = final_only(scenario_in(write(world, place)))
     if blind:
         robots = (
@@ -75,7 +73,7 @@ def test_a_team_that_is_as_configured_is_not_named(tmp_path):
 
 
 def test_a_robot_with_one_landmark_keeps_its_configuration(tmp_path):
-    """Nothing determines its errors: their prior does."""
+    """Its biases are determined by their prior alone."""
     found = mapped(StressWorld(seed=2, landmarks=1, robots=1, seconds=120.0), tmp_path)
     assert not shared_errors_of(found)
     assert found.errors.nees_per_dof < 5.0

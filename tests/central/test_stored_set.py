@@ -1,5 +1,3 @@
-"""The set of a centre on disk: each member once, what is none not, and all of it back."""
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +16,7 @@ SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in ran
 
 @contextmanager
 def a_life(path: Path) -> Iterator[StoredSet]:
-    """A centre's set from its start to its end."""
+    """A centre's set from start to end."""
     kept = StoredSet(path)
     yield kept
     kept.close()
@@ -29,7 +27,7 @@ def heard(found: list[Sample]) -> list[tuple[str, bytes]]:
 
 
 def kept_in(path: Path) -> list[tuple[str, bytes]]:
-    """Return the members that a restarted process reads."""
+    """Members that a restarted process reads."""
     with a_life(path) as kept:
         return heard(kept.samples())
 

@@ -1,4 +1,4 @@
-"""Surveyed landmarks fix the team's frame, also where no robot has a known start."""
+"""Surveyed landmarks fix the team's frame, also without a known start."""
 
 from functools import cache
 
@@ -31,7 +31,7 @@ UTM = (399_000.0, 5_756_000.0)
 
 @cache
 def drive(seed, unknown=("*",)):
-    """The scenario, the world, and the samples of a team without a survey."""
+    """Scenario, world and samples of a team without a survey."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=200)
     scenario = msgspec.structs.replace(scenario, seed=seed, world=world)
@@ -54,7 +54,7 @@ def surveyed_landmarks(seed, numbers, wrong=None, origin=(0.0, 0.0)):
 
 
 def fold_drive(seed, surveyed, *, unknown=("*",), maps=()) -> tuple[m.FusedMap, CentralNode]:
-    """The final map of a drive's submaps, which depend on no survey, and its centre."""
+    """The final map of a drive's submaps, which do not depend on the survey, and its centre."""
     scenario, _, samples = drive(seed, unknown)
     config = msgspec.structs.replace(scenario.central, surveyed=surveyed)
     centre = make_centre(config, [each.id for each in scenario.robots])
@@ -71,7 +71,7 @@ def day(seed, numbers, *, unknown=("*",), wrong=None, origin=(0.0, 0.0)):
 
 @cache
 def live_day():
-    """The samples of a team whose centre has a survey from the beginning."""
+    """Samples of a team whose centre has a survey from the beginning."""
     scenario, streams, _ = drive(1)
     central = msgspec.structs.replace(scenario.central, surveyed=surveyed_landmarks(1, (3, 15)))
     return list(run_team(msgspec.structs.replace(scenario, central=central), streams))

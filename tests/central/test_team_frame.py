@@ -1,4 +1,4 @@
-"""The frame of the robots' poses, for any order of arrival of their submaps."""
+"""Frame of the robots' poses, for any order of arrival of their submaps."""
 
 from collections import deque
 
@@ -29,7 +29,7 @@ _STREAMS: dict[tuple[str, bool, bool], list[m.Measurement]] = {}
 
 
 def measured(robot: str, *, started: bool, apart: bool) -> list[m.Measurement]:
-    """The robot's measurements; apart: of landmarks that no other robot has."""
+    """Measurements of the robot; apart: of landmarks that no other robot has."""
     key = (robot, started, apart)
     if key not in _STREAMS:
         found = published(stream(robot, STEPS, known=started, y=PATH_Y[robot]))
@@ -39,14 +39,14 @@ def measured(robot: str, *, started: bool, apart: bool) -> list[m.Measurement]:
 
 
 def renamed(measurement: m.Measurement, offset: int) -> m.Measurement:
-    """The measurement with other landmark ids."""
+    """Shift the landmark ids."""
     if not isinstance(measurement, m.Observations):
         return measurement
     return msgspec.structs.replace(measurement, ids=from_ids(ids(measurement.ids, "ids") + offset))
 
 
 class Team:
-    """Robots and a centre; the submaps of each robot wait until they are delivered.
+    """Robots and a centre; submaps wait until they are delivered.
 
     poses: the newest message of each robot on team/pose.
     """
@@ -76,7 +76,7 @@ class Team:
             self.take(self.robots[name].handle(measurement, 0))
 
     def deliver(self, name: str) -> None:
-        """Give the centre the robot's next message, and the robots what follows."""
+        """Deliver the robot's next message to the centre, and the answers to the robots."""
         if self.sent[name]:
             self.to_centre(self.sent[name].popleft())
 
@@ -107,7 +107,7 @@ class Team:
         self.to_centre(order)
 
     def check(self) -> None:
-        """No pose claims another frame than that of the newest map, and none is far off in it."""
+        """Check that poses state the newest map's frame or none, and are right in it."""
         for name, pose in self.poses.items():
             if not pose.in_team_frame:
                 assert pose.frame == f"{name}/1", "its own"
@@ -126,7 +126,7 @@ ROBOTS = sorted(PATH_Y)
 
 @st.composite
 def teams(draw):
-    """The robots, and the order in which they measure and are heard of."""
+    """Robots, and the order of measurements and deliveries."""
     names = ROBOTS[: draw(st.integers(2, 3))]
     kinds = {name: (draw(st.booleans()), draw(st.booleans())) for name in names}
     action = st.tuples(st.sampled_from(["measure", "measure", "deliver"]), st.sampled_from(names))
@@ -161,7 +161,6 @@ def test_no_pose_claims_the_teams_frame_and_is_in_another_whatever_the_order_of_
 
 
 def end_of(team: Team) -> m.End:
-    """The end of all streams, which the robots come to."""
     ends = []
     for name, node in team.robots.items():
         while team.coming[name]:
@@ -236,7 +235,6 @@ def test_a_withdrawn_robot_and_those_in_its_frame_withdraw_their_poses():
 
 
 def newest_prior(team: Team) -> m.Prior:
-    """The newest one of bravo."""
     found = (o.message for o in reversed(team.log) if o.channel is ch.PRIOR and o.name == "bravo")
     return next(found)
 

@@ -1,4 +1,4 @@
-"""The fold by ticks: the same for any order of arrival, final behind the watermark."""
+"""The fold by ticks: independent of the order of arrival, final behind the watermark."""
 
 from functools import cache
 
@@ -51,7 +51,7 @@ def expected():
 @settings(deadline=None, max_examples=12)
 @given(st.deferred(lambda: st.permutations(range(len(SUBMAPS.every())))), st.data())
 def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(order, data):
-    """A stream's own submaps come in sequence: the set hands on what has no gap."""
+    """A stream's own submaps come in sequence, since the set delivers no gaps."""
     ticks = fresh()
     waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
     for i in order:

@@ -1,4 +1,4 @@
-"""Law 2 where landmarks have no names: the map is a function of the set of submaps and verdicts."""
+"""Law 2 without identities: the map is a function of the set of submaps and verdicts."""
 
 from functools import cache
 from itertools import permutations
@@ -22,7 +22,7 @@ RING = 20.0
 
 @cache
 def two_robots() -> dict[str, list[m.Submap]]:
-    """Two robots with unknown initial poses on one ring, the second behind the first."""
+    """Two robots with unknown initial poses on one ring, one behind the other."""
     rng = np.random.default_rng(8)
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 80))
     r = rng.uniform(16.0, 24.0, 80)
@@ -132,7 +132,7 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final):
 
 
 def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been():
-    """Whenever the order comes: before its submaps, among them, behind a broadcast."""
+    """Whether the order comes before, among or after its submaps, or after a broadcast."""
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()
     for submap in two_robots()["r1"]:

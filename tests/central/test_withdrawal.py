@@ -42,9 +42,9 @@ MOTION = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.0
 
 
 def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
-    """A small world in which robots meet; each submap has a pose node or two.
+    """A small world in which robots meet; submaps have one or two pose nodes.
 
-    Without self-calibration, which would explain wheels that are a third too large.
+    Self-calibration is off: it would explain wheels that are a third too large.
     """
     front = FrontEnd(particles=20, window_s=5.0, node_s=5.0, biases=())
     world = SimulatedWorld(
@@ -58,7 +58,7 @@ def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
 
 
 def run(of: Scenario, wrong: str = "") -> list[Sample]:
-    """r3 has wheels that are a third too large, a bent camera, or one that reads too far."""
+    """r3 has wheels a third too large, a bent camera, or one that reads too far."""
     motion, sensor = MOTION, SENSOR
     if wrong == "bearing":
         sensor = msgspec.structs.replace(SENSOR, bearing_offset=0.3)
@@ -95,9 +95,9 @@ def of_set(
     central: CentralConfig | None = None,
     instead: m.Submap | None = None,
 ) -> TickFold:
-    """The fold over a run's submaps; without a robot: as if it had never been.
+    """The fold over a run's submaps; without: robot left out from the beginning.
 
-    instead: a submap in the place of the one with its name.
+    instead: a submap in place of the one of its name.
     """
     ticks = TickFold(scenario().central if central is None else central)
     for start in messages(samples, m.InitialPose):
@@ -210,8 +210,7 @@ def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimate
 
 
 def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
-    """An order is its operator's: in earlier versions a majority of robots could repeat one that
-    never was."""
+    """Orders come from the operator alone."""
     node = CentralNode(CentralConfig(), ["r1", "r2", "r3", "r4"])
     for robot in ("r1", "r2", "r3", "r4"):
         report = build.withdrawal_heard(robot=robot, withdrawn="r2", reason="it never was")
@@ -223,7 +222,7 @@ def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
 
 @cache
 def one_closes_windows_often() -> list[m.Message]:
-    """r3's wheels are wrong, and it has many submaps before the others have enough to be judged.
+    """r3's wheels are wrong, and it has many submaps before the others have enough for a verdict.
 
     Initial poses, inter-robot measurements and submaps until UNTIL_S, by their stamps.
     """
@@ -263,7 +262,7 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Map
 
 
 def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
-    """At 35 s r3 is a suspect whom nobody can convict yet; five submaps later there are enough."""
+    """At 35 s r3 is a suspect without enough evidence; five submaps later there is enough."""
     by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
@@ -281,7 +280,7 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
 
 
 def test_who_was_convicted_without_what_comes_late_is_acquitted():
-    """Two that agree convict a third; a submap of it that came late takes the checkpoint away."""
+    """Two that agree outvote a third; a late submap of it invalidates the checkpoint."""
     samples = team_run("odometry")
     ticks = of_set(samples)
     ticks.fold_until(math.inf)
@@ -304,7 +303,7 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong():
 
 
 def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
-    """The small world with three in ten measurements spoilt."""
+    """The small world with 30 % outliers."""
     of = scenario(landmark_submaps=2)
     replaced = msgspec.structs.replace
     team = tuple(replaced(r, front_end=replaced(r.front_end, particles=40)) for r in of.robots)
@@ -314,7 +313,7 @@ def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])
 def test_no_good_robot_is_withdrawn_for_the_outliers_among_its_measurements(kind):
-    """Nor is anybody a suspect; by windows without rejection all are (2000 and more)."""
+    """None is a suspect either; by windows without rejection all would be (2000 and more)."""
     of = with_outliers(kind, 3)
     samples = tuple(run(of))
     assert final_map(list(samples)).withdrawn == ()

@@ -1,7 +1,7 @@
 """Consistency: whether the estimator's covariances agree with its errors.
 
-Each test simulates many worlds whose true values are known and evaluates one of three statistics
-per degree of freedom, each of which has the expectation 1 if the covariances are right:
+Each test simulates many worlds with known truth and evaluates a statistic per degree of freedom,
+whose expectation is 1 if the covariances are right:
 
 | statistic | of | module |
 |---|---|---|
@@ -13,15 +13,14 @@ per degree of freedom, each of which has the expectation 1 if the covariances ar
 | NEES | a robot's pose in the team's frame | `test_team_pose` |
 | NEES | a map and the biases estimated with it | `test_map`, `test_range_scale` |
 
-The mean over the worlds has to lie in the two-sided interval that it leaves with probability 0.001
-(`team/estimation/consistency.py: chi2_interval`): above it the covariances are too small, below it
-too large. Most tests also have power: the same statistic of a mutant that counts information twice,
-or lacks a state, has to lie outside. `test_measures` tests the statistics and the interval
-themselves, on errors of a given covariance.
+The mean over the worlds must lie in the two-sided 99.9 % interval
+(`team/estimation/consistency.py: chi2_interval`); above it the covariances are too small. Most
+tests show their power by a mutant that counts information twice, or lacks a state, and must lie
+outside. `test_measures` tests the statistics themselves.
 
     python -m pytest tests/consistency
 
-The consistency of the comparison methods is in `tests/studies/estimators`, that of the monitor of
-a running team in `tests/central/test_monitor.py`, that of the window's smoother in
+Elsewhere: comparison methods in `tests/studies/estimators`, the monitor in
+`tests/central/test_monitor.py`, the window's smoother in
 `tests/estimation/association/test_clustering.py`.
 """

@@ -1,4 +1,4 @@
-"""Joined maps: NEES and joint cost; each with a mutant that fails."""
+"""NEES and joint cost of joined maps, each with a mutant that fails."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ RUNS = 100
 
 
 def consistency(runs):
-    """Mean NEES of the map and mean joint cost, each per degree of freedom, with it.
+    """Mean NEES and mean joint cost, each per degree of freedom, with it.
 
     runs: pairs of a fold and the true landmarks.
     """

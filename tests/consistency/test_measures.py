@@ -1,4 +1,4 @@
-"""The statistics of consistency and their intervals, on errors of a given covariance."""
+"""The statistics and their intervals, on errors of a given covariance."""
 
 import numpy as np
 import pytest

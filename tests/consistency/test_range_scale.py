@@ -1,6 +1,6 @@
-"""The NEES of maps of sensors with a common scale error of their ranges, and of the scale.
+"""NEES of maps with a common scale error of the ranges, and of the scale.
 
-The mutants lack the state of an error, or evaluate the scale at measured ranges.
+The mutants lack the bias state, or evaluate the scale at measured ranges.
 """
 
 import numpy as np
@@ -42,8 +42,9 @@ def test_the_scale_of_ranges_is_unbiased_at_joined_ranges_and_at_the_measured_on
 
 
 def test_a_scale_that_only_its_prior_determines_is_not_overconfident():
-    """Without odometry the scale of the map is undetermined; a sensitivity along the measured
-    bearings would determine it.
+    """Without odometry the map's scale is undetermined; a sensitivity along the measured bearings
+    would
+    determine it.
     """
     errors = scale_errors(range(300, 330), joined_ranges=True, way=1.0)
     assert abs(np.mean(errors)) < 3.3 / np.sqrt(len(errors))
@@ -67,7 +68,7 @@ def nees_of_maps(seeds, common_bias_sigma):
 
 
 def test_a_map_is_consistent_only_with_a_state_of_each_error_that_all_robots_share():
-    """Of the scale of all ranges, and of each landmark's marker, which reads too far for all."""
+    """The scale of all ranges, and a common range offset of each landmark's marker."""
     low, high = chi2_interval(10, 0.999, len(SEEDS))
     states = {"range_scale": COMMON, "marker": MARKER}
     assert low < nees_of_maps(SEEDS, states) / 10.0 < high

@@ -1,4 +1,4 @@
-"""Submaps and innovations of the front end; each with a mutant that fails."""
+"""Submaps and innovations of the front end, each with a mutant that fails."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from tests.estimation.hybrid_slam.test_window import (
 
 
 def submap_errors(sensor, particles, runs, **options):
-    """(NEES, dof) of end pose and landmarks jointly for each of the seeded windows."""
+    """(NEES, dof) of end pose and landmarks jointly for each seeded window."""
     results = []
     for seed in range(runs):
         run = drive(seed, sensor)
@@ -52,7 +52,7 @@ def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_measu
 
 
 def per_dof(sensor, runs=200, told=None, **options):
-    """The mean over seeded windows, and the 99.9 % interval that it lies in if all is right."""
+    """Mean over seeded windows, and its 99.9 % interval."""
     found = [
         driven(drive(s, sensor, steps=6), told or sensor, seed=s, **options) for s in range(runs)
     ]

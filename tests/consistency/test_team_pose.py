@@ -1,6 +1,6 @@
-"""The NEES of a robot's pose in the team's frame.
+"""NEES of a robot's pose in the team's frame.
 
-The mutants count a submap twice, or later submaps unlike the centre.
+The mutants count a submap twice, or treat later submaps unlike the centre.
 """
 
 from dataclasses import replace
@@ -51,7 +51,7 @@ SHARED = JoinSettings(covariance_factor=FACTOR, bias_sigma={"range_scale": SIGMA
 
 
 def with_shared_error(submap, error, rng):
-    """Errors of FACTOR times the stated covariance, and one that all its robot's submaps have."""
+    """Errors of FACTOR times the stated covariance, and one that all submaps of a robot share."""
     local = submap.local
     n = len(local.mean)
     column = 0.5 * rng.standard_normal((1, n))
@@ -64,7 +64,7 @@ def with_shared_error(submap, error, rng):
 
 
 def test_the_team_pose_is_overconfident_unless_it_joins_later_submaps_as_the_centre_does():
-    """The mutant takes them as they are: neither the factor nor the shared error of its prior."""
+    """The mutant omits the covariance factor and the shared error of the prior."""
     runs, told, untold = 200, 0.0, 0.0
     for seed in range(runs):
         rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_the_team_pose_is_overconfident_unless_it_joins_later_submaps_as_the_cen
 
 
 def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
-    """Broadcasts come late and some not at all; the mutant counts the robot's submaps twice."""
+    """Broadcasts come late or not at all; the mutant counts the robot's submaps twice."""
     runs, honest, twice = 200, 0.0, 0.0
     for seed in range(runs):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The core has the same bits whatever compiles it, and no build of it contracts arithmetic."""
+"""The core has the same bits with any compiler, and no build contracts arithmetic."""
 
 import hashlib
 import os
@@ -110,7 +110,7 @@ def test_the_search_for_fused_instructions_finds_one(tmp_path):
 
 
 def test_the_library_is_built_from_the_sources_that_are_here():
-    """Else the tests look at another core: `make core` builds it."""
+    """Otherwise run `make core`."""
     sources = [*(FOLDER / "src").glob("*.[ch]pp"), FOLDER / "CMakeLists.txt"]
     names = sorted(sources, key=lambda path: path.relative_to(FOLDER).as_posix())
     digests = "".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in names)

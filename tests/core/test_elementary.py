@@ -15,7 +15,7 @@ DIGITS = 45
 
 
 def _sine(x: Decimal) -> Decimal:
-    """Taylor's series of the angle less whole turns, at an eighth of it and three times doubled."""
+    """Taylor's series at an eighth of the reduced angle, three times doubled."""
     x = (x - 2 * PI * (x / (2 * PI)).to_integral_value()) / 3**3
     term = total = x
     for k in range(1, 40):

@@ -1,9 +1,10 @@
 """Each entry of the core returns or raises an error of its caller, whatever its arguments.
 
-Every function, constructor, method and property of the stub has an example, which it accepts. One
-or two arguments of the example, or of the constructor of its object, are replaced: by numbers that
-are not finite, huge or negative, by arrays of other shapes, types and strides, by None. In `make
-check-core` an access out of bounds, an overflow or a null pointer ends the process.
+Every entry of the stub has a valid example. One or two of its arguments, or of its object's
+constructor, are replaced by non-finite, huge or negative numbers, by arrays of other shapes, types
+and strides, or by None. In `make check-core` an access out of bounds, an overflow or a null
+pointer
+ends the process.
 """
 
 import ast
@@ -188,7 +189,7 @@ EXAMPLES = {
 
 
 def entries_of(stub: str) -> dict[str, list[str] | None]:
-    """List the stub's entries with the names of their arguments; None for a property."""
+    """List the stub's entries with their argument names; None for a property."""
     found: dict[str, list[str] | None] = {}
     for node in ast.parse(stub).body:
         members = node.body if isinstance(node, ast.ClassDef) and not node.bases else [node]
@@ -206,19 +207,18 @@ ENTRIES = entries_of((Path(core.__file__).parent / "_core.pyi").read_text("utf-8
 
 
 def examples_of(name: str) -> dict[str, object]:
-    """Make the example of each argument of an entry: its own, or that of all of the name."""
+    """Example of each argument of an entry: its own, or the one shared by name."""
     own = {each: f"{name}.{each}" for each in ENTRIES[name] or ()}
     return {each: EXAMPLES[at if at in EXAMPLES else each]() for each, at in own.items()}
 
 
 def made(name: str) -> object:
-    """Make an object of a class of the core by its example."""
     return getattr(core, name)(**examples_of(name))
 
 
 @cache
 def one_graph() -> core.SubmapGraph:
-    """Make the graph of all estimates."""
+    """The graph of all estimates."""
     return made("SubmapGraph")
 
 
@@ -250,7 +250,6 @@ OBJECTS = {
 
 
 def call(name: str, arguments: dict[str, object], owner: object) -> object:
-    """Call an entry, of an object if it has one."""
     of_class, _, member = name.rpartition(".")
     if not of_class:
         return getattr(core, name)(**arguments)
@@ -263,7 +262,7 @@ def one_of(choices: Sequence[object], rng: np.random.Generator) -> object:
 
 
 def mutated_array(value: np.ndarray, kind: int, rng: np.random.Generator) -> object:
-    """Change the shape, the layout, the type or one number of an array."""
+    """Change the shape, layout, type or one number of an array."""
     axis = int(rng.integers(value.ndim))
     if kind == 1 and value.shape[axis]:
         return np.delete(value, 0, axis)

@@ -1,4 +1,4 @@
-"""Odometry and scans in the core: motions since several places, and inputs that are refused."""
+"""Odometry and scans in the core: motions from several places, and refused inputs."""
 
 import numpy as np
 import pytest

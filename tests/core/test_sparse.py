@@ -1,4 +1,4 @@
-"""The sparse factorisation equals the dense one, and names the variable that is undetermined."""
+"""The sparse factorisation equals the dense one, and names an undetermined variable."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,13 @@ BIG_ROWS, BLOCK = 256, 48
 
 
 def pattern_of(sizes, pairs):
-    """The pattern with these blocks (i > j) and every diagonal block."""
     columns = [[j, *sorted(i for i, k in set(pairs) if k == j)] for j in range(len(sizes))]
     starts = np.cumsum([0, *(len(rows) for rows in columns)])
     return Pattern(np.array(sizes), starts, np.array([i for rows in columns for i in rows]))
 
 
 def pattern_with(sizes, tied):
-    """The pattern with these blocks; `tied` is looked at below its diagonal."""
+    """The pattern with these blocks; `tied` is read below its diagonal."""
     columns = [np.append(j, j + 1 + np.flatnonzero(tied[j + 1 :, j])) for j in range(len(sizes))]
     starts = np.cumsum([0, *(len(rows) for rows in columns)])
     return Pattern(np.array(sizes), starts, np.concatenate(columns))
@@ -36,7 +35,7 @@ def values_of(pattern, dense):
 
 
 def dense_on(pattern, rng):
-    """A well-conditioned positive definite matrix with this pattern, badly scaled."""
+    """A positive definite matrix with this pattern, well-conditioned but badly scaled."""
     offset = pattern.offset
     n = offset[-1]
     mask = np.zeros((n, n), dtype=bool)
@@ -55,7 +54,7 @@ def inverse_of(dense):
 
 
 def assert_right(pattern, dense, rng):
-    """Every result of the factor is that of dense algebra, relative to standard deviations."""
+    """Compare every result of the factor with dense algebra, relative to standard deviations."""
     cholesky, inverse = Cholesky(pattern, values_of(pattern, dense)), inverse_of(dense)
     n, sigma = len(dense), np.sqrt(np.diag(inverse))
     relative = np.outer(sigma, sigma)
@@ -105,7 +104,7 @@ def test_a_sparse_system_is_solved_and_inverted_like_a_dense_one(pattern, seed):
 
 
 def clique(unknowns):
-    """Everything is tied to everything; blocks of three unknowns as far as they go."""
+    """A full matrix of blocks of three unknowns."""
     sizes = [3] * (unknowns // 3) + [1] * (unknowns % 3)
     return pattern_with(sizes, np.ones((len(sizes), len(sizes)), dtype=bool))
 
@@ -118,9 +117,9 @@ def test_a_big_panel_is_right_at_each_edge_of_a_block(blocks, beyond, seed):
 
 
 def groups_on_a_clique(seed):
-    """Three groups that are tied to parts of a clique: big panels below a big root, and small ones.
-
-    Each group: some 70 unknowns, all tied to each other and to some 580 of the clique's 1000.
+    """Three groups of some 70 unknowns, each tied to some 580 of a clique's 1000: big panels below
+    a big
+    root, and small ones.
     """
     rng = np.random.default_rng(seed)
     root, group, loose = 500, 35, 30

@@ -1,6 +1,6 @@
-"""The boundary of the core: what crosses is checked, and what is refused changes nothing.
+"""The boundary of the core checks its inputs; a refused one changes nothing.
 
-The results of a window are tested in tests/estimation/hybrid_slam.
+Results of a window are tested in tests/estimation/hybrid_slam.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def opened(keyframes: int = 2, noise: tuple[float, ...] = NOISE) -> core.Window:
 
 
 def advance(window: core.Window, keyframe: tuple[object, ...] = KEYFRAME) -> core.Step:
-    """Take a keyframe by the same random numbers as any other."""
+    """Take a keyframe with the same random numbers as any other."""
     return window.advance(*keyframe, core.Random(KEY))
 
 
@@ -170,7 +170,7 @@ def test_a_pose_node_needs_a_keyframe_and_a_keyframe_of_a_measurement_a_path():
     st.integers(1, 40), st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([NOISE, CONSTANT])
 )
 def test_windows_of_any_size_run_and_close(count, seed, improved, noise):
-    """Sizes, ids and claims at random, for a build with sanitizers to find reads beyond an end."""
+    """Random sizes, ids and claims, for sanitizers to find reads out of bounds."""
     rng = np.random.default_rng(seed)
     mount = (0.1, 0.2, 0.3) if seed % 2 else (0.0, 0.0, 0.0)
     window, random = core.Window(count, noise, improved, mount, 0.5), core.Random(KEY)

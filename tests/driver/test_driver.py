@@ -1,5 +1,3 @@
-"""The driver: refused calls, the stored stream, and its messages."""
-
 import re
 import threading
 import warnings
@@ -250,7 +248,7 @@ def test_a_difference_of_poses_covers_the_time_in_which_a_driver_was_away(alone)
 
 
 class Listener:
-    """A robot's process for a driver: it receives measurements and reports its progress."""
+    """A robot's process that receives measurements and reports its progress."""
 
     def __init__(self, endpoint):
         self.bus = ZenohBus("lab", endpoint)

@@ -1,4 +1,4 @@
-"""What the estimation computes with, each function's bits as a digest; run it for a table of them.
+"""Bits of the estimation's functions as digests; run it for a table.
 
 python -m tests.estimation.arithmetic
 """
@@ -16,7 +16,7 @@ SIZES = (3, 40, 130)
 
 
 def digests() -> dict[str, str]:
-    """A digest of what each function makes of the same arguments."""
+    """A digest of each function's results for the same arguments."""
     x = np.concatenate([0.08 * np.arange(-500.0, 500.0), np.ldexp(1.37, np.arange(-1000, 1000))])
     found = {
         "sin": core.sin(x),

@@ -1,4 +1,4 @@
-"""Runs of single estimators in the thesis' world: one keyframe a step, as its streams have them."""
+"""Runs of single estimators in the thesis' world: one keyframe a step."""
 
 import functools
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from teamslam.team.estimation.models import Increment, corrected, increment_of
 
 
 class Keyframe(NamedTuple):
-    """One step's motion and what was seen at its end."""
+    """One step's motion and the measurements at its end."""
 
     increment: Increment
     ids: np.ndarray
@@ -27,7 +27,7 @@ def world(name, seed):
 
 
 def keyframes_of(config, stream):
-    """One keyframe per odometry interval; every interval ends with one message of landmarks."""
+    """One keyframe per odometry interval, each of which ends with one message of landmarks."""
     told, seen = stream.intervals, stream.landmark_detections
     np.testing.assert_array_equal(told.end_ns, seen.stamps_ns)
     keyframes = []
@@ -41,12 +41,12 @@ def keyframes_of(config, stream):
 
 
 def run(state, step, keyframes, config, *generator):
-    """The state after the keyframes, by an estimator's `filter_step`."""
+    """Run an estimator's `filter_step` over the keyframes."""
     for increment, *measurements in keyframes:
         state = step(state, increment, config.sensor, *measurements, *generator)
     return state
 
 
 def map_errors(landmarks, streams):
-    """Flat errors of the estimated landmarks (id k is the k-th true one), m."""
+    """Flat errors [m] of the estimated landmarks (id k is the k-th true one)."""
     return (landmarks.means - streams.landmarks[landmarks.ids.astype(int) - 1]).ravel()

@@ -1,9 +1,8 @@
-"""Worlds with each form of measurement, and the NEES of the submaps made of them.
+"""Worlds with each form of measurement, and the NEES of their submaps.
 
 Odometry is speeds, increments on SE(2) with a lateral part and a correlated covariance, or a car's
-encoders; landmarks are points or range and bearing, each with its own covariance, measured by a
-mounted sensor. A submap is compared with the truth in its own frame. A mutant changes the robot's
-configuration or its streams so that the stated covariances are wrong.
+encoders; landmarks are points or range and bearing with their own covariances, from a mounted
+sensor. A mutant makes the stated covariances wrong.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -40,7 +39,7 @@ FRONT = FrontEnd(particles=400, window_s=WINDOW_S)
 
 
 class Case(NamedTuple):
-    """A world, its robot, and what each mutant of it changes of the robot or of the streams."""
+    """A world, its robot, and each mutant's change of robot or streams."""
 
     world: SimulatedWorld
     robot: RobotConfig
@@ -117,7 +116,6 @@ CASES: Mapping[str, Case] = {
 
 
 def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWindow]:
-    """The windows that the robot makes of its stream."""
     slam = HybridSlam(robot, 1)
     for message in messages_of(stream):
         if isinstance(message, m.AnyScan | m.Detections):
@@ -142,7 +140,7 @@ def window_nees(closed: ClosedWindow, world: WorldStreams) -> tuple[float, int]:
 
 
 def mean_nees(case: Case, seeds: int, mutant: str | None = None) -> tuple[float, float, float]:
-    """The mean NEES per degree of freedom over seeds, and the interval that it should lie in."""
+    """Mean NEES per degree of freedom over seeds, and its interval."""
     total, dof = 0.0, 0
     for seed in range(seeds):
         world = simulate(case.world, [case.robot], seed)

@@ -1,4 +1,4 @@
-"""Teams whose submaps have a pose node in the middle of each, from where teammates are seen."""
+"""Teams whose submaps have a pose node in their middle, from where teammates are seen."""
 
 from dataclasses import dataclass, replace
 
@@ -77,7 +77,7 @@ def meeting(seed, robots=2, submaps=6, landmarks=5, reach=12.0, sigmas=(0.1, 0.0
 
 
 def joined_with(submaps, starts, sightings, options, tick=4):
-    """The fold over the submaps, `tick` at a time, with the sightings from the tick's submaps."""
+    """Fold the submaps, `tick` at a time, with the sightings from the tick's submaps."""
     fold = EMPTY_FOLD
     for start in starts:
         fold = add_start(fold, start)
@@ -90,9 +90,9 @@ def joined_with(submaps, starts, sightings, options, tick=4):
 
 
 def mirrored(bearing_sigma, options):
-    """r1 drives straight beside r0, who sees how far it is but hardly where: left or right.
+    """r1 drives straight beside r0, who measures its range but hardly its bearing.
 
-    Two islands: as it is, and with r1 on the other side.
+    Two islands: the true one, and r1 on the other side.
     """
     ranges_seen = []
     stamps = np.arange(1, 5) * 1000

@@ -1,6 +1,6 @@
 """Teams whose submaps are drawn from their own Gaussians about a known truth.
 
-The truth is made with complex numbers (a position is x + iy), not with the estimator's geometry.
+The truth is made with complex numbers (x + iy), not with the estimator's geometry.
 """
 
 from dataclasses import dataclass, replace
@@ -57,7 +57,7 @@ def drawn(truth, covariance, rng):
 
 
 def solved(fold, settings):
-    """The fold with the full solution of its main island; other minima are not searched for."""
+    """The fold with the full solution of its main island, without a search for other minima."""
     island, _, _ = solve_island(replace(fold.main, settings=settings))
     return replace(fold, islands={**fold.islands, fold.main_key: island})
 

@@ -1,4 +1,4 @@
-"""Rounds of a team of two that drives circles among four landmarks, with its models' own noise."""
+"""A team of two that drives circles among four landmarks, with its models' own noise."""
 
 import numpy as np
 

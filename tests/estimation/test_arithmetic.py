@@ -1,4 +1,4 @@
-"""The bits of what the estimation computes with do not depend on the processor's features."""
+"""The estimation's bits do not depend on the processor's features."""
 
 import json
 import os

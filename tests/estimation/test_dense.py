@@ -1,4 +1,4 @@
-"""Products and solutions of our own against NumPy's, and one order of every sum."""
+"""Own products and solutions against NumPy's, and one order of every sum."""
 
 import numpy as np
 import pytest

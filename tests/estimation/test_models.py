@@ -1,4 +1,4 @@
-"""Motion and sensor models against central differences, samples and their limits."""
+"""Motion and sensor models against central differences, samples and limits."""
 
 import msgspec
 import numpy as np
@@ -27,7 +27,7 @@ ALPHAS = (0.001, 0.002, 0.003, 0.004, 0.0005, 0.0006)
 
 
 def driven(kind, distance, turn, final_turn, lateral):
-    """The end of the motion, by small straight steps for the arc: nothing of the model is used."""
+    """End of the motion by small straight steps, without the model."""
     if kind == "turn-then-drive":
         end = np.array([distance * np.cos(turn), distance * np.sin(turn), turn])
     else:

@@ -1,4 +1,4 @@
-"""Measurements with noises of their own, as range and bearing and as points."""
+"""Measurements with their own noises, as range and bearing and as points."""
 
 import numpy as np
 import pytest

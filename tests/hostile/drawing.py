@@ -1,8 +1,8 @@
-"""Hostile messages, and sessions of nodes that receive them.
+"""Hostile messages, and sessions of nodes that receive them, from a seeded generator.
 
-`Team` and `hostile_stream` draw sessions that are valid on the wire: singular covariances, clocks
-that leap, coordinates of 1e200 m. `extreme_samples` draws messages of every type with fields at the
-bounds of their types. `mutated` changes bytes. Everything is drawn from a seeded generator.
+`Team` and `hostile_stream` draw sessions that are valid on the wire: singular covariances, jumping
+clocks, coordinates of 1e200 m. `extreme_samples` draws messages of every type with fields at the
+bounds of their types. `mutated` changes bytes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +45,7 @@ CHANNELS = {
 
 
 def valid(message: m.Message) -> m.Message | None:
-    """The message as a receiver has it; None where its door refuses it."""
+    """The message as received; None if the door refuses it."""
     try:
         return decoded(encoded(message), type(message))
     except (WireError, OverflowError):
@@ -53,7 +53,7 @@ def valid(message: m.Message) -> m.Message | None:
 
 
 def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
-    """A covariance of one of the kinds that break solvers."""
+    """A covariance of a kind that breaks solvers."""
     mild = rng.random() < 0.5
     sigmas = (
         np.full(n, 0.1) if mild else rng.choice(SIGMAS, n if rng.random() < 0.3 else 1) * np.ones(n)
@@ -75,7 +75,7 @@ def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def numbers(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Coordinates: mostly sensible, some at one place, some far off."""
+    """Coordinates: mostly sensible, some equal, some far off."""
     if rng.random() < 0.6:
         return rng.uniform(-20.0, 20.0, n)
     if rng.random() < 0.3:
@@ -88,14 +88,13 @@ def packed(P: np.ndarray) -> bytes:
 
 
 def initial_pose(robot: str) -> m.InitialPose:
-    """An unknown initial pose."""
     return build.initial_pose(robot=robot)
 
 
 class Team:
-    """The robots of a hostile team: chains of submaps that continue, so that a set takes them.
+    """A hostile team: chains of submaps that continue, so that a set accepts them.
 
-    In every third team landmarks have no names, and an operator says which are one, or two.
+    In every third team landmarks lack identities, and an operator gives verdicts.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -154,7 +153,7 @@ class Team:
         )
 
     def grow(self) -> None:
-        """One more submap of one robot, with the sightings from its nodes."""
+        """Add one submap of one robot, with the sightings from its nodes."""
         rng = self._rng
         robot = str(rng.choice(ROBOTS))
         made = self.submap(robot)
@@ -169,7 +168,7 @@ class Team:
             self._add(self._verdict())
 
     def _verdict(self) -> m.Verdict:
-        """An operator's word on two landmarks, which need not be there."""
+        """A verdict on two landmarks, which may not exist."""
         rng = self._rng
         first, second = (
             m.LocalLandmark(
@@ -202,12 +201,10 @@ class Team:
         )
 
     def ends(self) -> list[m.Message]:
-        """The last words of the robots and of the world."""
         return last_words(self._next)
 
 
 def progress(robot: str, submaps: int) -> m.Progress:
-    """Progress of a robot that has published so many submaps of ten seconds."""
     return build.progress(
         stamp_ns=submaps * 10 * S, robot=robot, measurements=1000, submaps=submaps
     )
@@ -265,7 +262,7 @@ def _interval(
 
 
 def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m.Measurement:
-    """Landmarks with identities, as ranges or points, or without; with own covariances or not."""
+    """Landmarks with or without identities and own covariances, as ranges or points."""
     n = int(rng.choice([0, 1, 2, 3, 6, 300], p=[0.1, 0.2, 0.3, 0.2, 0.18, 0.02]))
     ids = from_ids(rng.integers(1, 8 if n < 300 else 5000, n))
     ranges, bearings = np.abs(numbers(rng, n)), rng.uniform(-np.pi, np.pi, n)
@@ -287,7 +284,7 @@ def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m
 
 
 def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator[m.Message]:
-    """The measurements of one robot, as a broken driver may send them, and what comes back."""
+    """Measurements of one robot from a broken driver, and the messages to it."""
     yield Team(rng).start(robot)
     now_ns = 0
     counter = 0
@@ -326,7 +323,6 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
 
 
 def prior(rng: np.random.Generator, robot: str) -> m.Prior:
-    """Draw a prior for a robot."""
     ids = np.unique(rng.integers(1, 8, int(rng.integers(0, 5)))).astype(np.uint32)
     n = 3 + 2 * len(ids)
     sequence = int(rng.integers(-1, 4))
@@ -363,7 +359,7 @@ def robot_session(
 
 
 def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
-    """Hostile sessions and extreme messages of every type, each on its channels, without end."""
+    """Hostile sessions and extreme messages of every type, each on its channels, endless."""
     while True:
         numbers = np.random.default_rng(rng.getrandbits(32))
         team = Team(numbers)
@@ -381,7 +377,7 @@ def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
 
 
 def mutated(rng: Random, payload: bytes) -> bytes:
-    """Bytes flipped, cut, doubled, or put in from elsewhere."""
+    """Flip, cut, double or insert bytes."""
     data = bytearray(payload)
     for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
         if not data:
@@ -417,7 +413,7 @@ FLAWS = ("robot", "incarnation", "number", "node", "name")
 
 
 def extreme(rng: np.random.Generator, message: m.Message) -> m.Message:
-    """The message with some of its fields at extremes, as far as its door lets them through."""
+    """Set some fields to extremes, as far as the door accepts them."""
     rate = rng.choice([0.1, 0.3, 0.9])
     for name in rng.permutation(list(message.__struct_fields__)).tolist():
         if rng.random() > rate or (name in FLAWS and rng.random() < 0.7):
@@ -485,7 +481,7 @@ def _row(rng: np.random.Generator, name: str, value: tuple[Any, ...]) -> tuple[A
 def extreme_samples(
     rng: np.random.Generator, kind: type[m.Message], count: int
 ) -> Iterator[tuple[ch.Channel, str, bytes]]:
-    """Channel, name and payload of so many extreme messages of a class, on each of its channels."""
+    """Channel, name and payload of `count` extreme messages of a class on each of its channels."""
     (example,) = (each for each in examples() if type(each) is kind)
     for _ in range(count):
         robot = str(rng.choice(ROBOTS))

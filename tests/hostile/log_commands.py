@@ -1,4 +1,4 @@
-"""Every command that opens a log, in one process, on hostile ones: how much memory it takes.
+"""Every command that opens a log, in one process, on hostile logs: its memory.
 
     python -m tests.hostile.log_commands FOLDER LOG …
 
@@ -35,12 +35,12 @@ COMMANDS = {
 
 
 def peak_mib() -> float:
-    """The most memory that this process ever had."""
+    """Peak memory [MiB] of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def main(folder: str, *logs: str) -> None:
-    """Warm up what every command imports on a log that is no log, then measure."""
+    """Warm up every command's imports on an invalid log, then measure."""
     import matplotlib.figure  # noqa: F401 - its memory is not the file's
     import pyarrow.parquet  # noqa: F401
 
@@ -59,7 +59,7 @@ def main(folder: str, *logs: str) -> None:
 
 
 def _run(command: list[str], log: str, folder: str) -> tuple[int, str]:
-    """The exit status and the last line; an error that `teamslam` turns into its text, as that."""
+    """Exit status and last line; a `teamslam` error as its text."""
     Path(folder).mkdir(exist_ok=True)
     given = [each.replace("LOG", log).replace("OUT", folder) for each in command]
     done = CliRunner().invoke(app, given)

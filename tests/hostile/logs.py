@@ -1,4 +1,4 @@
-"""Small files that are more than they seem: what an MCAP log can hide in 16 kB."""
+"""Small files with large contents: what an MCAP log can hide in 16 kB."""
 
 import struct
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ DIGEST = b"configur"
 
 
 def log_of(path: Path, *chunks: bytes) -> Path:
-    """A complete log of ours with chunks of these records."""
+    """A complete log with chunks of these records."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start()
@@ -83,13 +83,13 @@ def many_small(path: Path) -> Path:
 
 
 def few_large(path: Path) -> Path:
-    """Messages of as many zeros as a message may have."""
+    """Messages of the maximum number of zeros."""
     large = records_of([(ch.OWN_MAP, "alpha", bytes(58_000_000))])
     return log_of(path, large, large)
 
 
 def far_counters(path: Path) -> Path:
-    """Sound messages whose counters name 10¹⁸ measurements."""
+    """Valid messages whose counters name 10¹⁸ measurements."""
     far = 2**60
     joint = from_floats([0.0] * 5)
     submap = build.submap(

@@ -1,4 +1,4 @@
-"""A message whose handling raises is set aside and named; the team completes its map."""
+"""A message whose handling raises is set aside and reported; the team completes its map."""
 
 import re
 import threading
@@ -37,7 +37,7 @@ BROKEN_NS = 17_000_000_000
 
 @pytest.fixture
 def brittle(monkeypatch):
-    """An estimator that raises at one odometry, in the middle of what it changes."""
+    """An estimator that raises at one odometry, in the middle of its changes."""
     whole = HybridSlam.drive
 
     def drive(self, interval, **how):

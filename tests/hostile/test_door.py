@@ -1,4 +1,4 @@
-"""Every node refuses impossible messages, counts and names them, and changes nothing."""
+"""Every node refuses, counts and reports impossible messages, and changes nothing."""
 
 import msgspec
 import pytest
@@ -206,7 +206,7 @@ def test_what_a_team_can_say_is_refused_in_no_order(order):
 
 
 def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there():
-    """One far progress of a stranger made the centre refuse the end, and wait for ever."""
+    """A stranger's far progress must not make the centre refuse the end."""
     (*said, end) = run()
     done = [each for each in said if each[0] == ch.ROBOT_DONE]
     before = [each for each in said if each[0] != ch.ROBOT_DONE]
@@ -252,7 +252,7 @@ FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("what", FORGED)
 def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind):
-    """The end and the last words that confirm each other are believed, whatever else was said."""
+    """The end and the last messages that confirm each other are accepted, whatever else arrived."""
     (*said, end) = run()
     honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
     given(Boundary("central"), honest, *said, end)
@@ -265,7 +265,7 @@ def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, 
 
 
 def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out():
-    """Everything that the robot itself said was then years before its stream began."""
+    """Otherwise all of the robot's messages would precede its stream by years."""
     node = CentralNode(CentralConfig(), list(STREAMS))
     boundary = Boundary("central")
     given(boundary, node, (ch.START, "r1", FAR_START), *run())
@@ -274,7 +274,7 @@ def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source
 
 
 def test_a_world_goes_on_when_others_took_what_a_stranger_has_published():
-    """A robot, and the recorder, counted further than there is: their progress gave no credit."""
+    """Progress beyond the stream, of a robot or the recorder, must not end the credit."""
     streams = world_of(*STREAMS.values())
     announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")

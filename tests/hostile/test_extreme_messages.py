@@ -1,8 +1,8 @@
-"""Extreme messages of every type, on every channel, given to every node: nothing raises.
+"""Extreme messages of every type, on every channel, to every node: nothing raises.
 
-A message is decoded or refused by name; each node handles what its door lets in, within bounds of
-time and memory; what it answers is sound. TEAMSLAM_STORM=N draws N of each type for each channel;
-`make check-core CORE_TESTS=tests/hostile` runs it with the core's indices checked.
+A message is decoded or refused by name; each node handles the accepted ones within bounds of time
+and memory and answers with valid messages. TEAMSLAM_STORM=N draws N of each type for each channel;
+`make check-core CORE_TESTS=tests/hostile` checks the core's indices.
 """
 
 import os
@@ -69,7 +69,7 @@ def drawn(kind: type[m.Message], count: int) -> list[Sample]:
 
 
 def beginning() -> list[Sample]:
-    """A stream of each robot, so that extreme messages meet a window that is open."""
+    """A stream of each robot, so that extreme messages meet an open window."""
     out = []
     for robot in ROBOTS:
         start = build.initial_pose(robot=robot)
@@ -97,7 +97,7 @@ def test_every_type_on_a_channel_is_drawn_and_most_of_it_passes_the_door():
 @pytest.mark.parametrize("name", NODES)
 def test_no_extreme_message_raises_in_a_node(name, kind):
     def hand_over() -> tuple[float, float]:
-        """CPU time [s] and growth of the peak of memory [MiB]."""
+        """CPU time [s] and growth of the peak memory [MiB]."""
         node, boundary = NODES[name](), Boundary(name)
         answers = node.begin()
         before, began = peak_mib(), time.process_time()

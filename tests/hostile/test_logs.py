@@ -1,4 +1,4 @@
-"""A log that is not trusted: every command that opens one, its memory and its last word."""
+"""An untrusted log: every command that opens it, its memory and its last line."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""A robot continues on any stream of its sensors, and rejects measurements with a reason."""
+"""A robot continues on any stream, and rejects measurements with a reason."""
 
 import os
 from collections import Counter
@@ -52,7 +52,7 @@ def config(estimator: Estimator = "hybrid", fusion: FusionRule = "join", **field
 def drive(
     steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
 ) -> list[m.Message]:
-    """A circle at 1 m/s, three landmarks each second; `odd`: what comes in place of a second's."""
+    """A circle at 1 m/s, three landmarks each second; `odd`: in place of one second's messages."""
     out: list[m.Message] = [build.initial_pose(pose=from_floats([0.0, 0.0, 0.0]))]
     for k in range(1, steps + 1):
         own = build.odometry(stamp_ns=k * S, number=2 * k)

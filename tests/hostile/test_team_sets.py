@@ -1,6 +1,6 @@
-"""Every message that the door accepts is folded or refused with a reason, and the map comes.
+"""Every accepted message is folded or refused with a reason, and the map comes.
 
-With TEAMSLAM_STORM=N as many sessions are drawn as asked for.
+TEAMSLAM_STORM=N draws N sessions.
 """
 
 import os
@@ -79,7 +79,7 @@ def sighting(by, of, stamp_ns, spread):
 
 
 def concluded(messages, config=None):
-    """The final map of these, after everybody's last word."""
+    """The final map of these messages, after all last messages."""
     count = dict.fromkeys(ROBOTS, 0)
     for each in messages:
         if isinstance(each, m.Submap):
@@ -156,7 +156,7 @@ def test_what_is_refused_leaves_the_map_of_the_others_as_it_is():
 
 
 def test_a_standing_robot_that_is_seen_by_another_one_stays_apart_and_it_is_said_why():
-    """As on a real data set: a place, seen again and again, gives no heading."""
+    """Repeated sightings of a place give no heading."""
     messages = []
     for robot, other in (("r1", "r2"), ("r2", "r1")):
         messages.append(start(robot, None))

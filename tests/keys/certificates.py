@@ -1,4 +1,4 @@
-"""The certificates that tests use: of a team, and of a stranger who made some for himself."""
+"""Certificates of a team, and a stranger's."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""One set of certificates for all tests here: they are cheap, but not free."""
+"""One set of certificates for all tests here."""
 
 from datetime import UTC, datetime, timedelta
 

@@ -1,6 +1,7 @@
 """With keys a stranger or a captured robot publishes nothing in the names of others.
 
-Each attack is made twice: at a router with keys nothing arrives, at an open one it does.
+Each attack is made at a router with keys, where nothing arrives, and at an open one, where it
+does.
 """
 
 import threading
@@ -68,7 +69,7 @@ ATTACKS = {
 
 
 def on_every_row() -> Iterator[Outgoing]:
-    """A message on each row of the table, on a key of r1, or of a node that is no robot."""
+    """A message on each row of the table, on a key of r1 or of another node."""
     said = {type(each): each for each in examples()}
     names = {"robot": "r1", "node": "robot/r1"}
     for channel in ch.CHANNELS:
@@ -84,7 +85,7 @@ OWN = Outgoing(
 
 @contextmanager
 def door(keys: Folders | None) -> Iterator[Callable[[str], ZenohBus]]:
-    """A router, and a function that brings a node in."""
+    """A router, and a function that connects a node."""
     opened: list[ZenohBus] = []
     folder = None if keys is None else keys.own
     own = folder and (credentials_of(folder, "router"), load_roster(folder))
@@ -103,7 +104,7 @@ def door(keys: Folders | None) -> Iterator[Callable[[str], ZenohBus]]:
 
 
 def arriving(bus: ZenohBus, last: str) -> list[str]:
-    """The keys that arrive until this one does."""
+    """Keys that arrive until this one does."""
     found: list[str] = []
 
     def look() -> bool:
@@ -150,8 +151,7 @@ OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
 def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_elses(
     keys, *, locked
 ):
-    """The final map of a team with a centre is the centre's, whatever a robot publishes before
-    and after it, and garbage hides it from nobody."""
+    """The final map of a team with a centre is the centre's, whatever a robot or garbage adds."""
     true = msgspec.structs.replace(FINAL, dof=99)
     order = Outgoing(ch.ORDER, "r2", build.withdrawal(robot="r2", reason=""))
     with door(keys if locked else None) as enter:
@@ -270,7 +270,6 @@ def test_no_estimator_hears_the_truth(keys):
 
 
 def test_a_token_with_an_endless_name_is_nobodys(keys):
-    """Its own prefix lets a robot hold it; nobody takes it for a node's."""
     with door(keys) as enter:
         robot, centre = enter("robot-r2"), enter("central")
         centre.watch_alive()
@@ -352,7 +351,7 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(tmp_path, monkeyp
 
 
 def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(tmp_path, monkeypatch):
-    """Its link comes up again and delivers nothing; those of the others deliver."""
+    """Its link comes up again and delivers nothing; the other links deliver."""
     monkeypatch.setattr(session, "LINK_S", 0.3)
     home, carried = tmp_path / "home", tmp_path / "carried"
     make_keys(home, TEAM, nodes_of(["r1", "r2"]))

@@ -1,4 +1,4 @@
-"""The absence of an answer ends no process; evidence against a certificate does."""
+"""Missing answers end no process; evidence against a certificate does."""
 
 import logging
 import socket
@@ -23,9 +23,7 @@ from tests.support import Link, submap, wait_until
 def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
     keys, monkeypatch, caplog
 ):
-    """Its machine is busy, its lid is closed, the radio is bad: connections stay, or are made, and
-    nothing is answered.
-    """
+    """Its machine is busy or the radio is bad: connections stay or are made, without answers."""
     for name, value in {
         "FIRST_LOOK_S": 0.2, "LINK_S": 0.05, "ANSWER_S": 0.2, "_LEASE_MS": 1_000, "LONGEST_S": 0.3,
     }.items():  # fmt: skip
@@ -70,7 +68,7 @@ def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
 
 @contextmanager
 def answering(answer: bytes | None) -> Iterator[str]:
-    """A server that answers each connection with these bytes and closes it; None: with nothing."""
+    """A server that answers each connection with these bytes and closes it; None: no answer."""
     kept: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -120,7 +118,7 @@ def test_only_an_answer_about_certificates_refuses_a_link(keys, answer, waits_fo
 def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
     keys, with_keys, monkeypatch, caplog
 ):
-    """A process of the team is restarted while the router stands still for longer than patience."""
+    """The router stands still for longer than patience."""
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
     monkeypatch.setattr("teamslam.team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
     caplog.set_level(logging.WARNING, "teamslam")

@@ -59,7 +59,7 @@ with client(sys.argv[2], 60.0, own) as session:
 
 @contextmanager
 def running(program: str, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process of its own, and the first line that it writes."""
+    """A process of its own, and its first line of output."""
     with subprocess.Popen(
         [sys.executable, "-c", program, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as process:

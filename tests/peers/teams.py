@@ -1,4 +1,6 @@
-"""Sets of small members, and peers that talk in any order, with loss, duplicates and partitions."""
+"""Sets of small members, and peers that exchange in any order, with loss, duplicates and
+partitions.
+"""
 
 import random
 from collections.abc import Iterator, Sequence
@@ -31,7 +33,7 @@ def start(robot: str, incarnation: int = 1) -> Member:
 
 
 def parcel(robot: str, sequence: int, mates: Sequence[str] = ()) -> list[Member]:
-    """A submap behind the inter-robot measurements from it."""
+    """A submap after the inter-robot measurements from it."""
     own = msgspec.structs.replace(submap(sequence, robot, 1), incarnation=1, sightings=len(mates))
     factors = [
         build.sighting_factor(
@@ -59,13 +61,13 @@ def done(robot: str, submaps: int) -> Member:
 
 @cache
 def said(robot: str, submaps: int, mate: str) -> tuple[list[Member], ...]:
-    """The members of one robot's life, by occasion."""
+    """Members of one robot's life, by occasion."""
     parcels = [parcel(robot, k, [mate] if k % 3 == 1 else []) for k in range(submaps)]
     return ([start(robot)], *parcels, [done(robot, submaps)])
 
 
 class Storm:
-    """Peers between whom a seed decides what arrives, when, how often, and who reaches whom."""
+    """Peers with random order, delay, duplicates and reach of messages."""
 
     def __init__(self, seed: int, robots: int = 3, submaps: int = 4) -> None:
         self.rng = random.Random(seed)
@@ -82,7 +84,7 @@ class Storm:
         return PeerNode(ch.robot_node(name), self.names)
 
     def run(self, turns: int = 10) -> None:
-        """Turns of chance; then everyone reaches everyone along a chain until nothing is said."""
+        """Take random turns; then connect all in a chain until no message is left."""
         for _ in range(turns):
             self.turn()
         self.cut = {
@@ -128,7 +130,7 @@ class Storm:
             self.disk[name].append(each)
 
     def kill(self, name: str) -> None:
-        """It comes back with what it had on disk, the end of which may be torn."""
+        """Restart it from its disk, the end of which may be torn."""
         kept = self.disk[name]
         own = [each for each in kept if about(each.message) == name]
         rest = [each for each in kept if about(each.message) != name]
@@ -182,6 +184,6 @@ class Storm:
                 self.send(name, other, each.message)
 
     def fed(self, name: str) -> Iterator[m.Message]:
-        """The messages that a fresh fold receives."""
+        """Messages that a fresh fold receives."""
         self.nodes[name].restart_fold()
         return self.nodes[name].new_messages()

@@ -1,4 +1,4 @@
-"""A peer's final map is a function of its set, whatever came first and together with what."""
+"""A peer's final map is a function of its set, in any order and portions."""
 
 import random
 
@@ -41,9 +41,7 @@ def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
     ids=["withdrawn", "given up and back", "both"],
 )
 def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(extra, withdrawn):
-    """The robot is the last by name: its `Done` stood before the order, and behind that it was
-    given up.
-    """
+    """The robot is the last by name: its `Done` precedes the order."""
     members = [
         each
         for robot in ROBOTS
@@ -63,7 +61,7 @@ def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(ext
 
 
 def test_a_fold_is_given_submaps_in_the_order_of_time():
-    """By robots, one after the other, it took back what it had and cost three times as much."""
+    """Order by robots would restart the fold and cost three times as much."""
     node = PeerNode("robot/r1", ROBOTS)
     for robot in reversed(ROBOTS):
         for each in (done(robot, 3), *parcel(robot, 2), *parcel(robot, 1), *parcel(robot, 0)):

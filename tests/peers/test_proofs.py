@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def nodes(folder):
-    """Peers with keys; r2 has received members of r1."""
+    """Peers with keys; r2 has members of r1."""
     found = {}
     for robot in ROBOTS:
         signer = Signer(credentials_of(folder, f"robot-{robot}", "t"))
@@ -144,7 +144,7 @@ class Renewed:
             proofs_of(self.r2).take_signature(proofs.sign(each), "r1")
 
     def submaps_of_r3(self) -> int:
-        """The submaps of r1 at r3 after some exchanges with r2 alone."""
+        """Submaps of r1 at r3 after some exchanges with r2 alone."""
         for _ in range(3):
             self.now_s += 10.0
             self.r2.tick(self.now_s)
@@ -169,7 +169,7 @@ def test_a_certificate_that_is_renewed_while_the_team_runs_splits_nothing(tmp_pa
 
 
 def test_what_a_revoked_key_has_signed_is_refused_until_its_author_signs_it_anew(tmp_path):
-    """The next generation's certificate is the proof of the revocation: no roster is needed."""
+    """The next generation's certificate proves the revocation, without a roster."""
     team = Renewed(tmp_path)
     stolen = team.own()
     make_keys(tmp_path, "t", [], revoke=["robot-r1"])

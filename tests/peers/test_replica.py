@@ -35,7 +35,7 @@ def digest_of(replica: Replica) -> bytes:
 
 
 def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
-    """A liar claims every submap of everyone and gives nothing; r2 has four submaps."""
+    """A liar claims every submap and gives nothing; r2 has four submaps."""
     node, honest = (
         PeerNode("robot/r1", ("r1", "r2", "r3")),
         PeerNode("robot/r2", ("r1", "r2", "r3")),
@@ -77,7 +77,7 @@ def test_questions_without_end_are_given_so_many_bytes_a_second():
 
 
 def test_questions_in_another_nodes_name_take_nothing_from_that_node():
-    """Nothing proves the name in a request: what r3 asks for as r2 is not counted against r2."""
+    """Names in requests are not proven: r3's requests as r2 do not count against r2."""
     node = PeerNode("robot/r1", ("r1", "r2", "r3"))
     for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
         node.take(each, "robot/r2")
@@ -241,7 +241,7 @@ def test_after_any_schedule_all_peers_have_the_whole_set(part):
 
 
 def test_without_questions_a_schedule_ends_with_different_sets():
-    """The mutant: what is lost stays lost where nobody asks."""
+    """Mutant: without questions lost members stay lost."""
     storm = Storm(7)
     storm.spread = lambda name, out: None
     storm.run()

@@ -1,4 +1,4 @@
-"""A set on disk: what a robot that was started again finds there, however its file was torn."""
+"""A set on disk: what a restarted robot finds, however its file was torn."""
 
 import errno
 import os
@@ -53,12 +53,12 @@ ENDS = [len(MAGIC), *(len(MAGIC) + n for n in accumulate(map(len, RECORDS)))]
 
 
 def touched(first: int, last: int) -> set[int]:
-    """The records that have a byte in this interval, both ends included."""
+    """Records that have a byte in this closed interval."""
     return {k for k in range(len(RECORDS)) if ENDS[k] <= last and first < ENDS[k + 1]}
 
 
 def check_recovered(path: Path, content: bytes, lost: set[int]) -> SetFile:
-    """Every intact record is found, the loss is named once, and the file goes on."""
+    """Check that all intact records are found, with one report, and the file continues."""
     path.write_bytes(content)
     store = SetFile(path)
     assert store.members == [each for k, each in enumerate(MEMBERS) if k not in lost]
@@ -117,7 +117,7 @@ def test_what_is_known_to_be_lost_is_named_by_its_number(tmp_path, caplog):
 
 
 def test_a_record_within_a_damaged_one_is_not_taken(tmp_path):
-    """Its author has put it there: only what the process itself has written counts."""
+    """Its author put it there; only records written by the process count."""
     order = build.given_up(node="robot/r2", by="nobody", reason="")
     forged = member_of(ch.GIVEN_UP.key("robot/r2"), encoded(order))
     body = msgpack.packb(["robot/r1/submap", record_of(forged) * 3, b""])

@@ -1,4 +1,4 @@
-"""A fusion rule as docs/architecture.md says how to add one: one node in one file."""
+"""A fusion rule by the recipe of docs/architecture.md: one node in one file."""
 
 import math
 
@@ -18,10 +18,10 @@ from teamslam.team.wire.digest import digest_of
 
 
 class FirstSubmaps(SubmapFold):
-    """The landmarks of each robot's first submap at its initial pose; of two, the first robot's."""
+    """Landmarks of each robot's first submap at its initial pose; of two, the first robot's."""
 
     def fold_until(self, closed_ns: float) -> None:
-        """Nothing is folded before a map is made."""
+        """Do nothing before a map is made."""
 
     def make_map(
         self,
@@ -57,6 +57,6 @@ class FirstSubmaps(SubmapFold):
 
 
 class FirstSubmapsCentre(CentralNode):
-    """The centre that makes its maps so."""
+    """The centre of `FirstSubmaps`."""
 
     fold_class = FirstSubmaps

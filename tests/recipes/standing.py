@@ -1,4 +1,4 @@
-"""An estimator as docs/architecture.md says how to add one: one class in one file."""
+"""An estimator by the recipe of docs/architecture.md: one class in one file."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from teamslam.team.robot.maps import InitialPose
 
 
 class Standing:
-    """A robot that believes that it stands still, and sees nothing."""
+    """A robot that assumes that it stands still, and sees nothing."""
 
     sequence = 0
     used = "in no map"
@@ -26,19 +26,19 @@ class Standing:
         self._pose = np.zeros(3) if initial.pose is None else initial.pose
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """It has no use for landmarks."""
+        """Ignore landmarks."""
         return Rejection.NO_LANDMARKS
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
-        """Each interval ends with a pose."""
+        """End each interval with a pose."""
         return Estimates(pose_ns=interval.end_ns)
 
     def finish(self) -> tuple[Estimates, int]:
-        """Nothing was waited for."""
+        """Nothing is pending."""
         return NOTHING_NEW, 0
 
     def own_pose(self) -> PoseGaussian:
-        """Where it began."""
+        """The initial pose."""
         return PoseGaussian(self._pose, np.eye(3))
 
     def own_map(self) -> LandmarkGaussian:

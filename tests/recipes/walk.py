@@ -1,4 +1,4 @@
-"""Adds a fusion rule and an estimator by their rows alone, runs teams with them, and verifies.
+"""Add a fusion rule and an estimator by their rows alone, run teams with them, and verify.
 
 python -m tests.recipes.walk FOLDER
 """
@@ -21,7 +21,7 @@ ROWS = {
 
 
 def add_rows() -> None:
-    """`teamslam.team.pairs` as it is with the rows in it, before anything imports it."""
+    """Add the rows to `teamslam.team.pairs` before anything imports it."""
     path = Path(teamslam.team.__file__).parent / "pairs.py"
     source = path.read_text()
     for before, row in ROWS.items():
@@ -34,7 +34,7 @@ def add_rows() -> None:
 
 
 def main(folder: Path) -> None:
-    """Says of each run what its final map has and what the verification finds."""
+    """Print each run's final map and verification."""
     add_rows()
     from teamslam.central.desk.verification.verification import verify
     from teamslam.sim.in_memory.team import final_map

@@ -24,7 +24,7 @@ def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
 
 
 def recorded_examples() -> list[tuple[c.Channel, m.Message, Sample]]:
-    """An example of every message that a log holds, with its channel and its sample."""
+    """An example of every recorded message, with its channel and sample."""
     of = {kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds}
     kept = [(of[type(x)], on_its_key(of[type(x)], "alpha", x)) for x in examples() if type(x) in of]
     return [(channel, x, sampled(channel, "alpha", x, i)) for i, (channel, x) in enumerate(kept)]

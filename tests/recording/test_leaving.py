@@ -1,4 +1,4 @@
-"""A process that has ended stays until the recorder has what only it can repeat."""
+"""An ended process stays until the recorder has what only it can repeat."""
 
 import logging
 import threading
@@ -32,7 +32,7 @@ def trajectory(robot: str) -> m.Trajectory:
 
 @contextmanager
 def leaving(bus: ZenohBus) -> Iterator[threading.Thread]:
-    """A centre that has published its final map and trajectories, and waits for the recorder."""
+    """A centre that has published its last messages and waits for the recorder."""
     bus.watch_alive("recorder")
     node = Shell(bus, Waiting(), "central", threading.Event())
     bus.declare_alive("central")

@@ -1,4 +1,4 @@
-"""Recorder, reader and repair: what goes in comes out, and what is broken is named."""
+"""Recorder, reader and repair: logs read back equal, and damage is named."""
 
 import hashlib
 import struct
@@ -129,7 +129,7 @@ def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path):
 
 
 def killed(path: Path, count: int) -> Log:
-    """The log of a recorder that was killed some time after it had written `count` samples."""
+    """The log of a recorder killed after `count` samples."""
     program = (
         "import sys, threading; from pathlib import Path\n"
         "from teamslam.team.recording.recorder import Recorder\n"
@@ -173,7 +173,7 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
 
 @pytest.fixture(scope="module")
 def noise():
-    """Samples that do not compress, so that they fill several chunks of a megabyte."""
+    """Incompressible samples, which fill several chunks of a megabyte."""
     return [
         Sample("view/noise", hashlib.shake_128(b"%d" % i).digest(40_000), i + 1, 0, i)
         for i in range(100)
@@ -230,7 +230,7 @@ def foreign(path: Path) -> None:
 
 
 def bomb(path: Path, size: int, claimed: int) -> None:
-    """A log of ours with one chunk that expands to `size` bytes and claims `claimed`."""
+    """A log with one chunk that expands to `size` bytes and claims `claimed`."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start()

@@ -236,7 +236,7 @@ def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(pa
 
 @pytest.fixture
 def limit():
-    """Sets the largest size of a file that this process may write: a full disk without a disk."""
+    """Limit the size of files that this process writes, as a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size < 0 else size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -331,7 +331,7 @@ def test_what_a_bus_sends_and_receives_is_in_its_own_log_and_merged_there_once(t
 
 
 def test_what_a_robot_has_asked_for_is_in_its_own_log_and_what_a_death_cost_it_is_known(tmp_path):
-    """Killed and started again, a robot had the measurements of its source, and its log had not."""
+    """A restarted robot fetches measurements from its source, which its log must contain."""
     path = tmp_path / "a.mcap"
     with router() as at, own_log(path, "t") as log, ZenohBus("t", at) as source:
         source.answer(c.MEASUREMENTS, "alpha", lambda _: [encoded(odometry(i)) for i in (1, 2, 5)])
@@ -351,7 +351,6 @@ def test_what_a_robot_has_asked_for_is_in_its_own_log_and_what_a_death_cost_it_i
 
 
 def answers(bus: ZenohBus, until: threading.Event) -> None:
-    """A node that does nothing but answer."""
     while not until.is_set():
         bus.receive(0.05)
 
@@ -382,7 +381,7 @@ def saved(path: Path) -> list[Sample]:
 
 
 def heads(path: Path) -> list[int]:
-    """Where the opcodes and the lengths of chunks and of their indices are."""
+    """Positions of the opcodes and lengths of chunks and of their indices."""
     with path.open("rb") as file:
         kinds = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
         offsets = [frame.offset for frame in read_frames(file, path) if frame.opcode in kinds]

@@ -51,7 +51,7 @@ GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 @pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
 def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(path, peers):
-    """Without a centre all peers' conclusions do, but for who is given up; with one its map."""
+    """Without a centre the conclusions of all peers but those given up do; with one, its map."""
     network = MemoryNetwork()
     team, bus = MemoryBus(network), MemoryBus(network)
     with Recorder(path, "t", {}) as recorder:
@@ -70,7 +70,7 @@ def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(path, peers):
 
 
 def test_a_flood_of_keys_and_of_tags_leaves_a_whole_log(path, monkeypatch):
-    """MCAP numbers a log's keys by 16 bits: more of them ended the recorder."""
+    """MCAP numbers a log's keys by 16 bits."""
     monkeypatch.setattr(recorder_module, "MOST_CHANNELS", 10)
     network = MemoryNetwork()
     robot, bus = MemoryBus(network), MemoryBus(network)
@@ -175,7 +175,7 @@ class Team:
         return [encoded(each) for each in self.published[wanted.first : wanted.last + 1]]
 
     def says(self, count: int) -> None:
-        """So many measurements, a submap and a pose for ten of them."""
+        """Publish so many measurements, with a submap and a pose for ten of them."""
         for _ in range(count):
             i = len(self.published)
             self.published.append(odometry(i))
@@ -186,7 +186,7 @@ class Team:
                 self.bus.publish(Outgoing(c.OWN_POSE, "alpha", POSE))
 
     def ends(self, until: Callable[[], bool]) -> None:
-        """The end of a run: what is left is asked for while the source is there."""
+        """End a run; the rest is requested while the source is there."""
         end = build.end(incarnation=0, alpha=len(self.published))
         self.bus.publish(Outgoing(c.END, "", end))
         self.bus.publish(Outgoing(c.FINAL_MAP, "", FINAL))
@@ -233,7 +233,7 @@ def test_the_recorder_names_the_run_by_its_log_also_after_a_restart(tmp_path):
 
 
 def flows(source: ZenohBus, path: Path) -> None:
-    """Return when what `source` publishes is in the log at `path`."""
+    """Return when publications of `source` reach the log at `path`."""
 
     def heard() -> bool:
         source.publish(Outgoing(c.SIGHTINGS, "probe", PROBE))

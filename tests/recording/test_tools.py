@@ -1,4 +1,4 @@
-"""Check, cut, merge and CSV: what is wrong is named, and parts put together are the whole."""
+"""Check, cut, merge and CSV: errors are named, and merged parts are the whole."""
 
 import contextlib
 import csv
@@ -75,7 +75,7 @@ def status(counter: int, wall_s: int = 0, node: str = "central", **fields: objec
 
 
 def later(samples: list[Sample], **fields: object) -> list[Sample]:
-    """The samples of a second life of their publisher."""
+    """Samples of their publisher's second life."""
     return [msgspec.structs.replace(s, wall_ns=s.wall_ns + SECOND, **fields) for s in samples]
 
 
@@ -208,7 +208,7 @@ def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(lives, rng):
 
 
 def set_back(samples: list[Sample], after: int, seconds: int) -> list[Sample]:
-    """The samples as of a machine whose clock is set back once, behind so many samples."""
+    """The samples of a machine whose clock is set back once, after so many samples."""
     return [
         msgspec.structs.replace(s, wall_ns=s.wall_ns - (k >= after) * seconds * 10**9)
         for k, s in enumerate(samples)
@@ -222,7 +222,7 @@ def set_back(samples: list[Sample], after: int, seconds: int) -> list[Sample]:
     st.integers(-100, 100),
 )
 def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(lives, after, seconds):
-    """A message a second, in the order of arrival; each life is known by its message 0."""
+    """A message a second, in the order of arrival; each life is identified by its message 0."""
     samples = [
         Sample("robot/alpha/status", b"", 0, (40 * life + counter) * 10**9, counter)
         for life, kept in enumerate(lives)
@@ -237,7 +237,7 @@ def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(lives, after, 
 
 
 def test_a_publication_that_came_as_a_reply_is_not_missing():
-    """Without its counter it is one of those published; which one does not matter."""
+    """Without its counter it is one of those published, no matter which."""
     counters = Counters()
     counters.take(Sample("central/final", b"", 0, 5, NO_COUNTER))
     assert counters.findings(part=False, totals=(1,)) == []
@@ -263,7 +263,7 @@ def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole):
 
 @pytest.fixture(scope="module")
 def once_recorded(tmp_path_factory):
-    """The bytes of one log: of another its recorder may end a chunk elsewhere, by the clock."""
+    """The bytes of one log, since another recorder may end chunks elsewhere, by the clock."""
     path = tmp_path_factory.mktemp("once") / "log.mcap"
     return recorded(path, drive("alpha", 2)).path.read_bytes()
 

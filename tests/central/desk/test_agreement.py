@@ -1,5 +1,3 @@
-"""The final map of a team without a centre is the one on which all its peers agree."""
-
 import hashlib
 import json
 

@@ -1,4 +1,4 @@
-"""Scores of the data association, and of a map as a set of points."""
+"""Scores of the data association, and of a map as a point set."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
 
 
 def truth(robot: str, labels: list[int]) -> Sample:
-    """One scan of each second; its only detection has this label."""
+    """One scan a second, with one detection of this label."""
     n = len(labels)
     stamps = from_stamps(np.arange(n) * TEN)
     message = m.TruthLabels(
@@ -54,7 +54,7 @@ def window(robot: str, sequence: int, first: int, landmarks: list[int]) -> Sampl
 
 
 def final(table: dict[str, list[tuple[int, int, int]]]) -> Sample:
-    """By robot: (sequence, local, identity less 2³¹)."""
+    """By robot: (sequence, local, identity − 2³¹)."""
     memberships = tuple(
         m.Membership(
             robot=robot,

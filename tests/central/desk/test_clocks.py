@@ -1,4 +1,4 @@
-"""Robots' clocks in results and while a team runs."""
+"""Robots' clocks in results and in a running team."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ LATE_S = 0.1
 
 
 def published(world: StressWorld, place: Path) -> list[Sample]:
-    """The log of a data set's measurements, without the data set's truth, and a final map."""
+    """Log of a data set's measurements without truth, with a final map."""
     of = scenario_in(write(world, place))
     node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
@@ -139,7 +139,7 @@ NOW_S = 1_763_800_000
 
 
 def presence(*behind: tuple[float, float]) -> Presence:
-    """A team's drivers, so many seconds behind the wall clock at two moments that are 2 s apart."""
+    """A team's drivers, so many seconds behind the wall clock at two moments 2 s apart."""
     found = Presence()
     for node in ("central", "robot/r1", "robot/r2", "robot/r3"):
         found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)

@@ -1,4 +1,4 @@
-"""The figures of a run equal their definitions."""
+"""Figures of a run equal their definitions."""
 
 import json
 
@@ -243,7 +243,7 @@ def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds():
 
 
 def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone():
-    """A pose 100 m away errs by 5 m along the circle and by 0.13 m across it; sigma there: 1 mm."""
+    """A pose 100 m away errs by 5 m along the circle and 0.13 m across it; sigma there: 1 mm."""
     turn, sigma = 0.05, 0.05
     truth = np.array([[100.0, 0.0, 0.3]])
     pose = np.array([[100.0 * np.cos(turn), 100.0 * np.sin(turn), 0.3 + turn]])

@@ -1,5 +1,3 @@
-"""The events of a run: each is reported once, when it happens."""
-
 from teamslam.central.desk.evaluation.events import EventDetector, without_decimals
 from teamslam.team.wire import messages as m
 from tests import build

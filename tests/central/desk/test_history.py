@@ -1,5 +1,3 @@
-"""The history of a run: its figures equal those computed from the log."""
-
 import numpy as np
 import pytest
 

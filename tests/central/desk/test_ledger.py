@@ -1,5 +1,3 @@
-"""Each measurement of a log has exactly one disposition, or the offender is named."""
-
 from pathlib import Path
 
 import msgspec

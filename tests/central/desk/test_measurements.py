@@ -1,4 +1,4 @@
-"""The measurements of a log are the first message of each number."""
+"""The first message of each number counts."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""Bearings of the wrong sign are found by the odometry alone, and explain the robot's misfit."""
+"""Bearings of the wrong sign are detected from the odometry alone."""
 
 from array import array
 from dataclasses import replace

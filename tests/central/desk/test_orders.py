@@ -1,5 +1,3 @@
-"""`teamslam withdraw` and `end`: an operator's order reaches the centre, and what comes of it."""
-
 import threading
 from contextlib import nullcontext
 
@@ -49,7 +47,6 @@ class Centre(threading.Thread):
 
 
 def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object) -> Centre:
-    """An order that is given; one that is answered may take its time, the others are given up."""
     monkeypatch.setattr(orders, "CENTRE_S", 30.0 if robot == "r3" else 2.0)
     network = MemoryNetwork()
     reply = msgspec.structs.replace(FUSED, **answer) if answer else None
@@ -138,7 +135,7 @@ def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkey
 
 
 def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgement, ...]) -> Result:
-    """`teamslam verdict` to a team of r3 whose map rests on these verdicts."""
+    """Run `teamslam verdict` in a team of r3 whose map rests on these verdicts."""
     monkeypatch.setattr(orders, "CENTRE_S", 2.0)
     network = MemoryNetwork()
     bus, over = MemoryBus(network), threading.Event()

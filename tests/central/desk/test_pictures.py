@@ -1,5 +1,3 @@
-"""Pictures of a run, on the page and for a paper."""
-
 from dataclasses import replace
 
 import msgspec
@@ -90,7 +88,7 @@ def test_the_same_run_draws_the_same_bytes(run, tmp_path):
 
 
 def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_path, monkeypatch):
-    """The path of a robot that had never joined began at the origin of the others' map."""
+    """Such a path would begin at the origin of the team's map."""
     drawn: list[Figure] = []
     monkeypatch.setattr(
         "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)

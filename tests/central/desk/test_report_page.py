@@ -1,5 +1,3 @@
-"""The report: one self-contained page for any log, incomplete or hostile."""
-
 import json
 import re
 from dataclasses import replace
@@ -36,7 +34,7 @@ def page_of(run: Run, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def log():
-    """A run in memory, which has no wall clock: each message a millisecond after the one before."""
+    """A run in memory: each message a millisecond after the one before."""
     of = scenario(robots=2)
     return [
         msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000)
@@ -46,7 +44,7 @@ def log():
 
 @pytest.fixture
 def _without_pictures(monkeypatch):
-    """To draw them takes longer than all else, and the test is about the page's words."""
+    """Skip drawing, which takes most of the time."""
     monkeypatch.setattr(report_page, "write_pictures", lambda *_: {})
 
 

@@ -1,5 +1,3 @@
-"""Robots that are withdrawn, not joined or lost, in results and reruns."""
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -26,7 +24,7 @@ from tests.central.test_withdrawal import run, scenario
 
 @pytest.fixture(scope="module")
 def samples():
-    """A run in memory of which the centre withdraws r3."""
+    """A run in which the centre withdraws r3."""
     return run(scenario(), "odometry")
 
 
@@ -73,7 +71,6 @@ def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothi
 
 
 def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]) -> list[Sample]:
-    """The samples with another final map."""
     return [
         msgspec.structs.replace(s, payload=encoded(change(decoded(s.payload, m.FusedMap))))
         if s.key == ch.FINAL_MAP.key()
@@ -83,7 +80,7 @@ def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]
 
 
 def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
-    """r1 alone has a known start; it is withdrawn, and the map is in the frame of r2."""
+    """r1 alone has a known start; after its withdrawal the map is in the frame of r2."""
     of = scenario()
     streams = simulate(of.world, of.robots, of.seed)
     streams = without_starts(streams, "r2", "r3")
@@ -109,7 +106,6 @@ def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_prin
 
 
 def without_starts(streams: WorldStreams, *robots: str) -> WorldStreams:
-    """The streams, with the initial poses of these robots unknown."""
     return replace(
         streams,
         streams=tuple(replace(s, start=None) if s.robot in robots else s for s in streams.streams),

@@ -1,4 +1,4 @@
-"""Exported results: paths at keyframe rate with their covariances, the map as tables."""
+"""Exported results: paths at keyframe rate with covariances, the map as tables."""
 
 import csv
 import json

@@ -1,7 +1,7 @@
-"""Errors of paths with the field's definitions, and the files that other tools read.
+"""Errors of paths by the field's definitions, and the files for other tools.
 
-tests/golden/evo.json holds what evo 1.38.1 says of the paths made here; where evo is on the path it
-is asked again. It is GPL-3.0: run as the program that it is, and no part of ours.
+tests/golden/evo.json holds the results of evo 1.38.1; where evo is installed it runs again, as a
+separate program (GPL-3.0).
 """
 
 import json
@@ -34,7 +34,7 @@ FIGURES = {
 
 
 def paths() -> tuple[Path, Path]:
-    """A loop with turns through the cut of the circle, and a noisy, shifted estimate of it."""
+    """A loop with headings across ±π, and a noisy, shifted estimate of it."""
     rng = np.random.default_rng(7)
     stamps = START_NS + np.arange(60) * 500_000_000
     angle = np.linspace(0.0, 9.0, 60)
@@ -46,7 +46,7 @@ def paths() -> tuple[Path, Path]:
 
 
 def asked(program: str, relation: str, options: tuple[str, ...], folder: FilePath) -> float:
-    """The RMSE that evo gives; the files are those that the report writes."""
+    """RMSE by evo on the files that the report writes."""
     estimate, true = paths()
     write_tum(estimate, folder / "estimate.tum")
     write_tum(true, folder / "true.tum")

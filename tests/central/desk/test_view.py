@@ -1,4 +1,4 @@
-"""Views: what a viewer node makes of a team's messages, read back by a reader that is not ours."""
+"""Views of a team's messages, read back by an independent reader."""
 
 import json
 from collections import defaultdict
@@ -39,7 +39,6 @@ S = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def samples():
-    """Run two robots for 40 steps of the thesis' world."""
     scenario = with_options(load("thesis"), seed=1)
     scenario = msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, steps=40)
@@ -58,7 +57,7 @@ def exported(samples, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def read(exported):
-    """(log time, message) by topic, decoded by the schemas in the file alone."""
+    """(log time, message) by topic, decoded by the file's own schemas."""
     found = defaultdict(list)
     with exported.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])

@@ -1,4 +1,4 @@
-"""The live page: its frames, its server's access rules, the channels for Foxglove."""
+"""The live page: frames, access rules, channels for Foxglove."""
 
 import base64
 import json
@@ -66,7 +66,6 @@ def told(path: Path) -> list[dict[str, object]]:
 
 @pytest.fixture(scope="module")
 def frames(log):
-    """Return the page's frames of the log by kind."""
     found = defaultdict(list)
     for frame in told(log):
         found[frame["k"]].append(frame)
@@ -98,7 +97,7 @@ def test_the_page_gets_every_pose_and_its_error(frames):
 
 
 def test_the_page_is_told_when_a_robots_poses_are_in_another_frame():
-    """Its earlier path is in its own frame, which is no place in the team's map."""
+    """Its earlier path is in its own frame."""
     page = PageFrames()
 
     def take(channel: ch.Channel, robot: str, message: m.Message) -> None:
@@ -133,7 +132,7 @@ def told_of(*messages: tuple[ch.Channel, m.Message]) -> list[dict[str, object]]:
 
 
 def test_the_page_gets_measurements_in_the_robots_frame():
-    """A sensor that looks to the left, half a metre ahead; a landmark at most twice a second."""
+    """A sensor half a metre ahead, turned to the left; a landmark at most twice a second."""
     sensor = {"mount": [0.5, 0.0, np.pi / 2], "max_range": 30.0, "field_of_view": 2.0}
     config = build.configuration(configuration=json.dumps({"sensor": sensor}))
 
@@ -167,7 +166,7 @@ def test_the_page_is_told_what_a_node_waits_for_and_when_no_more():
 
 
 def test_a_running_map_without_cross_covariances_has_no_nees(frames):
-    """The report's NEES is that of the final map: one name has one definition."""
+    """NEES is defined on the final map's joint covariance alone."""
     *running, final = frames["map"]
     assert {each["nees"] for each in running} == {None}
     assert {each["rmse"] is None for each in running} == {False}
@@ -238,7 +237,7 @@ TRUE = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 5.0]])
 
 
 def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Channel, m.Message]]:
-    """A map in the frame of a robot, whose start may be known; truth of it and of its landmarks."""
+    """A map in the frame of a robot whose start may be known, and the truth."""
     heading = np.zeros((3, 1))
     true_path = np.hstack((TRUE + 1.0, heading))
     path = np.hstack((transform_points(MAP_FROM_TRUTH, TRUE + 1.0), heading + MAP_FROM_TRUTH[2]))

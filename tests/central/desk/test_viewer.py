@@ -1,5 +1,3 @@
-"""The viewer's process: it leaves at the end, whenever it comes."""
-
 import threading
 
 import msgspec

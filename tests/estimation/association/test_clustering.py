@@ -22,7 +22,6 @@ RANGE_M, VIEW_M = 0.05, 6.0
 
 
 def path_of(motions: np.ndarray) -> np.ndarray:
-    """Chain the motions to poses, from the zero pose."""
     headings = np.cumsum(motions[:, 2])
     before = np.concatenate(([0.0], headings[:-1]))
     steps = np.einsum("kij,kj->ki", rotations(before), motions[:, :2])
@@ -30,7 +29,7 @@ def path_of(motions: np.ndarray) -> np.ndarray:
 
 
 def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
-    """(scans, the landmark of each detection): a drive through a grid of landmarks."""
+    """(scans, landmark of each detection) of a drive through a grid of landmarks."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(np.arange(-4, 12), np.arange(-4, 5)), -1).reshape(-1, 2) * spacing
     landmarks = grid[rng.random(len(grid)) < 0.5] + 0.1 * rng.normal(size=(1, 2))
@@ -64,7 +63,7 @@ def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
 
 
 def pairs(found: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
-    """Pairwise (precision, recall) of the detections that are of a landmark."""
+    """Pairwise (precision, recall) of the detections of landmarks."""
     real = labels != UNASSIGNED
     found, labels = found[real], labels[real]
     same = labels[:, None] == labels[None]

@@ -1,4 +1,4 @@
-"""The fold of submaps whose landmarks have no names."""
+"""The fold of submaps without landmark identities."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ LOOP = circle((0.0, 0.0), 20.0, 24, 1.25)
 
 
 def _world(seed: int) -> np.ndarray:
-    """Landmarks along a ring, none nearer to another than a metre."""
+    """Landmarks along a ring, at least a metre apart."""
     rng, kept = np.random.default_rng(seed), []
     while len(kept) < 90:
         angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(16.0, 24.0)
@@ -53,7 +53,6 @@ def _folded(
 
 
 def _not_joined(fold: Fold) -> list[str]:
-    """What a map says of the robots that are not in it."""
     return [text for text in reasons(fold, Shown(), (), 1) if "not joined" in text]
 
 

@@ -1,4 +1,4 @@
-"""Views of islands, their votes for a relative motion, and the numbers of their landmarks."""
+"""Views of islands, their votes for a relative motion, their landmark numbers."""
 
 from itertools import permutations
 
@@ -42,8 +42,9 @@ TWINS = np.array([(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)])
 
 
 def _seen(submaps: list[list[int]], common: float) -> tuple[Joint, list[np.ndarray]]:
-    """The same twins as several submaps saw them, each with an error that its landmarks share and
-    each landmark with one of its own, of these standard deviations.
+    """Twins as several submaps saw them; standard deviations of each submap's common error and of
+    each
+    landmark's own.
     """
     rng = np.random.default_rng(1)
     owner = np.repeat(np.arange(len(submaps)), [len(each) for each in submaps])

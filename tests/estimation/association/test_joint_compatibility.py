@@ -1,4 +1,4 @@
-"""Pairs of landmarks: gates, likelihoods, classes, densities, and compatibility of them all."""
+"""Pairs of landmarks: gates, likelihoods, classes, densities, joint compatibility."""
 
 from dataclasses import replace
 from itertools import product
@@ -92,7 +92,7 @@ def test_of_two_places_of_equal_shape_the_one_of_equal_classes_gets_the_votes():
 
 
 def exact(weights: np.ndarray) -> np.ndarray:
-    """The marginals over every joint association, each with the product of its odds."""
+    """Marginals over all joint associations, each weighted by the product of its odds."""
     n, count = weights.shape
     found, total = np.zeros_like(weights), 0.0
     for joint in product(range(-1, count), repeat=n):
@@ -134,7 +134,7 @@ PROFILE_JOINT_COMPATIBILITY = AssociationProfile(slack=0.0)
 
 
 def _joint(points: list[tuple[float, float]], sd: float, common: float = 0.0) -> Joint:
-    """Independent errors; the second half of the points has one error in common besides."""
+    """Independent errors; the second half of the points has a common error besides."""
     n = len(points)
     covariance = sd**2 * np.eye(2 * n)
     half = np.zeros((2 * n, 2))
@@ -218,7 +218,7 @@ TWINS = [(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)]
 
 
 def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarray]:
-    """Known landmarks in twos, and some of them seen again with an error that they share."""
+    """Known landmarks in pairs, some seen again with a common error."""
     n, m = len(TWINS), len(seen)
     points = np.array([*TWINS, *(TWINS[k] for k in seen)])
     covariance = 0.01**2 * np.eye(2 * (n + m))
@@ -257,8 +257,9 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
 
 @pytest.mark.parametrize(("heading_sigma", "merged"), [(0.06, 3), (0.2, 0)])
 def test_far_landmarks_are_merged_that_near_ones_make_certain(heading_sigma, merged):
-    """Three landmarks seen again at 4, 6 and 8 m under an error of the heading. Alone, the nearest
-    one is too little evidence; the others are uncertain by more than `most_sd` until it is merged.
+    """Three landmarks seen again at 4, 6 and 8 m under an error of the heading. The nearest one
+    alone is
+    too little evidence; the others are uncertain by more than `most_sd` until it is merged.
     """
     known, most_sd = np.array([(4.0, 0.0), (0.0, 6.0), (-8.0, 0.0)]), 0.35
     profile = AssociationProfile(slack=0.03, density=0.05, same=0.5)

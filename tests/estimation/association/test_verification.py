@@ -1,4 +1,4 @@
-"""The tests of a closure: which of them hold inside one map, and which between two."""
+"""Tests of a closure inside one map, and between two."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Submaps of a simulated drive whose landmarks have no names, and what each of them truly is."""
+"""Submaps of a simulated drive without landmark identities, and their truth."""
 
 from itertools import pairwise
 
@@ -25,10 +25,9 @@ def drive(
     named: bool = False,
     pose_sd: tuple[float, float, float] = POSE_SD,
 ) -> tuple[list[Contribution], dict[LocalLandmark, int]]:
-    """A submap between each two poses of a path of all landmarks within reach, and its truth.
-
-    Each submap has them in an order of its own; all are seen by one keyframe. named: they keep
-    their numbers in the world.
+    """A submap between each two poses of a path, of all landmarks within reach in random order,
+    and its
+    truth; named: landmarks keep their numbers.
     """
     submaps, truth = [], {}
     for k, (start, end) in enumerate(pairwise(path)):
@@ -72,7 +71,7 @@ def ring(rng: np.random.Generator, count: int) -> Float[np.ndarray, "k 2"]:
 
 
 def wrong(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
-    """Members whose set has more of another true landmark."""
+    """Members whose set contains more of another true landmark."""
     count = 0
     for members in landmarks.sets.values():
         found = [truth[member] for member in members]
@@ -81,6 +80,6 @@ def wrong(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
 
 
 def duplicates(landmarks: Landmarks, truth: dict[LocalLandmark, int]) -> int:
-    """Sets beyond one of each true landmark."""
+    """Sets beyond one for each true landmark."""
     members = (member for of in landmarks.sets.values() for member in of)
     return len(landmarks.sets) - len({truth[member] for member in members})

@@ -10,15 +10,14 @@ NO_MAP = np.empty(0, np.uint32), np.empty((1, 0, 2)), np.empty((1, 0, 3))
 
 
 def placed(pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray]:
-    """A landmark at first sight by a particle at the pose: its mean, and (xx, xy, yy)."""
+    """Place a landmark at first sight: its mean, and (xx, xy, yy)."""
     return _stepped(pose, NO_MAP, seen, sensor, own)[:2]
 
 
 def updated(mean, packed, pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, float]:
-    """A landmark after the measurement, and the log-likelihood of that.
+    """Update a landmark; also the log-likelihood.
 
-    seen: (ranges, bearings); only the first one is taken. sensor: (σ_range², σ_range_per_m²,
-    σ_bearing²).
+    seen: (ranges, bearings), the first is used. sensor: (σ_range², σ_range_per_m², σ_bearing²).
     """
     known = np.array([7], np.uint32), mean[None, None], packed[None, None]
     return _stepped(pose, known, seen, sensor, own)

@@ -1,6 +1,4 @@
-"""Which measurements of a window are taken: what agrees stays, outliers go, nobody else is
-asked.
-"""
+"""Outlier rejection in a window: consistent measurements stay, outliers go."""
 
 from dataclasses import dataclass
 
@@ -26,7 +24,7 @@ PLACES = np.array([[5.0, 4.0], [9.0, -3.0], [12.0, 6.0], [2.0, -5.0]])
 
 @dataclass
 class Drive:
-    """A window as the robot has it: motions and measurements, by keyframe."""
+    """A robot's window: motions and measurements, by keyframe."""
 
     motions: list[Increment]
     keyframes: np.ndarray
@@ -34,7 +32,7 @@ class Drive:
     measurements: np.ndarray
 
     def judged(self, by="confirmed", outlier_share: float = 0.3, own=None, sensor=SENSOR):
-        """What a `Consensus` of all keyframes marks, in the order of the measurements."""
+        """Marks of a `Consensus` of all keyframes, in the order of the measurements."""
         own = unclaimed(len(self.ids)) if own is None else own
         consensus = core.Consensus(
             noise_of(sensor), sensor.max_range, sensor.field_of_view, outlier_share
@@ -49,7 +47,7 @@ class Drive:
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
-    """A robot on an arc of ten steps that sees all places in each, with the declared noise."""
+    """A robot on an arc of ten steps that sees all places in each, with the stated noise."""
     rng = np.random.default_rng(seed)
     motions, rows, pose = [], [], np.zeros(3)
     for k in range(10):
@@ -148,9 +146,7 @@ def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
 
 
 def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:
-    """The shares of good measurements that are kept and of outliers that pass, in windows of 12
-    s.
-    """
+    """Shares of inliers kept and of outliers accepted, in windows of 12 s."""
     robots = load(name).robots
     kept, passed = [], []
     clean, spoilt = world_of(name, kind, 0.0), world_of(name, kind, 0.3)
@@ -199,7 +195,7 @@ def test_the_smoother_finds_what_the_odometry_alone_lets_pass():
 
 @pytest.mark.parametrize("exactly", [False, True])
 def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly):
-    """Ranges so good that their weight is no finite number: no Cholesky factor, whatever rounds."""
+    """The weight of such ranges is not finite: no Cholesky factor exists."""
     window = drive(0)
     if exactly:
         pose = np.zeros(3)

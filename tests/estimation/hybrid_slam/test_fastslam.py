@@ -1,4 +1,4 @@
-"""FastSLAM against the exact posterior where the problem is linear, and against its own laws."""
+"""FastSLAM against the exact posterior of linear problems, and its invariances."""
 
 import numpy as np
 import pytest
@@ -85,7 +85,7 @@ def kalman(motions, keyframes):
 
 
 def simulated(seed, steps=5, covariance=MOTION.covariance):
-    """Increments and measurements of a robot that stands at its first keyframe and then moves."""
+    """Increments and measurements of a robot that stands at its first keyframe, then moves."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate((np.zeros(3), LANDMARKS.ravel()))
     motions, keyframes = [], []

@@ -1,4 +1,4 @@
-"""One measurement of a landmark against the textbook, correlated covariances included."""
+"""One measurement of a landmark against the textbook, with correlated covariances."""
 
 import math
 
@@ -59,7 +59,7 @@ def test_the_range_and_then_the_bearing_are_the_joint_update(kind):
 
 
 def test_a_measured_point_is_a_linear_measurement_in_the_plane():
-    """Its density is that of (range, bearing of the predicted range), so `distance` times it."""
+    """Its density is that of (range, bearing of the predicted range) times `distance`."""
     h = np.array(predicted(np.array(POSE), MEAN))
     z = h + np.array([0.3, 0.4])
     to_map = tangent(POSE[2] + z[1])[:2, :2]
@@ -79,7 +79,7 @@ EVIDENCE, REACH, FIELD = math.log(100.0), 3.0, 6.0
 def least_prior(
     motion: np.ndarray, covariance: np.ndarray, z: np.ndarray, own: np.ndarray
 ) -> float:
-    """The log odds of good measurements from which on two scans' measurements agree."""
+    """Least log odds of an inlier at which two scans' measurements agree."""
     none, some = -20.0, EVIDENCE
     while some - none > 1e-12:
         prior = 0.5 * (none + some)
@@ -96,10 +96,10 @@ def least_prior(
 
 @pytest.mark.parametrize("kind", ["none", "range and bearing"])
 def test_one_measurement_predicts_another_with_all_of_their_noise(kind):
-    """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, its Jacobians by differences.
+    """S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ, with Jacobians by differences.
 
-    Both agree where log p + prior + log(reach · field of view), the support of the one that is
-    supported best, exceeds EVIDENCE − prior.
+    Both agree where log p + prior + log(reach · field of view), the best-supported one's support,
+    exceeds EVIDENCE − prior.
     """
     own = OWN[kind]
     seen, z, pose = np.array([REACH, 0.4]), np.array([2.4, 0.9]), np.array([0.8, -0.3, 0.2])

@@ -1,6 +1,4 @@
-"""A robot whose measurements are in part outliers: its submaps do without it, and it says how
-much.
-"""
+"""A robot with outliers: its submaps leave them out, and it reports their share."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +29,7 @@ def robot() -> RobotConfig:
 
 
 def spoilt(given: RobotStream) -> RobotStream:
-    """Every fifth measurement of the stream is somewhere else."""
+    """Displace every fifth measurement of the stream."""
     seen = given.landmark_detections
     rows = np.arange(len(seen.ids)) % 5 == 2
     ranges = np.where(rows, 2.0 + seen.ranges, seen.ranges)
@@ -76,7 +74,7 @@ def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(mo
 
 
 def world_with(kind: str, steps: int = 200) -> Scenario:
-    """The thesis' world B in longer steps, three in ten measurements outliers."""
+    """The thesis' world B in longer steps, 30 % outliers."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(
         scenario.world, steps=steps, outlier_share=0.3, outlier_kind=kind
@@ -99,7 +97,7 @@ def aligned_rmse(scenario: Scenario) -> float:
 
 @pytest.fixture(scope="module")
 def clean_rmse():
-    """Of the run in which the same measurements are left out."""
+    """RMSE of the run without the outliers' measurements."""
     return aligned_rmse(world_with("drop"))
 
 

@@ -45,7 +45,7 @@ def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
 
 
 def arc(seconds, forward=0.6, yaw_rate=0.25):
-    """Position and heading on the circle that the robot drives."""
+    """Position and heading on the robot's circle."""
     angle = yaw_rate * seconds
     middle = forward / yaw_rate * (np.exp(1j * angle) - 1.0) / 1j
     return np.array([middle.real, middle.imag, angle])
@@ -77,7 +77,7 @@ def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyfr
 @settings(deadline=None, max_examples=60)
 @given(st.floats(1.01, 2.99), st.floats(0.5, 8.0), st.floats(-3.0, 3.0))
 def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing):
-    """The teammate stands; from the node it lies where the geometry of the circle says."""
+    """The teammate stands; the circle's geometry gives its place seen from the node."""
     grid, segmenter = initial_state()
     observer = arc(at_s)
     point = observer[0] + 1j * observer[1] + distance * np.exp(1j * (observer[2] + bearing))
@@ -148,7 +148,7 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
 
 
 def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
-    """Two sensors with different latencies, before odometry has covered either time."""
+    """Two sensors with different latencies, before odometry covers either time."""
     found = []
     for order in ((1_800_000_000, 2_500_000_000), (2_500_000_000, 1_800_000_000)):
         grid, segmenter = initial_state()
@@ -174,7 +174,7 @@ def seen():
 
 
 def driven(marks, particles=200, sensor=SENSOR, biases=()):
-    """Four keyframes; landmarks are seen at the first; marked as nodes: those in `marks`."""
+    """Four keyframes; landmarks are seen at the first; `marks`: nodes."""
     random = core.Random(b"a key of 16 byte")
     window = windows.open_window(FrontEnd(particles=particles, biases=biases), sensor)
     for k in range(4):
@@ -185,7 +185,7 @@ def driven(marks, particles=200, sensor=SENSOR, biases=()):
 
 
 def off(poses, mean):
-    """Log(mean⁻¹ ∘ pose) of each pose, turned by the mean's heading."""
+    """Log(mean⁻¹ ∘ pose) of each pose, rotated by the mean's heading."""
     turn = wrap(poses[:, 2] - mean[2])
     apart = (poses[:, :2] - mean[:2]) @ np.array([1.0, 1j])
     apart *= 0.5 * turn / np.tan(0.5 * turn) - 0.5j * turn

@@ -1,4 +1,4 @@
-"""Windows against the truth and against dense solutions, whatever they measure."""
+"""Windows against the truth and against dense solutions."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ WINDOWS = {1011: 34, 1022: 34, 1074: 21}
 
 
 def nees_of_window(seed, sequence):
-    """Of the end pose of that window, against the truth: χ² of three numbers."""
+    """NEES of that window's end pose, three degrees of freedom."""
     scenario = with_options(load("thesis"), seed=seed)
     config, stream = scenario.robots[0], streams_of(scenario).streams[0]
     slam, start_ns = HybridSlam(config, 1), 12_000_000_000 * sequence
@@ -110,8 +110,9 @@ def submap_of(keyframes: list[Keyframe], seed: int) -> LocalMap:
 
 
 def differences(keyframes: list[Keyframe]) -> list[float]:
-    """Between the end poses of one window by two seeds each: χ² of three numbers, in one's
-    covariance.
+    """χ² (3 degrees of freedom) between the end poses of one window by two seeds each, in the
+    covariance
+    of one.
     """
     maps = [submap_of(keyframes, seed) for seed in range(1, 5)]
     return [

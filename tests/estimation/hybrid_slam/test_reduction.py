@@ -1,4 +1,4 @@
-"""Windows whose detections have no names."""
+"""Windows of detections without identities."""
 
 import numpy as np
 import pytest
@@ -19,9 +19,9 @@ SENSOR = Sensor(range_sigma=0.02, bearing_sigma=0.01)
 
 
 def keyframes(keyframe_s: float, *, hidden: bool, tagged: int = 0) -> list[Keyframe]:
-    """A second of driving on an arc; each scan sees two of the three, in an order of its own.
+    """A second of driving on an arc; each scan sees two of the three, in random order.
 
-    tagged: of so many the names are told all the same, in a message of their own.
+    tagged: number of landmarks whose identities are sent in a message of their own.
     """
     rng = np.random.default_rng(0)
     segmenter = Segmenter(MOTION, SENSOR, keyframe_s)

@@ -1,4 +1,4 @@
-"""Biases that a robot's submaps share: columns, factors, and what the centre makes of them."""
+"""Biases that a robot's submaps share: columns, factors, and their use at the centre."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ MOTION = MotionModel(
 
 
 def window_of(bearing, clock_offset, forward_scale, range_offset, range_scale, white=1.0):
-    """A robot drives a curve among six landmarks, read without noise but with these errors."""
+    """A robot on a curve among six landmarks, measured without noise but with these biases."""
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
     front = FrontEnd(particles=1600, resample_below=0.0, biases=BIASES)
     window, random = windows.open_window(front, sensor), random_numbers(1, "r1", 0, 0)
@@ -88,9 +88,10 @@ def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements
 
 
 def test_the_clocks_derivative_changes_as_the_curvature_states():
-    """In the true window's place of each landmark less that by a late one, S b + ½ D b² has a third
-    of the spread of S b alone. All landmarks are displaced alike by what particles and smoother
-    differ in, at first order.
+    """In the true window's landmark places less those by a late one, S b + ½ D b² has a third of
+    the
+    spread of S b alone. Particles and smoother differ at first order by a displacement of all
+    landmarks.
     """
     late, errors = 0.8, dict.fromkeys(BIASES, 0.0)
     true, off = window_of(**errors), window_of(**(errors | {"clock_offset": late}))
@@ -103,7 +104,7 @@ def test_the_clocks_derivative_changes_as_the_curvature_states():
 
 
 def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
-    """A core's window of six random keyframes, and its motions' covariances and shifts."""
+    """A window of six random keyframes, with its motions' covariances and shifts."""
     rng, random = np.random.default_rng(seed), random_numbers(seed, "r1", 0, 0)
     window = core.Window(5, noise_of(sensor), mount=mount)
     motions = []
@@ -123,7 +124,7 @@ def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
 
 
 def stated(window, motions, points):
-    """The answers of the smoother to each bias: dense, its Jacobians by differences.
+    """The smoother's response to each bias: dense, Jacobians by differences.
 
     Residuals are Log(motion⁻¹ ∘ x_{k−1}⁻¹ ∘ x_k) − shift b and h(x, landmark) + g b.
     """
@@ -171,8 +172,9 @@ def stated(window, motions, points):
 
 
 def measured_later(path, seconds, k, point):
-    """How range and bearing change with the delay of their stamp, by differences along the motion
-    from a quarter of a second before keyframe k to a quarter after.
+    """∂(range, bearing)/∂(delay of the stamp), by differences along the motion from a quarter of a
+    second
+    before keyframe k to a quarter after.
     """
     ends, times = [np.zeros(3), *path], np.append(0.0, np.cumsum(seconds))
     first = max(j for j in range(k + 1) if j == 0 or times[k + 1] - times[j] >= 0.25)
@@ -288,7 +290,7 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
 
 
 def biased_team(seed):
-    """Submaps whose means are off by a share of each robot's two biases, and the biases."""
+    """Submaps shifted by a share of each robot's two biases, and the biases."""
     world = team(seed, robots=2, submaps=6, landmarks=5)
     rng = np.random.default_rng([seed, 7])
     errors = {robot: rng.normal(size=2) * (0.01, 0.01) for robot in world.paths}

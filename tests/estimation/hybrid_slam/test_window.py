@@ -1,7 +1,6 @@
-"""One window becomes one honest Gaussian: against batch least squares, in odd cases, in many runs.
+"""A window becomes one Gaussian: against batch least squares, in edge cases, over many runs.
 
-The truth and the measurements are made here by a few lines of their own, without the filter's
-models.
+Truth and measurements are made without the filter's models.
 """
 
 import dataclasses
@@ -35,7 +34,7 @@ def wrap(angle):
 
 @dataclasses.dataclass
 class Drive:
-    """What a robot was told to do, what it read, and the truth: (end pose, all landmarks)."""
+    """Commands, readings, and the truth: (end pose, all landmarks)."""
 
     motions: list
     keyframes: list
@@ -75,7 +74,7 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
 
 
 def move(window, motion, seed):
-    """Move the particles of a window without a keyframe."""
+    """Move the particles without a keyframe."""
     random = random_numbers(seed, "a", 0, 0)
     window.core.move(motion.mean, motion.covariance, random)
 
@@ -87,9 +86,9 @@ def bytes_of(window):
 
 
 def batch(run, sensor, ids):
-    """Maximum a posteriori over (noise of every step, landmarks) and its Laplace covariance,
-
-    both of (end pose, landmarks in the order of ids), by scipy's least squares.
+    """MAP over (noise of every step, landmarks) by scipy's least squares: mean and Laplace
+    covariance of
+    (end pose, landmarks in the order of ids).
     """
     steps = len(run.motions)
 
@@ -241,7 +240,7 @@ def test_the_information_of_few_particles_is_right_on_average_and_that_of_their_
 
 
 def test_a_pose_after_an_uncertain_turn_is_that_of_the_odometry_and_no_mean_of_coordinates():
-    """A turn that is known to 0.4 rad bends the particles about the start, 10 m away."""
+    """A turn with a sigma of 0.4 rad bends the particles about the start, 10 m away."""
     step = increment_of(MotionModel(kind="turn-then-drive", turn=MotionNoise(0.4)), 1.0, 10.0, 0.0)
     window = windows.open_window(FrontEnd(particles=4000), ACCURATE)
     move(window, step, 2)

@@ -1,4 +1,4 @@
-"""The bounded fold: condensed submaps, and the identities that it remembers."""
+"""The bounded fold: condensed submaps, and the identities that it keeps."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ ROBUST = JoinSettings()
 
 
 def ticks_of(world):
-    """The submaps by tick: one of each robot."""
+    """Submaps by tick, one of each robot."""
     ends = sorted({each.end_ns for each in world.submaps})
     return [[each for each in world.submaps if each.end_ns == end] for end in ends]
 
@@ -46,7 +46,7 @@ def both(world, settings):
 
 
 def apart(one, other):
-    """Compute the distance of two maps in σ² of the first per degree of freedom."""
+    """Distance of two maps in σ² of the first, per degree of freedom."""
     a, b = marginals.landmark_map(one), marginals.landmark_map(other)
     assert a.ids.tolist() == b.ids.tolist()
     difference = (a.means - b.means).ravel()
@@ -75,7 +75,7 @@ def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
 
 
 def test_a_submap_that_is_condensed_twice_is_not_consistent():
-    """The mutant: what counts a factor twice claims too much, and the test above would see it."""
+    """Mutant: a factor counted twice makes the map overconfident."""
     world = team(1, submaps=20)
     full, bounded = both(world, JoinSettings())
     island = bounded.main

@@ -40,7 +40,7 @@ def team_pose(prior, pending, open_window):
 
 
 def later(world, robot, known):
-    """The submaps of the team up to each robot's `known`-th, and this robot's further ones."""
+    """The team's submaps up to each robot's `known`-th, and this robot's further ones."""
     before = [each for each in world.submaps if each.sequence < known]
     after = [each for each in world.submaps if each.robot == robot and each.sequence >= known]
     return before, after
@@ -79,7 +79,7 @@ def test_an_open_window_is_one_more_submap():
 
 
 def one_after_the_other(prior, pending):
-    """The mutant, which was the program: each submap is linearised on the guess before it."""
+    """Mutant: each submap is linearised at the guess before it."""
     whole = prior.whole
     for each in pending:
         whole = conditioning.join_submap(whole, each)
@@ -87,7 +87,7 @@ def one_after_the_other(prior, pending):
 
 
 def test_a_poor_prior_and_later_submaps_give_the_pose_of_the_full_join():
-    """Submaps of 0.5 rad: what the later ones see settles the heading of the earlier ones, too."""
+    """With submaps of 0.5 rad, later measurements determine the heading of earlier ones, too."""
     away = {"ours": [], "one after the other": []}
     for seed in range(12):
         world = team(seed, submaps=8, landmarks=10, size=60.0, reach=20.0, sigmas=(0.3, 0.5, 2.0))
@@ -108,7 +108,7 @@ def test_a_poor_prior_and_later_submaps_give_the_pose_of_the_full_join():
 
 
 def overconfident(local, shift):
-    """A submap whose end pose is off by `shift`, and claims to be known three times better."""
+    """A submap whose end pose is off by `shift`, with a third of the standard deviations."""
     mean, scale = local.mean.copy(), np.ones(len(local.mean))
     mean[:3] += shift
     scale[:3] = 0.3
@@ -117,9 +117,9 @@ def overconfident(local, shift):
 
 @pytest.mark.parametrize("seed", [2, 4, 7])
 def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(seed):
-    """The gate took all that later submaps saw for other landmarks, for as long as the prior held.
+    """The gate must not take all later measurements for other landmarks while the prior holds.
 
-    Now what is left of the error is within three sigma two windows later, and it is said.
+    Two windows later the error is within three sigma, and a warning is given.
     """
     world = team(seed, submaps=10, landmarks=12)
     before, after = later(world, "r0", 5)
@@ -136,7 +136,7 @@ def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(s
 
 
 def misread(local, place, shift):
-    """The submap whose landmark at this place was taken for another one, `shift` away."""
+    """The submap with this landmark's measurement replaced by one `shift` away."""
     mean = local.mean.copy()
     mean[3 + 2 * place : 5 + 2 * place] += shift
     return LocalMap(local.ids, mean, local.covariance)
@@ -190,7 +190,7 @@ def test_a_trajectory_has_the_joint_covariance_of_neighbouring_poses():
 
 
 def test_a_pose_behind_a_bad_heading_has_the_covariance_of_its_arc():
-    """20 m on from where the heading was known to 0.2 rad: against samples of pose ∘ Exp(ξ)."""
+    """20 m beyond a heading known to 0.2 rad: against samples of pose ∘ Exp(ξ)."""
     generator = np.random.default_rng(1)
     mean = np.array([3.0, -2.0, 0.7])
     S = np.array([[0.1, 0.0, 0.0], [0.0, 16.1, 0.79], [0.0, 0.79, 0.04]])

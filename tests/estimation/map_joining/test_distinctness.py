@@ -1,5 +1,6 @@
-"""A final map shows no landmark twice: what may be one with another landmark is left out, and so
-is what nearly all submaps miss that look there.
+"""A final map shows no landmark twice: it leaves out possible duplicates, and landmarks that
+nearly
+all submaps miss.
 """
 
 import numpy as np
@@ -29,7 +30,7 @@ PAIR = [(2.0, 0.0), (2.0, 0.2)]
 def seen(
     sequence: int, places: list[tuple[float, float]], pose_sd: float, heading_sd: float = 0.001
 ) -> Contribution:
-    """A submap of a robot that stands, with landmarks that one keyframe saw together."""
+    """A submap of a standing robot, with landmarks that one keyframe saw together."""
     sd = np.array([pose_sd, pose_sd, heading_sd, *[SD] * (2 * len(places))])
     local = LocalMap(
         (UNNAMED + np.arange(len(places))).astype(np.uint32),
@@ -46,7 +47,7 @@ def folded(
     times: int = 2,
     heading_sd: float = 0.001,
 ) -> Fold:
-    """Two neighbours are seen twice; after a motion with an error of 0.3 m one landmark is."""
+    """Two neighbours are seen twice; after a motion with an error of 0.3 m, one landmark."""
     fold = EMPTY_FOLD
     for k in range(2 + times):
         places, pose_sd = (PAIR if k < 2 else [later]), (0.3 if k == 1 else SD)
@@ -105,7 +106,9 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(heading_sd, 
 
 
 def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fold:
-    """Two neighbours are seen so many times, and a third landmark beside them the first ones."""
+    """Two neighbours are seen `times` times, and a third landmark beside them the first `found`
+    times.
+    """
     fold = EMPTY_FOLD
     for k in range(times):
         places = [*PAIR, FALSE] if k < found else PAIR

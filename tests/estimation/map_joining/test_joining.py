@@ -29,7 +29,6 @@ EXACTLY = JoinSettings(step_tolerance=1e-11)
 
 
 def joined(submaps, starts, options=EXACTLY, tick=4):
-    """The fold over the submaps, `tick` at a time."""
     return joined_with(submaps, starts, (), options, tick)
 
 
@@ -242,7 +241,7 @@ def test_a_graph_without_a_gauge_names_a_node_that_is_not_determined():
 
 
 def with_outlier(world, k):
-    """The k-th submap sees everything three times as far away as it is."""
+    """The k-th submap sees everything at three times its distance."""
     bad = world.submaps[k]
     mean = bad.local.mean.copy()
     mean[3:] *= 3.0

@@ -32,7 +32,7 @@ WHOLE = replace(ROBUST, landmark_gate=math.inf)
 
 
 def mistaken(world, seed, share=0.3):
-    """In some submaps of r0 two landmarks that it sees are exchanged."""
+    """Exchange two landmarks in some submaps of r0."""
     rng = np.random.default_rng([seed, 3])
     submaps = []
     for each in world.submaps:
@@ -51,7 +51,7 @@ def fold_of(world, submaps, options, full=solve_fold):
 
 
 def errors_of(world, fold):
-    """RMSE of the landmarks and of r0's path [m]."""
+    """RMSE [m] of the landmarks and of r0's path."""
     found = landmark_map(fold)
     graph, state = fold.main.graph, fold.main.state
     ends = np.array([state[graph.offset[k] :][:2] for k in graph.streams["r0", 0][1:]])
@@ -145,9 +145,9 @@ def standing(robot, place, spread):
 
 
 def closed_loop(options):
-    """r1's odometry of 1 m (one sigma) is 3.5 m off, and r0 sees to the centimetre where it is.
+    """r1's odometry of 1 m (one sigma) is 3.5 m off, and r0 measures its place to a centimetre.
 
-    Bent, the chain costs 12; a sighting that is not believed costs 22. Not solved yet.
+    A bent chain costs 12, a rejected sighting 22. Not solved yet.
     """
     starts = {(robot, 0): InitialPoseFactor(robot, 0, np.zeros(3)) for robot in ("r0", "r1")}
     submaps = [standing("r0", (0.0, 0.0), 0.01), standing("r1", (10.0, 3.5), 1.0)]
@@ -166,7 +166,7 @@ def after(ticks, island):
 
 
 def off_m(island):
-    """Compute the distance of r1's node from its measured place [m]."""
+    """Distance [m] of r1's node from its measured place."""
     begin = island.graph.offset[island.graph.streams["r1", 0][1]]
     return abs(float(island.state[begin + 1]))
 

@@ -1,4 +1,4 @@
-"""A robot without a start is placed by landmarks of the team with the covariance of its error."""
+"""A robot without a start is placed by the team's landmarks, with the covariance of its error."""
 
 import numpy as np
 import pytest

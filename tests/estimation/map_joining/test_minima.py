@@ -1,4 +1,4 @@
-"""Wrong minima are found out: by a start that needs no guess, by the cost, by a second place."""
+"""Wrong minima are detected by a start without a guess, by the cost, by a second place."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def island_of(world, sightings=()):
 
 
 def thrown(island, seed):
-    """The same island with every unknown anywhere."""
+    """The island with random values of all unknowns."""
     rng = np.random.default_rng(seed)
     free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
     state = np.where(free, rng.uniform(-30.0, 30.0, len(free)), island.state)
@@ -144,7 +144,7 @@ def test_a_place_that_the_measurements_exclude_is_no_second_place():
 def hinged(apart, turn=0.1, sigma=0.8):
     """r1 passes one landmark, turns by `turn` ± `sigma` [rad], and passes the other one 10 m on.
 
-    How far the two lie apart [m], r0 knows: r1 has turned by so much to the left or to the right.
+    r0 knows their distance `apart` [m]: r1 has turned left or right.
     """
     near, point = [0.05, 0.05, 0.02], [0.05, 0.05]
     said = [

@@ -25,7 +25,7 @@ LANDMARKS = np.array([[0.0, 0.0], [8.0, 0.0], [3.0, 7.0]])
 
 
 def latecomer(blind, seed=0, turn=0.09):
-    """r0 sees three landmarks from a known start; r1 drives `blind` submaps of 10 m before it does.
+    """r0 sees three landmarks from a known start; r1 first drives `blind` submaps of 10 m.
 
     turn: of each submap's end [rad].
     """
@@ -64,7 +64,7 @@ def test_the_start_of_a_robot_that_drove_long_without_a_landmark_is_said(seed):
 
 @pytest.mark.parametrize(("blind", "least", "most"), [(14, 4, 24), (1, 0, 0)])
 def test_a_bent_ellipse_is_exceeded_and_another_one_is_not(blind, least, most):
-    """Count the worlds of 24 whose true start exceeds the 99.9 % bound of the motion's χ²."""
+    """Number of 24 worlds whose true start exceeds the 99.9 % bound of the motion's χ²."""
     ahead = 10.0 * blind * np.exp(0.3j)
     truth = np.array([[-3.0 - ahead.real, 2.0 - ahead.imag, 0.3]])
     beyond = 0
@@ -85,9 +85,7 @@ def test_a_robot_that_sees_landmarks_soon_is_not_said(monkeypatch):
 
 
 def test_a_robot_whose_initial_pose_is_given_costs_no_profile(monkeypatch):
-    """Its profiles were computed and thrown away: the final map of a large team took most of its
-    time for them.
-    """
+    """Profiles of known starts would take most of a large team's final map."""
     fold, asked = latecomer(blind=10), []
 
     def noted(island, node):

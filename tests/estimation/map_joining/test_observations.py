@@ -1,4 +1,4 @@
-"""Observations of landmarks by single submaps: places, covariances, and their scatter."""
+"""Observations of landmarks by single submaps: places, covariances, scatter."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ STEP = 1e-6
 
 @pytest.fixture(scope="module")
 def island():
-    """A joined team whose covariances count twice."""
+    """A joined team with doubled covariances."""
     world, settings = team(2), JoinSettings(covariance_factor=2.0)
     return solved(joined_with(world.submaps, world.starts, (), settings), settings).main
 

@@ -1,4 +1,4 @@
-"""The scale of the ranges: noise at the joined map's ranges, and an error that all robots share."""
+"""The range scale: noise at the joined map's ranges, and an error that all robots share."""
 
 from dataclasses import replace
 
@@ -25,11 +25,12 @@ LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -
 
 
 def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0):
-    """Robots on known ways whose ranges are wrong in proportion; each says what it measured.
+    """Robots on known paths whose ranges are wrong in proportion: contributions, starts, true
+    scale errors.
 
-    own, common, marker: standard deviations of errors of each robot, of all, and of each landmark's
-    marker, whoever sees it; way: of each submap's end pose [m].
-    Contributions, starts, and the true error of each robot's scale.
+    own, common, marker: sigmas of the scale of each robot, of all, and of each landmark's marker;
+    way:
+    of each submap's end pose [m].
     """
     random = np.random.default_rng(seed)
     shared = common * random.standard_normal()
@@ -112,7 +113,7 @@ def test_at_joined_ranges_errors_are_times_the_ratio_of_distances_and_columns_th
 
 
 def _with_offset(submap):
-    """The same submap with an offset of the ranges beside their scale, as the landmarks moved."""
+    """The submap with an offset of the ranges beside their scale."""
     local = submap.local
     points = local.end_pose[:2] / 2.0 - local.landmarks
     ahead = points / np.linalg.norm(points, axis=1, keepdims=True)

@@ -24,7 +24,7 @@ ROUND = 14
 
 
 def field(seed: int, count: int = 30, half: float = 15.0) -> np.ndarray:
-    """Landmarks in a square, none nearer to another than two metres."""
+    """Landmarks in a square, at least two metres apart."""
     rng, kept = np.random.default_rng(seed), []
     while len(kept) < count:
         point = rng.uniform(-half, half, 2)
@@ -34,7 +34,7 @@ def field(seed: int, count: int = 30, half: float = 15.0) -> np.ndarray:
 
 
 def folded(*parts: list[Contribution]) -> Fold:
-    """The fold of a robot's drives one after the other, as if its odometry joined them."""
+    """Fold a robot's drives one after the other, as if its odometry joined them."""
     fold, sequence = EMPTY_FOLD, 0
     for part in parts:
         for each in part:

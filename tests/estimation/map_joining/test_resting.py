@@ -1,4 +1,4 @@
-"""Landmarks at rest: map, covariance and cost are those of a fold in which none rests."""
+"""Resting landmarks: map, covariance and cost are those of a fold in which none rests."""
 
 from dataclasses import replace
 

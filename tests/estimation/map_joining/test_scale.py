@@ -1,8 +1,7 @@
-"""The scale of a map that many robots know only by how far they drove.
+"""The scale of a map that many robots know only from their odometry.
 
-Every robot drives straight from one pair of landmarks to another, by windows in which it sees
-nothing else, with an uncertain heading. The truth and the measurements are made here by a few lines
-of their own.
+Every robot drives straight from one pair of landmarks to another, with an uncertain heading and
+nothing in sight between. Truth and measurements are made without the estimator's models.
 """
 
 import numpy as np
@@ -32,7 +31,7 @@ SENSOR = Sensor(range_sigma=0.5, bearing_sigma=0.05)
 
 
 def driven(robot, aside, rng):
-    """The submaps of one robot on the line y = aside, a step of 1 m each second."""
+    """Submaps of one robot on the line y = aside, a step of 1 m each second."""
     submaps = []
     for window in range(WINDOWS):
         keyframes = []
@@ -55,7 +54,7 @@ def driven(robot, aside, rng):
 
 
 def too_long(seed):
-    """Compute the mean excess distance of the far landmarks, in the map's standard deviations."""
+    """Mean excess distance of the far landmarks, in the map's standard deviations."""
     rng = np.random.default_rng(seed)
     sides = {f"r{k}": float(rng.uniform(-3.0, 3.0)) for k in range(ROBOTS)}
     submaps = {robot: driven(robot, aside, rng) for robot, aside in sides.items()}

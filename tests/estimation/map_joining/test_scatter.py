@@ -1,4 +1,4 @@
-"""The standard deviation of a sum by the scatter of its parts, which may be correlated."""
+"""Standard deviation of a sum from the scatter of its possibly correlated parts."""
 
 import math
 
@@ -11,7 +11,7 @@ CHAINS, SUBMAPS, DRAWS = 3, 40, 600
 
 
 def _series(rng, fade):
-    """Draw a stationary autoregressive series of unit variance."""
+    """A stationary autoregressive series of unit variance."""
     series = [rng.standard_normal()]
     for fresh in rng.standard_normal(SUBMAPS - 1):
         series.append(fade * series[-1] + math.sqrt(1.0 - fade * fade) * fresh)
@@ -20,8 +20,9 @@ def _series(rng, fade):
 
 @pytest.mark.parametrize("fade", [0.0, 0.3, 0.6])
 def test_errors_that_last_longer_than_a_window_widen_the_sum(fade):
-    """As the sum scatters over draws, whatever the correlation; sums of the squares alone would be
-    short by √((1 + ρ)/(1 − ρ)), up to a factor of 2. The fit removes the mean of the series.
+    """The result matches the scatter over draws; a sum of squares would be short by √((1 + ρ)/(1 −
+    ρ)),
+    up to a factor of 2. The fit removes the mean of the series.
     """
     rng = np.random.default_rng(0)
     sums, found = [], []

@@ -1,4 +1,4 @@
-"""Sightings of teammates are factors between pose nodes: honest, once, and a tie between frames."""
+"""Sightings of teammates are consistent factors between pose nodes, used once; they tie frames."""
 
 from dataclasses import replace
 

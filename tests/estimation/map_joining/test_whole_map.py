@@ -28,7 +28,6 @@ LINEAR = (0.1, 1e-5, 0.2)
 
 
 def map_of(local):
-    """The submap as a map."""
     bare = local.without_nodes
     return WholeMap(bare.ids, bare.mean, bare.covariance)
 
