@@ -90,8 +90,7 @@ class Shares(LoadScopeScheduling):
     """Scheduler that gives a worker whole files, whose fixtures are shared.
 
     Files of tests/system go to the first TEAMS workers while other files are left, so that few
-    teams
-    run at a time.
+    teams run at a time.
     """
 
     def _split_scope(self, nodeid: str) -> str:

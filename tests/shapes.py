@@ -52,8 +52,7 @@ def checked(function: F) -> Callable[..., object]:
     """Check a function's arguments and result, as often as CALLS allows.
 
     jaxtyping calls it twice for a function: for the arguments, and for the result with them. The
-    check
-    is built at the first call.
+    check is built at the first call.
     """
     name = (function.__module__, function.__qualname__)
     check: Callable[..., object] | None = None

@@ -55,8 +55,7 @@ def stream(
     """A robot that drives along the x axis and observes near landmarks.
 
     off_ns: time of observations before the end of their interval. beyond: number of observations
-    after
-    the last odometry.
+    after the last odometry.
     """
     rng = np.random.default_rng([seed, steps, *robot.encode()])
     ends = step_ns * np.arange(1, steps + 1)

@@ -91,8 +91,7 @@ def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path):
 
 def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch):
     """Folded ticks: at most those of the nominal run for each robot left out, each robot alone,
-    and a
-    restart with each of the few suspensions.
+    and a restart with each of the few suspensions.
     """
     counts = []
     for robot in ("", "r2"):

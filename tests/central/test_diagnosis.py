@@ -121,8 +121,7 @@ def test_noise_that_is_stated_too_small_widens_the_covariance_of_the_final_map()
 
 def test_errors_that_change_slowly_are_noise_and_no_error_that_the_submaps_share(tmp_path):
     """The offset of a robot's bearings is many stated sigmas from 0; the scatter of its submaps
-    shows that
-    it is not constant.
+    shows that it is not constant.
     """
     (found,) = diagnosed(scenario(replace(TEAM, correlated_s=20.0), tmp_path))
     assert found.cause == "noise_underestimated"

@@ -3,8 +3,7 @@
 Every entry of the stub has a valid example. One or two of its arguments, or of its object's
 constructor, are replaced by non-finite, huge or negative numbers, by arrays of other shapes, types
 and strides, or by None. In `make check-core` an access out of bounds, an overflow or a null
-pointer
-ends the process.
+pointer ends the process.
 """
 
 import ast

@@ -1,4 +1,6 @@
-"""Teams whose robots tell in every form, in memory: every rule maps them, the log says it again."""
+"""Teams with every form of measurement, in memory: every rule maps them, the log reproduces the
+run.
+"""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""The inbox: measurements in their order, each once, whatever order they come in."""
+"""The inbox: measurements in order, each once, in any order of arrival."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -77,7 +77,7 @@ def test_what_an_earlier_life_consumed_is_not_taken_again():
 
 
 def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():
-    """His measurements wait for ever: the robot asked for those before them, or for nothing."""
+    """A stranger's far measurements must not stop the requests for those before them."""
     inbox = Inbox()
     for each in (*map(measurement, range(3)), measurement(4, incarnation=7)):
         inbox.put(each)

@@ -1,4 +1,4 @@
-"""The robot's process: one of a name."""
+"""The robot's process, one per name."""
 
 import threading
 import time
@@ -41,7 +41,7 @@ def test_a_robot_whose_earlier_life_has_gone_begins():
 
 
 class Source:
-    """The source of r1's stream on a bus: it answers for what it has published."""
+    """The source of r1's stream on a bus, which answers for its publications."""
 
     answers = True
 
@@ -64,7 +64,7 @@ class Source:
 def lived(
     network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None], waits_s: float = 0.0
 ) -> RobotShell:
-    """A robot's process that hears what `act` brings about, and is told to stop."""
+    """A robot's process that receives the results of `act`, and is told to stop."""
     stop = threading.Event()
     shell = RobotShell(bus, config("r1"), stop, patience_s=0.0)
     shell.shell.begin = act  # when it has subscribed
@@ -82,7 +82,7 @@ def lived(
 
 
 def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone():
-    """One message of a stranger made a robot leave its stream, and wait for another for ever."""
+    """A stranger's message must not make a robot leave its stream."""
     network = MemoryNetwork()
     source = Source(network)
 
@@ -113,7 +113,7 @@ def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path)
 
 
 def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source():
-    """A stranger published more measurements than there are: the robot waited for ever."""
+    """A stranger's additional measurements must not make the robot wait for more."""
 
     class Ending(Source):
         def answer(self, request: bytes) -> list[bytes]:
@@ -141,7 +141,7 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
 
 
 class Published(Source):
-    """A source that has its initial pose and one odometry interval to give."""
+    """A source with an initial pose and one odometry interval."""
 
     def answer(self, request: bytes) -> list[bytes]:
         super().answer(request)
@@ -151,7 +151,7 @@ class Published(Source):
 
 
 def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
-    """A stranger's far end made the robot wait for ever; an early one made it leave."""
+    """A stranger's far end must not make the robot wait, nor an early one make it leave."""
 
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
@@ -175,7 +175,7 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
 
 @pytest.mark.parametrize("state", ["ended", "open"])
 def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
-    """A stranger's head of a driver that is not there: the robot waited, and asked for nothing."""
+    """A stranger's head of a driver that does not exist must not stop the requests."""
 
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
@@ -194,7 +194,7 @@ def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
 
 
 def test_a_stream_begins_where_its_source_says():
-    """A stranger was there first, years away: everything of the source was refused after that."""
+    """A stranger's earlier messages, years away, must not refuse those of the source."""
     network = MemoryNetwork()
     source = Source(network)
 
@@ -220,7 +220,7 @@ def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_o
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
-    """One odometry as measurement 0 of incarnation 7 made a robot leave its stream for ever."""
+    """One odometry as measurement 0 of incarnation 7 must not make a robot leave its stream."""
     network = MemoryNetwork()
     source = Source(network)
 

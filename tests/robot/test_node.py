@@ -1,4 +1,4 @@
-"""The robot's node: what it sends for fusion hangs on its own measurements alone."""
+"""The robot's node: its contributions depend on its own measurements alone."""
 
 from functools import cache
 from itertools import pairwise
@@ -38,7 +38,7 @@ def payloads(out, channel=ch.SUBMAP):
 
 @cache
 def lonely():
-    """What it sends for fusion when nothing happens to it."""
+    """Contributions of an undisturbed robot."""
     return payloads(driven(RobotNode(config()), MEASUREMENTS))
 
 
@@ -104,7 +104,7 @@ def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections
 
 
 def test_the_prior_does_change_the_team_pose():
-    """The mutant's other half: the noise above is really used, where it may be."""
+    """Counterpart of the mutant: the noise above is used where it may be."""
     poses = []
     for at in (0.0, 3.0):
         node = RobotNode(config())
@@ -182,7 +182,7 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
 
 
 def out_of_order(measurements):
-    """What is counted right before an odometry interval is stamped half a second behind its end."""
+    """Stamp the measurement before each odometry interval half a second behind its end."""
     late = []
     for measurement, following in pairwise([*measurements, None]):
         ends = following is not None and isinstance(following, m.Odometry)
@@ -196,7 +196,7 @@ def out_of_order(measurements):
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_s": 0.3}, {"node_s": 1.0}])
 def test_what_is_stamped_behind_its_window_is_in_no_submap_also_after_a_restart(options):
-    """Before, the next window used it too: a robot that was started again sent another submap."""
+    """Otherwise the next window would use it too, and after a restart another submap came."""
     measurements = out_of_order(published(stream("r1", 12)))
     front_end = msgspec.structs.replace(config().front_end, **options)
     out = driven(RobotNode(config(front_end=front_end)), measurements)
@@ -338,7 +338,7 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
 
 
 def outliers(measurements, share):
-    """Some of the ranges and bearings have nothing to do with what is there."""
+    """Replace some of the ranges and bearings by random ones."""
     rng, spoilt = np.random.default_rng(7), []
     for measurement in measurements:
         if isinstance(measurement, m.Observations):

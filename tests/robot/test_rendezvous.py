@@ -1,4 +1,4 @@
-"""A rendezvous changes when submaps are sent, never what becomes of them."""
+"""A rendezvous changes when submaps are sent, never their content."""
 
 import random
 
@@ -44,7 +44,7 @@ def test_the_final_map_is_that_of_a_continuous_exchange_to_the_last_bit(continuo
 
 
 def test_a_robot_that_keeps_what_it_holds_is_found_out(continuous, monkeypatch):
-    """The mutant: the comparison above sees a submap that was never sent."""
+    """Mutant: the comparison detects a submap that was never sent."""
     monkeypatch.setattr(RobotNode, "_release", lambda *_: [])
     assert encoded(met(1).final) != encoded(continuous.final)
 

@@ -1,4 +1,4 @@
-"""The robot's submaps: each is held once, and decoded to the bits of the window that closed."""
+"""The robot's submaps: stored once, and decoded to the bits of the closed window."""
 
 import gc
 

@@ -1,4 +1,4 @@
-"""The robot's team map: a submap is in it once, whether the prior or the robot brings it."""
+"""The robot's team map: it contains a submap once, from the prior or from the robot."""
 
 import msgspec
 import numpy as np
@@ -33,7 +33,7 @@ def prior(sequence: int) -> m.Prior:
 
 
 def test_a_pose_costs_the_same_however_long_no_prior_comes(monkeypatch):
-    """The oldest submaps are condensed, by their order alone, whenever it is asked for."""
+    """The oldest submaps are condensed by their order alone."""
     submaps = [each.local for each in team(1, robots=1, submaps=5 * CONDENSED).submaps]
     first = submaps[0]  # its frame is the team's
     told = msgspec.structs.replace(
@@ -69,7 +69,7 @@ def test_a_pose_is_told_with_the_covariance_of_its_arc():
 
 
 def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already():
-    """The prior has submaps 0 to 4; the robot, started again, has sent three of them so far."""
+    """The prior has submaps 0 to 4; the restarted robot has sent three of them so far."""
     kept, told = TeamMap(), prior(4)
     alone = translate.prior_of(told).whole
     for known in (3, 4, 5):

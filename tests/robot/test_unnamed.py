@@ -1,4 +1,4 @@
-"""Landmarks without names: detections, classes."""
+"""Landmarks without identities: detections, classes."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""The network of a ROS 2 robot: a Zenoh router that is not ours."""
+"""The network of a ROS 2 robot: a foreign Zenoh router."""
 
 import socket
 

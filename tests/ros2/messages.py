@@ -1,4 +1,4 @@
-"""ROS 2 messages and bags for tests, written by rosbags as ROS would write them."""
+"""ROS 2 messages and bags, written by rosbags."""
 
 from collections.abc import Sequence
 from math import cos, sin

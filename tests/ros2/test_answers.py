@@ -1,4 +1,4 @@
-"""Results for ROS 2: the right numbers in the right frames, read by readers that are not ours."""
+"""Results for ROS 2: right numbers and frames, read by independent readers."""
 
 import math
 

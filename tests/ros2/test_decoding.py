@@ -1,4 +1,4 @@
-"""CDR in, values out, of each type that is understood; damage is an error and nothing else."""
+"""CDR of each supported type decodes to values; damage is an error."""
 
 import random
 from typing import Any

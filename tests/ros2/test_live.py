@@ -1,4 +1,4 @@
-"""A ROS 2 robot live: keys of rmw_zenoh and of a bridge, from a publisher that is not ours."""
+"""A live ROS 2 robot: keys of rmw_zenoh and of a bridge, from an independent publisher."""
 
 import struct
 import time
@@ -32,7 +32,7 @@ TOPICS = RobotTopics(
 
 
 class Robot(Driver):
-    """A driver that stores its calls, and refuses time that goes back."""
+    """A driver that stores its calls and refuses decreasing time."""
 
     sensor_mount: tuple[float, float, float] | None = None
     antenna: tuple[float, float] | None = None

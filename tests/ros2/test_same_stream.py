@@ -1,4 +1,4 @@
-"""A ROS 2 robot live and its bag as a data set are one stream of measurements, byte for byte."""
+"""A live ROS 2 robot and its bag as a data set give one stream, byte for byte."""
 
 import numpy as np
 import pytest

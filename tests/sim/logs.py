@@ -43,17 +43,16 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
 
 
 def streams(of: Scenario) -> WorldStreams:
-    """The world's streams of a scenario."""
     return simulate(of.world, of.robots, of.seed)
 
 
 def samples(out: Sequence[Outgoing]) -> list[Sample]:
-    """Return the samples that a recorder stores of publications."""
+    """Samples that a recorder stores of publications."""
     return [Sample(o.key, encoded(o.message), o.message.stamp_ns, 0, i) for i, o in enumerate(out)]
 
 
 def world_log(of: Scenario) -> list[Sample]:
-    """Everything that the world publishes, with nobody listening."""
+    """All publications of a world without listeners."""
     node = WorldNode(streams(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
@@ -80,7 +79,7 @@ def final_map(
 
 
 def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: float) -> Outgoing:
-    """A smoothed trajectory with the same deviation of everything."""
+    """A smoothed trajectory with one sigma for all coordinates."""
     covariances = np.tile(sigma**2 * np.eye(3), (len(stamps), 1, 1))
     message = translate.trajectory_message(
         stamps[-1], robot, 1, bytes(8), list(stamps), poses, covariances
@@ -89,7 +88,7 @@ def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: floa
 
 
 def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoing]:
-    """Build pose messages of r1 at the end of each step, with unit covariance."""
+    """Pose messages of r1 at the end of each step, with unit covariance."""
     ends = streams(of).streams[0].intervals.end_ns.tolist()
     unit = from_floats(np.eye(3))
     return [
@@ -103,7 +102,7 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
 
 
 def joined_log(of: Scenario, deviation: float) -> list[Sample]:
-    """The world's log, and a joined map and trajectories that are off by `deviation` everywhere."""
+    """The world's log with a joined map and trajectories, off by `deviation` everywhere."""
     world = streams(of)
     assert world.landmarks is not None
     out = []
@@ -117,7 +116,7 @@ def joined_log(of: Scenario, deviation: float) -> list[Sample]:
 
 
 def counted_twice(log: Sequence[Sample]) -> list[Sample]:
-    """The log with every observation in it twice, as two measurements."""
+    """The log with every observation twice, as two measurements."""
     doubled = []
     for sample in log:
         _, _, message = opened(sample)

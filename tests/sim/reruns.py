@@ -1,4 +1,4 @@
-"""Logs to compute again: written from samples, honest or tampered with."""
+"""Logs to recompute: written from samples, honest or tampered with."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ Change = Callable[[m.Message], m.Message | None]
 
 
 def thesis(steps: int, **options: str | int) -> Scenario:
-    """The thesis world, shorter, with windows of 10 s whatever its default is."""
+    """The thesis world, shorter, with windows of 10 s."""
     scenario = with_options(load("thesis"), **options)
     world = msgspec.structs.replace(scenario.world, steps=steps)
     robots = tuple(
@@ -44,7 +44,7 @@ def written(path: Path, samples: Iterable[Sample], more: Mapping[str, str] | Non
 
 
 def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> list[Sample]:
-    """The samples with `change` applied to every message of a channel; None leaves it out."""
+    """Apply `change` to every message of a channel; None removes it."""
     out = []
     for sample in samples:
         found, _, message = opened(sample)
@@ -56,12 +56,11 @@ def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> l
 
 
 def messages(samples: Iterable[Sample], channel: ch.Channel, name: str = "") -> list[m.Message]:
-    """The messages on one key."""
     return [opened(s)[2] for s in samples if s.key == channel.key(name)]
 
 
 def said(team: Team) -> list[Sample]:
-    """Everything that a team of the tests has sent, key by key."""
+    """All messages of a test's team, key by key."""
     return [
         Sample(key, encoded(message), message.stamp_ns, 0, counter)
         for key, sent in team.sent.items()

@@ -19,7 +19,7 @@ def bounds_of(seed, believed=lambda scenario: scenario):
 
 
 def halved(scenario):
-    """Believed a quarter of the variance."""
+    """Claim a quarter of the variance."""
     sensors = [
         msgspec.structs.replace(r.sensor, bearing_sigma=0.5 * r.sensor.bearing_sigma)
         for r in scenario.robots
@@ -38,7 +38,7 @@ def halved(scenario):
 
 
 def nees(robot, believed=lambda scenario: scenario):
-    """Compute the NEES per degree of freedom of the robot's last poses over all runs."""
+    """NEES per degree of freedom of the robot's last poses over all runs."""
     found = [bounds_of(seed, believed)[robot] for seed in SEEDS]
     errors = np.array([each.errors[-1] for each in found])
     covariances = np.array([each.covariances[-1] for each in found])

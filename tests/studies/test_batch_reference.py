@@ -75,7 +75,7 @@ def nees_of(of: Scenario, *, twice: bool) -> BatchReference:
 
 @pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
 def test_the_map_is_consistent_and_a_measurement_used_twice_is_found(twice):
-    """The mutant is found among fewer runs."""
+    """The mutant needs fewer runs."""
     seeds = range(100, 130 if twice else 180)
     runs = [nees_of(scenario(seed), twice=twice) for seed in seeds]
     errors = [run.errors for run in runs if run.errors is not None]

@@ -1,4 +1,4 @@
-"""The batch with the profile's noise: factors of the declared density, persistent errors."""
+"""The batch with the profile's noise: factors of the stated density, persistent errors."""
 
 import msgspec
 import pytest

@@ -1,4 +1,4 @@
-"""The experiments after Downs' thesis: his protocol, and a table of his."""
+"""The experiments after Downs' thesis: his protocol, and one of his tables."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Runs of experiments, and shards that are computed apart."""
+"""Runs of experiments, and shards computed apart."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Ma & Ma's figures on a small set in the UTIAS format, written from a simulated world."""
+"""Ma & Ma's figures on a small set in the UTIAS format, from a simulated world."""
 
 import numpy as np
 import pytest

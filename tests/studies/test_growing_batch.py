@@ -1,4 +1,4 @@
-"""The growing batch MAP: the dense solution that it must equal, and its consistency."""
+"""The growing batch MAP: equal to the dense solution, and consistent."""
 
 import numpy as np
 import pytest

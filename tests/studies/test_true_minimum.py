@@ -1,4 +1,4 @@
-"""A map is asked by its cost whether it lies in the truth's minimum."""
+"""The cost decides whether a map lies in the truth's minimum."""
 
 from dataclasses import replace
 from typing import Any
@@ -55,7 +55,7 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum():
 
 @pytest.mark.parametrize(("bearing_sigma", "lower"), [(30.0, False), (0.02, True)])
 def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
-    """Two places that are equally likely, and one that the measurements exclude."""
+    """Two equally likely places, and one that the measurements exclude."""
     island, across = mirrored(bearing_sigma, OPTIONS)
     stamps = np.array([1000, 2000, 3000, 4000, 5000])
     poses = {

@@ -1,4 +1,4 @@
-"""The thesis' figures: its readings of the measurements, and the steps of its filter."""
+"""The thesis' figures: its readings of the measurements, and its filter's steps."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Fixtures of the system tests: their processes, short scenarios, and one finished launch."""
+"""Fixtures of the system tests: processes, short scenarios, one finished launch."""
 
 import json
 import signal
@@ -21,7 +21,7 @@ if threading.current_thread() is threading.main_thread():
 
 @dataclass(frozen=True)
 class Launched:
-    """A launch that has ended: of which scenario, its JSON, its log, its output."""
+    """A launch that has ended: scenario, JSON, log, output."""
 
     scenario: Path
     exit: int
@@ -32,7 +32,7 @@ class Launched:
 
 @pytest_asyncio.fixture
 async def team(tmp_path: Path) -> AsyncIterator[Processes]:
-    """The processes of a test: ended in any case, and none left."""
+    """The processes of a test, which end with it."""
     processes = Processes(tmp_path)
     try:
         yield processes
@@ -42,7 +42,7 @@ async def team(tmp_path: Path) -> AsyncIterator[Processes]:
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def launched(tmp_path_factory: pytest.TempPathFactory) -> Launched:
-    """One short world, launched as fast as it goes, with a report."""
+    """One short world, launched at full speed, with a report."""
     folder = tmp_path_factory.mktemp("launched")
     processes = Processes(folder)
     scenario = short(folder)

@@ -1,4 +1,4 @@
-"""A bystander on a running team's bus: what has been published so far."""
+"""Observer of a running team's bus."""
 
 import re
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from tests.system.processes import until
 
 
 class Observer:
-    """Counts what is published on some channels; a context manager."""
+    """Count the messages of some channels; a context manager."""
 
     def __init__(self, endpoint: str, channels: Sequence[Channel], team: str = "short") -> None:
         self._bus = ZenohBus(team, endpoint)
@@ -32,21 +32,21 @@ class Observer:
         self._bus.close()
 
     def count(self, channel: Channel, name: str = "") -> int:
-        """How many messages of the channel's key have come by now."""
+        """Number of messages of the channel's key so far."""
         for sample in self._bus.receive():
             self._counts[sample.key] = self._counts.get(sample.key, 0) + 1
         return self._counts.get(channel.key(name), 0)
 
     async def sees(self, number: int, channel: Channel, name: str = "") -> None:
-        """Return when so many messages of the key have come."""
+        """Return after so many messages of the key."""
         what = f"{number} messages of {channel.key(name)}"
         await until(lambda: self.count(channel, name) >= number, what)
 
 
 async def endpoint_of(folder: Path, last: str = "world") -> str:
-    """Where the router of the launch listens whose run's folder this is, once all are started.
+    """Endpoint of the router of the launch in this folder, once all processes are started.
 
-    last: who is started as the last one; a live team has no world.
+    last: the process that starts last; a live team has no world.
     """
     await until((folder / f"{last}.log").exists, f"the {last} is started")
     said = folder / "router.log"

@@ -1,7 +1,6 @@
-"""Real processes under test: started, watched, ended by their ids, and none of them left.
+"""Real processes under test: started, watched, ended by their ids, and none left.
 
-Every process works in its test's own folder, and so does whatever it starts: so what a killed
-parent leaves behind is found by its working folder.
+A process works in its test's own folder, by which the children of a killed parent are found.
 """
 
 import asyncio
@@ -24,7 +23,7 @@ _PROC = Path("/proc")
 
 
 async def until(condition: Callable[[], object], what: str, timeout_s: float = 180.0) -> None:
-    """Return as soon as the condition holds; fail when it does not within the time."""
+    """Return once the condition holds; fail after the time."""
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, f"not within {timeout_s:g} s: {what}"
@@ -32,7 +31,7 @@ async def until(condition: Callable[[], object], what: str, timeout_s: float = 1
 
 
 class Process:
-    """One process that a test started; its output goes into a file."""
+    """One process of a test; its output goes into a file."""
 
     def __init__(self, name: str, process: asyncio.subprocess.Process, output: Path) -> None:
         self.name = name
@@ -55,26 +54,26 @@ class Process:
         self._process.send_signal(number)
 
     async def says(self, text: str) -> None:
-        """Return when it has said this; fail when it ends before."""
+        """Return when it has printed this; fail when it ends before."""
         await until(lambda: text in self.said() or self.exit is not None, f"{self.name}: {text}")
         assert text in self.said(), f"{self.name} ended with {self.exit}:\n{self.said()}"
 
     async def ended(self, timeout_s: float = 300.0) -> int:
-        """Its exit status, once it has ended by itself."""
+        """Its exit status after it ended by itself."""
         try:
             return await asyncio.wait_for(self._process.wait(), timeout_s)
         except TimeoutError:
             pytest.fail(f"{self.name} has not ended within {timeout_s:g} s:\n{self.said()}")
 
     async def end(self) -> None:
-        """End it, whatever it is doing."""
+        """End it at once."""
         if self.exit is None:
             self._process.kill()
         await self._process.wait()
 
 
 class Terminal:
-    """A terminal of 200 columns: `end` is for the process, `shown` is what it has written there."""
+    """A terminal of 200 columns: `end` is for the process, `shown` is the text written there."""
 
     def __init__(self) -> None:
         self._mine, self.end = os.openpty()
@@ -108,7 +107,7 @@ class Processes:
     async def run(
         self, name: str, command: Sequence[str | Path], errors: int = asyncio.subprocess.STDOUT
     ) -> Process:
-        """Start a command; `errors`: where its standard error goes."""
+        """Start a command; `errors`: file of its standard error."""
         output = self.folder / f"{name}.said"
         with output.open("wb") as file:
             process = await asyncio.create_subprocess_exec(
@@ -129,14 +128,14 @@ class Processes:
         return await self.run(name or f"{number}-{arguments[0]}", [*PROGRAM, *arguments])
 
     async def router(self) -> str:
-        """Start a router; its endpoint."""
+        """Start a router; return its endpoint."""
         process = await self.start("router", "--listen", "tcp/127.0.0.1:0")
         await process.says("listening at tcp/127.0.0.1:")
         await process.says("\n")
         return process.said().split()[-1]
 
     def alive(self) -> dict[int, list[str]]:
-        """The command line of every living process of this test, by id."""
+        """Command lines of this test's living processes, by id."""
         found = {}
         for entry in _PROC.iterdir():
             if entry.name.isdigit():
@@ -148,7 +147,7 @@ class Processes:
         return found
 
     async def pid(self, *words: str) -> int:
-        """The id of the one process whose command line has all these words, once it lives."""
+        """Id of the process whose command line has all these words, once it lives."""
 
         found: list[int] = []
 
@@ -169,7 +168,7 @@ class Processes:
             pytest.fail(f"left behind: {self.alive()}")
 
     async def close(self) -> None:
-        """End all by their ids; fail when what they had started outlives them."""
+        """End all by their ids; fail when their children outlive them."""
         for process in reversed(self._started):
             await process.end()
         try:

@@ -1,4 +1,4 @@
-"""Short worlds for the system tests, and what a team in one process makes of them."""
+"""Short worlds for the system tests, and their results in memory."""
 
 import hashlib
 from functools import cache
@@ -20,19 +20,18 @@ def short(folder: Path, base: str = "thesis", steps: int = STEPS, more: str = ""
 
 
 def final_map(samples: "list[tuple[str, bytes]]") -> bytes:
-    """The bytes of the one final map among (key, payload)."""
+    """Bytes of the one final map among (key, payload)."""
     (payload,) = [payload for key, payload in samples if key == FINAL_MAP.key()]
     return payload
 
 
 def map_in_memory(scenario: Path, seed: int = 1) -> bytes:
-    """The bytes of the final map that the same nodes send on the bus in memory."""
+    """Bytes of the final map that the same nodes send in memory."""
     return _map_of(dumps(with_options(load(scenario), seed=seed)))
 
 
 @cache
 def _map_of(scenario: str) -> bytes:
-    """Several tests launch the same short world."""
     resolved = loads(scenario)
     samples = run_team(resolved, streams_of(resolved))
     return final_map([(sample.key, sample.payload) for sample in samples])

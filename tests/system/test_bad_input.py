@@ -1,6 +1,6 @@
-"""Mistakes of a user that a process meets: one clear message, exit status 2, nothing left running.
+"""Wrong input that a process detects: one clear message, exit status 2, no process left.
 
-Mistakes that a command refuses by itself are in `tests/sim/cli/test_wrong_use.py`.
+For single commands see `tests/sim/cli/test_wrong_use.py`.
 """
 
 import asyncio
@@ -19,12 +19,11 @@ from tests.system.scenarios import short
 
 
 def told(process: Process) -> str:
-    """The one message of a command that was used wrongly."""
     return message_in(process.said(), process.exit)
 
 
 async def refused(team: Processes, *arguments: str | Path) -> str:
-    """Run a command that can not do what it is asked for; its message."""
+    """Run a command that must fail; return its message."""
     process = await team.start(*arguments)
     await process.ended()
     await team.none_left(0.0)

@@ -1,4 +1,4 @@
-"""A system that is big enough for BLAS has the same bits in every process."""
+"""A system large enough for BLAS has the same bits in every process."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""A team whose processes are started by hand: their output and their refusals."""
+"""Processes started by hand: their output and refusals."""
 
 import signal
 

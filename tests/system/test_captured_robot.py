@@ -1,7 +1,7 @@
-"""A robot whose valid certificate is in the hands of an attacker harms nobody but itself.
+"""An attacker with a robot's valid certificate harms that robot alone.
 
-Attacks of `../shared/repro` on a whole team of processes with keys: the map stays that of a team
-to which nothing happens, no process ends, and the logs stay small.
+Attacks on a whole team of processes with keys: the map stays that of an undisturbed team, no
+process ends, and the logs stay small.
 """
 
 import asyncio
@@ -50,7 +50,7 @@ def flood_unknown_keys(bus: ZenohBus) -> None:
 
 
 def flood_garbage(bus: ZenohBus) -> None:
-    """Publish payloads that are no message on a key of the robot."""
+    """Publish invalid payloads on a key of the robot."""
     for count in range(FLOOD):
         bus.publish_raw(Sample("robot/r2/status", b"x", 0, time.time_ns(), count))
 

@@ -27,7 +27,7 @@ def services():
 
 @pytest.fixture
 def names(services):
-    """The services' namespaces; skips where this machine does not permit them."""
+    """The services' namespaces; skips where they are not permitted."""
     if shutil.which("ip") is None or os.geteuid():
         pytest.skip("network namespaces need iproute2 and root")
     with ExitStack() as stack:

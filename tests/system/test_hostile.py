@@ -1,4 +1,4 @@
-"""Hostile traffic through real processes; `tests/trials/hostile.py` is the storm."""
+"""Hostile traffic through real processes; `tests/trials/hostile.py` has more."""
 
 import time
 from itertools import islice

@@ -1,4 +1,4 @@
-"""The program as it is installed from its wheel."""
+"""The program as installed from its wheel."""
 
 import shutil
 import subprocess
@@ -30,10 +30,7 @@ async def done(team: Processes, name: str, command: Sequence[object]) -> str:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """The wheel, built from a copy with the build tools at hand, so that nothing is fetched.
-
-    It is built without the core, which takes most of the time: the tests use one that was built.
-    """
+    """The wheel, built from a copy without network, and without the core, as already built."""
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -72,7 +69,7 @@ def test_the_wheel_holds_one_package_and_nothing_else(wheel):
 
 
 async def test_the_wheel_runs_in_an_environment_of_its_own(team, wheel):
-    """Dependencies and core are lent by the environment of the tests; nothing is fetched."""
+    """Dependencies and core are those of the tests' environment; nothing is fetched."""
     fresh = team.folder / "fresh"
     await done(team, "venv", [sys.executable, "-m", "venv", "--without-pip", fresh])
     python = fresh / "bin" / "python"

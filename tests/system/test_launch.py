@@ -1,4 +1,4 @@
-"""`teamslam launch`: one command, and a whole team of processes maps a place and ends by itself."""
+"""`teamslam launch` starts a team of processes that maps a place and ends by itself."""
 
 import json
 import re
@@ -97,7 +97,7 @@ def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(launche
 
 
 async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, object]:
-    """Launch at full speed without a report and views; the JSON."""
+    """Launch at full speed without a report and views; return the JSON."""
     process = await team.start(
         *("launch", scenario, "--speed", "max", "--no-report", "--no-views", "--output", "run"),
         *("--json", "result.json", *options),
@@ -120,7 +120,7 @@ async def test_a_comparison_pair_ends_with_the_bytes_of_a_team_in_memory(team):
 
 @dataclass(frozen=True)
 class Watched:
-    """A launch in a terminal: what was seen there, and its JSON."""
+    """A launch in a terminal: its screen, and its JSON."""
 
     shown: str
     result: dict[str, Any]
@@ -128,9 +128,9 @@ class Watched:
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
-    """The short world once more, at 20 × real time, in a terminal, by the installed command.
+    """The short world at 20 × real time, in a terminal, by the installed command.
 
-    In the folder are a user's own packages and modules with the names of ours.
+    The folder has a user's own packages and modules with our names.
     """
     team = Processes(tmp_path_factory.mktemp("watched"))
     for package in ("team", "central", "sim", "teamslam"):

@@ -1,4 +1,4 @@
-"""A live team: the page's example brings two robots onto it, through deaths and a cut link."""
+"""A live team: two robots on the page's example, through deaths and a cut link."""
 
 import asyncio
 import json
@@ -26,7 +26,7 @@ PAUSE = "0.05"
 
 
 def recorded(folder: Path) -> bytes:
-    """Two robots' tables in `data`; the final map's bytes of a run with them as a data set."""
+    """Two robots' tables in `data`; bytes of the final map of a run on them as a data set."""
     simulated = with_options(load(short(folder)), robots=2)
     write_folder(streams_of(simulated), folder / "data")
     for tables in (folder / "data").glob("r*"):

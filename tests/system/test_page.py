@@ -1,6 +1,6 @@
-"""The page in a real browser: a recorded log, and a team while it runs.
+"""The page in a real browser: a recorded log, and a running team.
 
-Skipped where there is no Chromium; `make test` installs one where it may (tests/get-chromium).
+Skipped without a Chromium; `make test` installs one where it may (tests/get-chromium).
 """
 
 import asyncio
@@ -48,7 +48,7 @@ def url(tmp_path_factory):
 
 
 def open_page(browser, url):
-    """Open the page on a desktop, without errors of before."""
+    """Open the page on a desktop, without earlier errors."""
     browser.errors.clear()
     browser.size(1280, 800)
     browser.open(url)
@@ -200,7 +200,7 @@ def test_an_event_of_a_robot_is_where_the_robot_was(page):
 
 @pytest.fixture(scope="module")
 def changed_url(tmp_path_factory):
-    """The address of a log whose final map has changed since a saved map, in an arbitrary frame."""
+    """Address of a log whose final map differs from a saved map, in an arbitrary frame."""
     path = tmp_path_factory.mktemp("changed") / "log.mcap"
     changes = (
         m.LandmarkChange(landmark=1, state="unchanged"),

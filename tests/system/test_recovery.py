@@ -1,4 +1,4 @@
-"""Lost messages come back: the map is that of a run without losses."""
+"""With lost messages the map is that of a run without losses."""
 
 import signal
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Team:
     log: Path
 
     async def ends_well(self, status: int = 0) -> None:
-        """Every process ends with 0, the robots that are listed by now included.
+        """Check that every process ends with 0, listed robots included.
 
         status: 1 where the final map is without a robot.
         """
@@ -40,7 +40,7 @@ class Team:
 
 
 async def assembled(team: Processes, speed: str, r1_connects: str = "") -> Team:
-    """Recorder, centre, robots and world around a router; r1 may reach it by another way."""
+    """Recorder, centre, robots and world around a router; `r1_connects`: r1's own way to it."""
     scenario = short(team.folder)
     endpoint = await team.router()
     there = ["--connect", endpoint]

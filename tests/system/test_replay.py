@@ -1,4 +1,4 @@
-"""`teamslam replay`: a log's traffic again, into a program that is not ours."""
+"""`teamslam replay`: a log's traffic again, to an independent program."""
 
 import json
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
 
 
 def recorded(launched: Launched) -> Arrived:
-    """The expected samples: each message of the log, in its order."""
+    """The expected samples: the log's messages in order."""
     return [
         (
             (key := f"team/short/{sample.key}"),

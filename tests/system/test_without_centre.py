@@ -1,4 +1,4 @@
-"""A team without a centre as processes: every robot ends with the map of a central run."""
+"""Processes without a centre: every robot ends with the map of a central run."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The product without what is there for comparison: folders are taken out, and it still works."""
+"""The product works without the folders that are there for comparison."""
 
 import os
 import shutil

@@ -1,13 +1,13 @@
 """Storms on a team without a centre: does every peer end with the central run's map, to the bit?
 
-`python -m tests.trials.agreement [CASE…] [--utias FOLDER] [--json FILE]`, in memory. Each case runs
-once with a centre; then as peers, three ways: with a centre that is one more peer, without, and
-with one that dies half way and comes back at the end. Meanwhile 20 % of what robots say to each
-other is lost, 10 % comes twice, up to 2 s late, so out of order; partitions by chance; 30 deaths,
-each of which may tear the end of a disk; the second robot joins at half time, the last one only
-ever meets the first. CASE is a scenario, `eight`, or `utias-6`; with `@100` behind it so many steps
-or seconds of it; with `/withdrawn` an operator withdraws the second robot half way, and only the
-first one hears it. --json FILE keeps each row as it comes; a row that is in it is not run again.
+`python -m tests.trials.agreement [CASE…] [--utias FOLDER] [--json FILE]`, in memory. Each case
+runs with a centre, then as peers in three ways: with a centre as one more peer, without, and with
+one that dies half way and returns at the end. Between robots 20 % of the messages are lost, 10 %
+come twice, up to 2 s late; there are random partitions and 30 deaths, each of which may tear the
+end of a disk; the second robot joins at half time, the last one only meets the first. CASE is a
+scenario, `eight`, or `utias-6`; `@100` limits it to so many steps or seconds; with `/withdrawn` an
+operator withdraws the second robot half way, and only the first receives it. --json FILE stores
+each row; stored rows are not run again.
 """
 
 import argparse
@@ -50,7 +50,7 @@ WAYS = ("with", "without", "dies")
 
 
 def scenario_of(case: str, utias: Path) -> Scenario:
-    """A case by its name; with `@100` behind it so many steps, or seconds of a data set."""
+    """A case by its name; `@100` limits it to so many steps, or seconds of a data set."""
     case, _, length = case.partition("@")
     if length:
         whole = scenario_of(case, utias)
@@ -67,7 +67,7 @@ def scenario_of(case: str, utias: Path) -> Scenario:
 
 @dataclass
 class Storm:
-    """The events of a run: deaths, a late joiner, a centre, an order; `reach` for the air."""
+    """Events of a run: deaths, a late joiner, a centre, an order; `reach` for the air."""
 
     scenario: Scenario
     way: str
@@ -88,7 +88,7 @@ class Storm:
         self.due = sorted(times)
 
     def reach(self, one: str, other: str, now_ns: int) -> bool:
-        """The last robot meets the first one only; else, until the end, by chance."""
+        """The last robot meets the first only; else random until the end."""
         pair = sorted((one, other))
         loner = self.names[-1]
         if len(self.names) > 2 and loner in pair and self.names[0] not in pair:
@@ -100,12 +100,10 @@ class Storm:
         return hashlib.blake2b(named, digest_size=1).digest()[0] < 100
 
     def begin(self, team: PeerTeam) -> None:
-        """The late joiner is not there yet."""
         if self.late:
             del team.seats[self.late]
 
     def step(self, team: PeerTeam) -> None:
-        """Once a round."""
         now_ns = team.now_ns
         if self.late and self.late not in team.seats and now_ns >= self.half_ns:
             team.restart(self._config(self.late))
@@ -126,8 +124,8 @@ class Storm:
                 self._order(team)
 
     def _order(self, team: PeerTeam) -> None:
-        """The first robot hears the operator's order, and again from the router when it is back
-        from a death, which may have torn the order off its disk before anyone else had it.
+        """Deliver the operator's order to the first robot, and again by the router after a death,
+        which may have torn it off the disk.
         """
         for order in self.disks.get("order", ()):
             team.hear(self.names[0], Sample(order.key, order.payload, 0, 0, 0))
@@ -148,14 +146,13 @@ class Storm:
 
 
 def order_of(robot: str) -> Member:
-    """An operator's order."""
     order = build.withdrawal(robot=robot, reason=REASON)
     return Member(ch.ORDER.key(robot), encoded(order), order)
 
 
 def central_map(scenario: Scenario, samples: list[Sample], order: Member | None) -> bytes:
-    """The final map of a central run; with an order, of the same set with it: the streams' end
-    comes last, since a centre does not wait for what a withdrawn robot has not sent yet.
+    """Final map of a central run; an order precedes the streams' end, since a centre does not wait
+    for a withdrawn robot.
     """
     if order is None:
         return encoded(final_map(samples))
@@ -171,14 +168,13 @@ def central_map(scenario: Scenario, samples: list[Sample], order: Member | None)
 
 
 def span_of(streams: WorldStreams) -> tuple[int, int]:
-    """When measurements begin and end."""
     stamps = [each.stamps_ns for each in streams.streams if len(each.stamps_ns)]
     return min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)
 
 
 def outcome(case: str, way: str, scenario: Scenario, expected: bytes, *, withdrawn: bool,
             submaps: set[bytes]) -> dict[str, object]:  # fmt: skip
-    """One storm: which peers have the central run's bytes, and what happened to them."""
+    """Run one storm: peers with the central run's bytes, and counts of the events."""
     streams = streams_of(scenario)
     begin_ns, end_ns = span_of(streams)
     storm = Storm(scenario, way, begin_ns, end_ns, 1, withdrawn)
@@ -219,7 +215,6 @@ def outcome(case: str, way: str, scenario: Scenario, expected: bytes, *, withdra
 
 
 def storms(case: str, ways: list[str], utias: Path) -> Iterator[dict[str, object]]:
-    """All storms of one case."""
     name, _, kind = case.partition("/")
     scenario = msgspec.structs.replace(scenario_of(name, utias))
     samples = list(run_team(scenario, streams_of(scenario)))
@@ -233,7 +228,7 @@ def storms(case: str, ways: list[str], utias: Path) -> Iterator[dict[str, object
 
 
 def main() -> int:
-    """Run, print, 1 where anyone differs."""
+    """Run and print; return 1 where any map differs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cases", nargs="*", default=["thesis", "random-10", "eight"])
     parser.add_argument("--ways", nargs="*", default=list(WAYS))

@@ -1,8 +1,8 @@
 """Merge three robots' object maps by shape and class: SlideSLAM's forest, parking and indoor sets.
 
-Each file has an object a line, `class x y z`, in its robot's own frame. A map is one submap without
-odometry, its objects unnamed landmarks with independent errors of --sigma [m]. Printed for each of
-the six ordered pairs: accepted or the failed test, and the figures; and the loop 0-1-2-0.
+Each file has an object a line, `class x y z`, in its robot's frame. A map is one submap without
+odometry, its objects unnamed landmarks with independent errors of --sigma [m]. Prints for each
+ordered pair: accepted or the failed test, and the figures; and the loop 0-1-2-0.
 
     python -m tests.trials.class_maps ../shared/benchmarks/classes [--without-classes]
 """
@@ -37,7 +37,7 @@ STEPS = 100
 
 
 def contribution(rows: np.ndarray, robot: int, sigma: float, classes: np.ndarray) -> Contribution:
-    """Objects as a robot's only submap; classes: those that the detector tells apart."""
+    """Objects as a robot's only submap; classes: those that the detector distinguishes."""
     count = len(rows)
     mean = np.concatenate((np.zeros(3), rows[:, 1:3].ravel()))
     variances = np.concatenate((np.full(3, 1e-2), np.full(2 * count, sigma**2)))
@@ -75,10 +75,10 @@ def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[
 def fit_motion(one: IslandView, two: IslandView, closure: Closure) -> np.ndarray:
     """Motion of the first map's landmarks onto the second's, by maximum likelihood.
 
-    A map may have an object several times, and a pair of two such parts is off by their distance.
-    The partner of a landmark is therefore unknown: one of the second map's, each in Student's t of
-    TAILS degrees of freedom about it, or none of them, with the density of landmarks. Solved by
-    expectation maximisation (Granger and Pennec 2002, ECCV; Lange, Little and Taylor 1989).
+    A map may have an object several times. The partner of a landmark is therefore unknown: one of
+    the second map's, in Student's t of TAILS degrees of freedom about it, or none, with the
+    density of landmarks. Expectation maximisation (Granger and Pennec 2002, ECCV; Lange, Little
+    and Taylor 1989).
     """
     a, b = one.joint.mean, two.joint.mean
     first, second = np.array([(pair.first, pair.second) for pair in closure.pairs]).T
@@ -104,7 +104,6 @@ def loop_error(found: dict[tuple[int, int], Closure]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sigma", type=float, default=0.07)

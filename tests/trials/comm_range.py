@@ -1,10 +1,9 @@
 """The gain by communication: error of each robot's own map and pose, by the range of its radio.
 
 `python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]`: `random-10`
-without a centre, in memory, with radios that reach 5, 10, 20, 40 m and everyone. Against the truth,
-over team time: the error of the position that each robot believes (`team/pose`; its own pose where
-it has none yet), that of the landmarks of its own map of the team, and how many these are.
-Without alignment: the team's frame is that of the known initial poses.
+without a centre, in memory, with radios of 5, 10, 20, 40 m and unlimited. Over team time, against
+the truth: the error of each robot's position (`team/pose`, or else its own pose), the error and
+number of the landmarks of its team map. No alignment: known initial poses give the frame.
 """
 
 import argparse
@@ -126,7 +125,6 @@ def drawn(found: dict[str, Rows], path: Path) -> None:
 
 
 def main() -> int:
-    """Measure, print a table, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--picture", type=Path)

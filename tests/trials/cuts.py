@@ -2,13 +2,12 @@
 
     python -m tests.trials.cuts --runs 10 --cuts 5 [--longest 12] [--json FILE]
 
-Needs root and `ip` (Linux). The router, the world, the recorder, the centre and the robots hang on
-one bridge; a cut takes one process's link down for a while, for less or for more than the lease of
-a connection. Each run is a short world; its final map is compared byte by byte with that of the
-same team in memory, and its log's content with the streams' own last counts. --json FILE keeps what
-each run was, as it ends; called again with this file, only runs that are not in it are made. Ends
-with 1 unless every process of every run ended with 0, with this map, and without a hole that
-`teamslam log check` does not name.
+Needs root and `ip` (Linux). Router, world, recorder, centre and robots hang on one bridge; a cut
+takes one process's link down, for less or more than a connection's lease. Each run is a short
+world; its final map is compared byte by byte with that of the same team in memory, its log with
+the streams' last counts. --json FILE stores each run; only missing runs are made. Ends with 1
+unless every process ended with 0, with this map, and without a hole that `teamslam log check`
+misses.
 """
 
 import argparse
@@ -37,7 +36,7 @@ Commands = Mapping[str, Sequence[str]]
 
 @dataclass
 class Run:
-    """The result of one run; kills and cuts: at [s after the start], who, for how long [s]."""
+    """Result of one run; kills and cuts: time [s after the start], node, duration [s]."""
 
     number: int
     kills: list[tuple[float, str]] = field(default_factory=list)
@@ -50,7 +49,7 @@ class Run:
 
     @property
     def good(self) -> bool:
-        """As if nothing had happened."""
+        """Whether the run equals an undisturbed one."""
         unnamed = bool(self.lacks) and not self.check
         return self.equal and not unnamed and not any(self.exits.values())
 
@@ -71,7 +70,7 @@ class Run:
 
 
 class Team:
-    """The processes of a run, each in its namespace; by node its command and its link's name.
+    """Processes of a run, each in its namespace; command and link by node.
 
     A driver starts when its robot is connected.
     """
@@ -83,7 +82,6 @@ class Team:
         self.started: dict[str, subprocess.Popen[bytes]] = {}
 
     def begin(self) -> None:
-        """Start all processes."""
         self.start("router")
         await_text(self.folder / "run" / "router.log", "listening at")
         drivers = [node for node in self.told if node.startswith("driver-")]
@@ -100,7 +98,7 @@ class Team:
             self.start(node)
 
     def start(self, node: str) -> None:
-        """Start it, or start it again."""
+        """Start or restart a node."""
         with (self.folder / "run" / f"{node}.log").open("ab") as said:
             self.started[node] = subprocess.Popen(
                 ["ip", "netns", "exec", self.names[link_of(node)], *self.told[node]],
@@ -109,7 +107,7 @@ class Team:
             )  # fmt: skip
 
     def restart(self, node: str) -> None:
-        """Kill it and start it again; `ip netns exec` has become the process itself."""
+        """Kill a node and start it again; `ip netns exec` has become the process itself."""
         self.started[node].kill()
         self.started[node].wait()
         self.start(node)
@@ -118,7 +116,7 @@ class Team:
         return self.started[node].poll() is None
 
     def stop(self) -> dict[str, int]:
-        """End what is left; how each had ended by itself, 99 where it had not."""
+        """Stop the rest; return each exit status, 99 for those still running."""
         found = {node: process.poll() for node, process in self.started.items()}
         for node, process in self.started.items():
             if process.poll() is None:
@@ -129,12 +127,12 @@ class Team:
 
 
 def link_of(node: str) -> str:
-    """The name of a process's link at the bridge: 15 letters at most."""
+    """Name of a process's link at the bridge: 15 letters at most."""
     return node.replace("driver", "d")
 
 
 def disturb(run: Run, team: Team, mortal: Sequence[str], options: argparse.Namespace) -> None:
-    """Kill and cut at random moments; return when all have ended or time is over."""
+    """Kill and cut at random times, until all have ended or time is over."""
     rng = random.Random(f"{options.seed} {run.number}")
     moments = [(rng.uniform(0.0, options.span), "kill") for _ in range(options.kills)]
     moments += [(rng.uniform(0.0, options.span), "cut") for _ in range(options.cuts)]
@@ -173,7 +171,7 @@ def play(
     options: argparse.Namespace,
     mortal: Sequence[str] = (),
 ) -> Run:
-    """A team from its first process to its final map; mortal: the nodes that may be killed."""
+    """Run a team to its final map; mortal: nodes that may be killed."""
     run = Run(number)
     (folder / "run").mkdir()
     with network([link_of(node) for node in told]) as names:
@@ -198,7 +196,7 @@ def play(
 
 
 def options_of(description: str, kills: int) -> argparse.ArgumentParser:
-    """The options that trials with cut links share."""
+    """Common options of trials with cut links."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--kills", type=int, default=kills, help="in each run")
@@ -212,7 +210,7 @@ def options_of(description: str, kills: int) -> argparse.ArgumentParser:
 
 
 def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> int:
-    """Make the runs that the file does not have, print them and the totals; the exit status."""
+    """Make the missing runs, print them and the totals; return the exit status."""
     runs = []
     if options.json and options.json.exists():
         runs = [Run(**row) for row in json.loads(options.json.read_text())]

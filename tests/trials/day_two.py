@@ -2,13 +2,13 @@
 
     python -m tests.trials.day_two [--starts 20] [--set UTIAS_1.zip] [--json FILE]
 
-A map is saved of a first day in memory: a run of `thesis-b`, a new one for every five starts, or
-with --set the first 250 s of this UTIAS set. Then the team begins at unknown poses, each start at
-another time of a second day (of the set's later part), and runs for 30 s. Each robot is judged by
-its first pose in the frame of the map: the time since it had seen two landmarks of the map, the
-error against the truth, and its NEES of three degrees of freedom. A pose beyond six standard
-deviations is a wrong placement. Ends with 1 if there is one, if a robot that has seen two landmarks
-is not placed within 10 s, or if fewer than 85 % are within two standard deviations.
+The map is of a first day in memory: a run of `thesis-b`, a new one for every five starts, or with
+--set the first 250 s of this UTIAS set. The team begins at unknown poses at various times of a
+second day (the set's later part), and runs for 30 s. For each robot's first pose in the map's
+frame: the time since it had seen two landmarks of the map, the error, and the NEES (three degrees
+of freedom); beyond six standard deviations it is a wrong placement. Ends with 1 if there is one,
+if a robot that has seen two landmarks is not placed within 10 s, or if fewer than 85 % are within
+two standard deviations.
 """
 
 import argparse
@@ -124,7 +124,6 @@ def _error(stream: RobotStream, pose: m.PoseEstimate) -> np.ndarray:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Summarise all starts."""
     placed = [row for row in rows if row["placed"]]
     of = {name: np.array([row[name] for row in placed]) for name in placed[0] if name != "robot"}
     return {

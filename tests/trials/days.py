@@ -2,9 +2,8 @@
 
     python -m tests.trials.days --days 30 --seed 1 --picture docs/maps_days.png
 
-Each day a team without known starts loads the map of the day before, and its final map is saved
-for the next one. Each landmark changes overnight with a probability of 5 %: it is moved by 2 m, or
-it is gone and another one is new. In memory.
+Each day a team without known starts loads the map of the day before and saves its own. Overnight 5
+% of the landmarks change: moved by 2 m, or gone and replaced by a new one. In memory.
 """
 
 import argparse
@@ -36,9 +35,9 @@ AWAY = (-900.0, -900.0)
 class Day(NamedTuple):
     """Figures of a day.
 
-    changed: landmarks whose change was found or missed on this day. missed: moved or new, observed,
-    and not reported. false: reported as moved or gone though they are not. The errors are those of
-    the landmarks whose changes have been observed.
+    changed: landmarks whose change was found or missed. missed: moved or new, observed, not
+    reported. false: wrongly reported as moved or gone. Errors are of landmarks whose changes were
+    observed.
     """
 
     landmarks: int
@@ -53,7 +52,7 @@ class Day(NamedTuple):
 
 
 class Site:
-    """The true landmarks by number, from 1; one that is gone is AWAY."""
+    """True landmarks by number, from 1; one that is gone is AWAY."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(seed)
@@ -78,7 +77,6 @@ class Site:
 
 
 def run_days(count: int, seed: int) -> Iterator[Day]:
-    """Run one day after the other."""
     site, saved = Site(seed), None
     pending: dict[int, str] = {}
     for day in range(count):
@@ -162,7 +160,6 @@ def draw(days: list[Day], path: Path) -> None:
 
 
 def main() -> None:
-    """Print a row for each day, and the totals."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--days", type=int, default=30)
     parser.add_argument("--seed", type=int, default=1)

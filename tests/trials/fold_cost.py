@@ -1,10 +1,9 @@
 """The cost of a peer's fold: CPU of a robot that folds always, on request, or at the end only.
 
-`python -m tests.trials.fold_cost [SCENARIO] [--steps N]`, in memory, everyone in reach. The first
-robot folds as the set grows; the second when it is asked to, once a third of the way and once two
-thirds; the others when everything is there. Of each, CPU of everything that it does, of its fold
-until the streams end, and of its fold in all. Then what a small computer has left to do: keep the
-set, say what it has, answer. A robot that never folds takes its whole time less that of its fold.
+`python -m tests.trials.fold_cost [SCENARIO] [--steps N]`, in memory, all in reach. The first robot
+folds as the set grows; the second on request, after one and two thirds; the others at the end. For
+each: CPU time in total, of its fold until the streams end, and of its fold in all. A robot that
+never folds needs the total less its fold.
 """
 
 import argparse
@@ -32,14 +31,13 @@ T = TypeVar("T")
 
 
 class Clock:
-    """CPU seconds of what is done in it; what is done inside of itself counts once."""
+    """CPU seconds of the work done in it; nested work counts once."""
 
     def __init__(self) -> None:
         self.s = 0.0
         self._depth = 0
 
     def of(self, work: Callable[[], T]) -> T:
-        """Do it."""
         self._depth += 1
         began = time.process_time()
         try:
@@ -51,7 +49,7 @@ class Clock:
 
 
 class TimedFold(PeerFold):
-    """A fold whose CPU is counted."""
+    """A fold whose CPU time is counted."""
 
     clock: Clock
 
@@ -59,12 +57,11 @@ class TimedFold(PeerFold):
         return self.clock.of(lambda: super(TimedFold, self)._give(message))
 
     def refresh(self) -> list[Outgoing]:
-        """As the fold's."""
         return self.clock.of(lambda: super(TimedFold, self).refresh())
 
 
 class Timed(PeerRobot):
-    """A peer whose CPU is counted: all, of its fold, and of its fold when the streams end."""
+    """A peer whose CPU time is counted: all, its fold, and its fold when the streams end."""
 
     def __init__(self, scenario: Scenario, config: RobotConfig, when: FoldWhen) -> None:
         names = [each.id for each in scenario.robots]
@@ -74,13 +71,11 @@ class Timed(PeerRobot):
         self.fold.clock = Clock()  # type: ignore[attr-defined]
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
-        """As a peer's."""
         if isinstance(message, m.End):
             self.driving_s = self.fold.clock.s  # type: ignore[attr-defined]
         return self.whole.of(lambda: super(Timed, self).handle_sample(message, sample))
 
     def tick(self, now_s: float) -> list[Outgoing]:
-        """As a peer's."""
         return self.whole.of(lambda: super(Timed, self).tick(now_s))
 
 
@@ -122,7 +117,6 @@ def measured(name: str, steps: int) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenario", nargs="?", default="random-10")
     parser.add_argument("--steps", type=int, default=150)

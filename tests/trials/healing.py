@@ -1,10 +1,9 @@
 """The effort until all robots have all data again, after two halves of a team have been apart.
 
 `python -m tests.trials.healing [--teams 2 5] [--topologies all line]`: the peers of
-`benchmarks.peers`, which close their submaps one after the other, each one every 10 s; two
-halves are apart from 100 s to 200 s. From the healing on by steps of 0.05 s: the seconds until
-everyone has all that there was when it healed, and per robot what was said and heard meanwhile (new
-submaps in it), and what of that it lacked. Links have no limit of bytes here.
+`benchmarks.peers`, each with a submap every 10 s, one after the other; two halves are apart from
+100 s to 200 s. From the healing on, by steps of 0.05 s: the seconds until all have everything that
+existed then, and per robot the bytes sent and received, and the missing ones. Links have no limit.
 """
 
 import argparse
@@ -24,8 +23,7 @@ WITHIN_S = 600
 def healed(topology: str, robots: int) -> dict[str, float]:
     """The effort after two halves were apart, until all robots have all data of that time.
 
-    seconds: by the last of them; said_kb, heard_kb: of each robot meanwhile, in the mean, of which
-    news_kb are what each lacked when it healed.
+    seconds: of the last robot; said_kb, heard_kb: mean per robot, of which news_kb were missing.
     """
     team = Team(topology, robots)
     whole, half = team.air.reach, robots / 2
@@ -69,7 +67,7 @@ def healed(topology: str, robots: int) -> dict[str, float]:
 
 
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
-    """Measure and print; 1 where they did not agree."""
+    """Measure and print; return 1 where they did not agree."""
     options = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))
     wholes = [each for each in TOPOLOGIES if each != "partition"]

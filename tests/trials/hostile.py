@@ -3,15 +3,12 @@
     python -m tests.trials.hostile [--mutated 1000000] [--messages 100000] [--through 20000]
                                  [--keys] [--json FILE]
 
-Door: mutated payloads of every message are opened as a receiver opens them; what raises anything
-but `WireError` has escaped. Nodes: a team is launched as real processes, and a stranger publishes
-valid messages that no honest node would send, and mutated ones, on everybody's keys while it runs.
-Without keys no process may die and nothing may be set aside as a fault; what a stranger can do to
-the map then is in docs/decisions/09-keys-and-access-control.md, and orders and ends of the run are
-not among the messages.
-With --keys the stranger has a certificate of the team in the name of a robot that is not in the
-scenario, says everything, and the final map must be that of the same team in memory. Ends with 1
-if anything of this does not hold.
+Door: mutated payloads of every message are decoded; any error but `WireError` has escaped. Nodes:
+a stranger publishes valid dishonest messages and mutated ones on all keys of a team of processes.
+Without keys no process may die and no fault be set aside; orders and ends of the run are left out,
+and docs/decisions/09-keys-and-access-control.md states the effects on the map. With --keys the
+stranger has the team's certificate of a robot outside the scenario and sends everything; the final
+map must be that of the same team in memory. Ends with 1 if any of this does not hold.
 """
 
 import argparse
@@ -45,7 +42,7 @@ SUBMAPS = 1_500
 
 
 def door(count: int, seed: int) -> tuple[int, int, list[str]]:
-    """How many mutated payloads were refused, how many passed, and what escaped."""
+    """Numbers of mutated payloads refused and accepted, and the escaped errors."""
     rng = random.Random(seed)
     refused = passed = 0
     escaped: list[str] = []
@@ -66,7 +63,7 @@ def door(count: int, seed: int) -> tuple[int, int, list[str]]:
 
 
 def storm(bus: ZenohBus, options: argparse.Namespace, launch: subprocess.Popen[bytes]) -> Counter:
-    """Publish until everything is said or the run is over; how many of each channel."""
+    """Publish until everything is sent or the run is over; return the count of each channel."""
     rng = random.Random(options.seed)
     sent: Counter[str] = Counter()
     mutants = options.through
@@ -96,7 +93,7 @@ def storm(bus: ZenohBus, options: argparse.Namespace, launch: subprocess.Popen[b
 
 
 def nodes(options: argparse.Namespace) -> dict[str, object]:
-    """A team with a stranger in it: what became of it."""
+    """Run a team with a stranger in it; return the outcome."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place).resolve()
         scenario = shortened(folder, options.steps)

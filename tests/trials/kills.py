@@ -8,14 +8,12 @@
     python -m tests.trials.kills --runs 10 --without-centre --what robot,router,world
 
 --acceptance: with keys, each run with three kills and one stop of 12 s, of any process, beside two
-busy loops. Each run is a short world; with --keys behind certificates. Who is stopped for ever
-stays so until `launch --end-silent` ends it. The final map, --without-centre every robot's, is
-compared, byte by byte, with that of the same team in memory, where nobody dies, the log's content
-with the streams' own last counts; with --verify each log is computed again. A row per run, and a
-summary. --json FILE keeps what each run was, as it ends; called again with this file, only runs
-that are not in it are made. Ends with 1 unless every run ended with 0, with this map, left no
-process, and no hole in its log that `teamslam log check` does not name. Counted, too: the processes
-that ended by themselves with an error, as for silence, though somebody only stood still.
+busy loops. Each run is a short world. A process stopped for ever stays so until `launch
+--end-silent` ends it. The final map (--without-centre every robot's) is compared byte by byte with
+that of an undisturbed team in memory, the log with the streams' last counts; --verify recomputes
+each log. --json FILE stores each run; only missing runs are made. Ends with 1 unless every run
+ended with 0, with this map, left no process, and no hole in its log that `teamslam log check`
+misses. Processes that ended by themselves with an error, as for silence, are counted too.
 """
 
 import argparse
@@ -54,7 +52,7 @@ GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
 
 @dataclass
 class Run:
-    """The result of one run; hit: who was killed or stopped, and when [s after the launch]."""
+    """Result of one run; hit: node killed or stopped, and when [s after the launch]."""
 
     number: int
     hit: list[tuple[float, str]] = field(default_factory=list)
@@ -71,7 +69,7 @@ class Run:
 
     @property
     def good(self) -> bool:
-        """As if nothing had happened."""
+        """Whether the run equals an undisturbed one."""
         unnamed = bool(self.lacks) and not self.check
         sound = self.verified in (None, True)
         ended = self.left or self.gave_up
@@ -79,7 +77,7 @@ class Run:
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
-    """The command lines of a run's processes but for `launch`, by pid."""
+    """Command lines of a run's processes but for `launch`, by pid."""
     found = {}
     for entry in PROC.iterdir():
         if entry.name.isdigit() and int(entry.name) != launch:
@@ -137,7 +135,7 @@ def shortened(folder: Path, steps: int) -> Path:
 
 
 def expected_of(scenario: Scenario) -> bytes:
-    """The final map's bytes of a team to which nothing happens."""
+    """The final map's bytes of an undisturbed team."""
     samples = run_team(scenario, streams_of(scenario))
     (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
     return expected
@@ -233,7 +231,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
 
 
 def await_start(folder: Path, launch: subprocess.Popen[bytes], node: str) -> None:
-    """Return when a node has connected: soon the world publishes."""
+    """Return when a node has connected; the world publishes soon after."""
     end = time.monotonic() + 120.0
     said = folder / "run" / f"{node}.log"
     while time.monotonic() < end and launch.poll() is None:
@@ -267,7 +265,7 @@ def hit(
 
 
 def kept_in(path: Path | None) -> list[Run]:
-    """The runs that an earlier call has kept."""
+    """Runs stored by an earlier call."""
     if path is None or not path.exists():
         return []
     rows = json.loads(path.read_text())
@@ -275,13 +273,12 @@ def kept_in(path: Path | None) -> list[Run]:
 
 
 def keep_in(path: Path | None, runs: list[Run]) -> None:
-    """Write all runs until now."""
+    """Store all runs so far."""
     if path is not None:
         path.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
 
 
 def main() -> int:
-    """Read the options, run, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--kills", type=int, default=3, help="in each run")
@@ -345,7 +342,6 @@ def main() -> int:
 
 
 def row(run: Run) -> str:
-    """One line on a run."""
     what = ", ".join(f"{who} at {at:.1f}" for at, who in run.hit)
     exit_ = "–" if run.exit is None else run.exit
     words = [

@@ -2,11 +2,11 @@
 
     sudo python -m tests.trials.lossy_radio --runs 1 --loss 15,25,30 --delay 60,120,150
 
-Needs root and `ip` (Linux). Robot r1 is in a network namespace of its own, all others in
-another one; loss [%] and delay [ms] hold in each direction. In each run the link is cut --cuts
-times for --cut seconds. A run is good if no process ended with another status than 0, and the final
-map equals, byte by byte, that of the same team in memory; or if the run goes on at its time limit
-with every process alive. --open: without keys, for comparison. Ends with 1 unless all are good.
+Needs root and `ip` (Linux). Robot r1 is in one network namespace, all others in another; loss [%]
+and delay [ms] hold in each direction. The link is cut --cuts times for --cut seconds. A run is
+good if all processes ended with 0 and the final map equals, byte by byte, that of the same team in
+memory; or if all are alive at the time limit. --open: without keys. Ends with 1 unless all are
+good.
 """
 
 import argparse
@@ -43,7 +43,7 @@ FAR = "r1"
 
 @dataclass
 class Run:
-    """The outcome of one run. exits: the status of each process; None: alive at the time limit."""
+    """Outcome of one run. exits: status of each process; None: alive at the time limit."""
 
     loss: int
     delay: int
@@ -56,12 +56,12 @@ class Run:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the robot was still at work, and everybody alive that it needs."""
+        """Whether the robot was still working, with all that it needs alive."""
         return any(status is None for status in self.exits.values())
 
     @property
     def good(self) -> bool:
-        """Nobody died, and the map is the undisturbed one, or is still being made."""
+        """Whether none died, and the map is the undisturbed one or still pending."""
         died = any(self.exits.values())
         return not died and (self.goes_on or self.equal is True)
 
@@ -81,7 +81,7 @@ def run_ip(*words: str) -> None:
 
 
 class Radio:
-    """A link between two namespaces that loses packets and delays them, and that can be cut.
+    """A link between two namespaces with loss, delay and cuts.
 
     Two TUN devices, and a thread that carries packets between them.
     """
@@ -119,7 +119,7 @@ class Radio:
 
 
 def tun_in(namespace: str) -> int:
-    """Open the TUN device `radio` of a namespace, which is made by it."""
+    """Create the TUN device `radio` of a namespace."""
     libc = ctypes.CDLL(None, use_errno=True)
     found = []
 
@@ -139,7 +139,7 @@ def tun_in(namespace: str) -> int:
 
 @contextmanager
 def radio(loss: int, delay_ms: int, seed: str) -> Iterator[tuple[str, str, Radio]]:
-    """Two namespaces, of the team and of the far robot, with a bad link between them."""
+    """Two namespaces, of the team and of the far robot, with a bad link."""
     home, away = (f"teamslam-{os.getpid()}-{side}" for side in ("home", "away"))
     made: list[str] = []
     link = None
@@ -206,7 +206,7 @@ def one(
 
 
 def disturb(run: Run, link: Radio, team: Team, options) -> None:
-    """Cut the link at even intervals, and return when all have ended or time is over."""
+    """Cut the link at even intervals, until all have ended or time is over."""
     began = time.monotonic()
     due = [options.first + k * (options.cut + options.between) for k in range(options.cuts)]
     mend_s = None

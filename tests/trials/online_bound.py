@@ -1,11 +1,10 @@
 """Bound of online poses: the batch estimate of all measurements of the team until then.
 
-The batch smoother of all robots' measurements up to t, marginalised to the poses at t, linearised
-at the truth: an extended Kalman filter over all robots' poses and all landmarks whose Jacobians are
-taken at the true state. No delay, no submaps, no error of linearisation: no estimator that has to
-linearise where it believes to be does better on average. Its errors come from the same noise, so a
-robot's RMSE over this one's says how much of it the estimator owes, and how much the world.
-Simulated worlds with known initial poses, one noise per second; the models are written again here.
+The batch smoother of all robots' measurements up to t, marginalised to the poses at t: an extended
+Kalman filter over all poses and landmarks with Jacobians at the true state. Without delay, submaps
+or linearisation error, it bounds the mean accuracy of any estimator; a robot's RMSE over this
+one's is the estimator's share. For simulated worlds with known initial poses and one noise per
+second; the models are independent implementations.
 """
 
 from typing import NamedTuple
@@ -25,7 +24,7 @@ UNKNOWN_M2 = 1e6
 
 
 class Bounded(NamedTuple):
-    """A robot's poses: errors (x, y, θ), covariances and true headings at stamps_ns."""
+    """Errors (x, y, θ), covariances and true headings of a robot's poses at stamps_ns."""
 
     stamps_ns: np.ndarray
     errors: np.ndarray
@@ -44,10 +43,10 @@ class Bounded(NamedTuple):
         return float(np.sqrt(np.mean(variances)))
 
     def nees_on_arcs(self) -> np.ndarray:
-        """NEES of (x, y, θ) where these errors are exact as an estimate: truth ∘ Exp(error).
+        """NEES of (x, y, θ) of the estimate truth ∘ Exp(error).
 
-        Such an estimator knows its covariance, and a pose is still no Gaussian in (x, y, θ): behind
-        a heading that is off by three sigma it lies on an arc, outside its own ellipse.
+        Even with the right covariance a pose is no Gaussian in (x, y, θ): for a heading off by
+        three sigma it lies on an arc, outside its own ellipse.
         """
         found = np.empty(len(self.errors))
         for k, (error, covariance) in enumerate(zip(self.errors, self.covariances, strict=True)):
@@ -139,7 +138,7 @@ class _AtTruth:
         self._P[at, at] += G @ Q @ G.T
 
     def look(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
-        """Ranges and bearings of landmarks, from where the robot truly is."""
+        """Use ranges and bearings of landmarks from the robot's true pose."""
         seen = stream.landmark_detections
         at = seen.rows(int(stream.rows[counter]))
         scan = seen.ids[at], seen.ranges[at], seen.bearings[at]
@@ -179,7 +178,7 @@ def _around(angle: float) -> float:
 
 
 def longest_s(stamps_ns: np.ndarray, far: np.ndarray) -> float:
-    """The longest time in a row in which this holds [s]."""
+    """Longest time [s] in a row in which this holds."""
     longest, far_since = 0.0, None
     for stamp_ns, is_far in zip(stamps_ns.tolist(), far.tolist(), strict=True):
         far_since = None if not is_far else stamp_ns if far_since is None else far_since

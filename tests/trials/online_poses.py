@@ -2,15 +2,13 @@
 
     python -m tests.trials.online_poses [SCENARIO …] [--seeds FIRST-LAST] [--json FILE]
 
-For each scenario: the mean NEES per degree of freedom of the online poses (1 is right), the median
-and the worst RMSE of a robot in a run, and who is silent: more than a window of poses in a row with
-a NEES beyond once in 10⁹ while the robot warns of nothing. Beside each RMSE stands that of the
-bound (`online_bound.py`): what the batch smoother of all that the team has measured by then errs
-by, in the same run at the same stamps. Far from known landmarks a robot errs whatever its estimator
-is, so the worst over the median is the world's figure, and the RMSE over the bound's the
-estimator's. FILE is written after each seed, and what it has is not run again. Seeds 5000 to 5999
-are for headline figures (decision 21): tune with others. Exit status 1 if a goal of GOALS is
-missed.
+For each scenario: the mean NEES per degree of freedom of the online poses (1 is right), median and
+worst RMSE of a robot in a run, and silent robots: more than a window of poses in a row with a NEES
+of probability below 10⁻⁹, without a warning. Beside each RMSE that of the bound
+(`online_bound.py`) in the same run at the same stamps: the worst over the median is due to the
+world, the RMSE over the bound's to the estimator. FILE is written after each seed; stored seeds
+are not run again. Seeds 5000 to 5999 are for headline figures (decision 21), not for tuning. Exit
+status 1 if a goal of GOALS is missed.
 """
 
 import argparse
@@ -38,7 +36,7 @@ GOALS = {"nees_per_dof": 1.15, "worst_over_median": 3.0, "over_bound": 1.25, "si
 
 
 def run(scenario_name: str, seed: int) -> list[dict[str, Any]]:
-    """One run: of each robot its figures and the longest time that it was far off and silent."""
+    """One run: figures of each robot, and the longest time that it was far off and silent."""
     scenario = with_options(load(scenario_name), seed=seed)
     window_ns = round(max(r.front_end.window_s for r in scenario.robots) * 1e9)
     nodes: dict[str, RobotNode] = {}
@@ -86,7 +84,7 @@ def run(scenario_name: str, seed: int) -> list[dict[str, Any]]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Over all runs and robots. over_bound: the root of the mean square error over the bound's."""
+    """Figures over all runs and robots. over_bound: RMSE over the bound's."""
     errors, bound = (np.array([row[name] for row in rows]) for name in ("rmse_m", "bound_rmse_m"))
     return {
         "seeds": float(len({row["seed"] for row in rows})),

@@ -3,17 +3,17 @@
     python -m tests.trials.robust_cost [--profiles NAME …] [--seeds FIRST-LAST] [--dataset ZIP …]
 
 The team runs in memory, twice for each seed: with the windows' gate against outliers, and without.
-On data sets (UTIAS) the seed is that of the particles alone, and the errors are aligned.
-The submaps of both runs are joined again with parts of the default left out:
+On data sets (UTIAS) the seed is that of the particles, and the errors are aligned. The submaps are
+joined again with parts of the default left out:
 
     default   the robust loss, the shared errors as states, the gate
     squares   least squares in place of the loss
     no gate   and windows that accept every measurement
     no states and no shared errors
 
-A line gives the ratio of the default's RMSE to that of each (geometric mean over the seeds, with
-its standard error) and the mean NEES per degree of freedom. Exit status 1 if the default is more
-than 2 % worse than `no gate`, or its NEES is outside [0.95, 1.05], by two standard errors.
+A line gives the ratio of the default's RMSE to each (geometric mean over the seeds, with standard
+error) and the mean NEES per degree of freedom. Exit status 1 if the default is more than 2 % worse
+than `no gate`, or its NEES is outside [0.95, 1.05], by two standard errors.
 """
 
 import argparse
@@ -56,7 +56,6 @@ class Figures(NamedTuple):
 
 
 def log_of(scenario: Scenario) -> list[Sample]:
-    """Run the team; return its log."""
     of = final_maps_only(scenario)
     return list(run_team(of, streams_of(of)))
 
@@ -78,7 +77,7 @@ def joined(
 
 
 def variants(scenario: Scenario, *, is_aligned: bool) -> Iterator[tuple[str, Figures]]:
-    """Compute the figures of each variant of one seed."""
+    """Figures of each variant of one seed."""
     of = partial(joined, is_aligned=is_aligned)
     samples = log_of(scenario)
     yield "default", of(samples, is_robust=True, has_biases=True)
@@ -114,7 +113,6 @@ def report(profile: str, found: Mapping[str, Sequence[Figures]]) -> bool:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the lines of each profile."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--profiles", nargs="*", default=[*PROFILES])
     parser.add_argument("--seeds", default="2000-2049", help="FIRST-LAST, both in it")

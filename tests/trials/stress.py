@@ -2,17 +2,17 @@
 
     python -m tests.trials.stress [--only CASE …] [--seeds N] [--first SEED] [--drawn]
 
-With --drawn each seed also draws another world for the case's fault: 1 to 4 robots, 12 to 40
-landmarks in a square of 30 to 50 m, a reach of 6 to 12 m, 170 to 240 s.
+--drawn: each seed draws another world for the case's fault: 1 to 4 robots, 12 to 40 landmarks in a
+square of 30 to 50 m, a reach of 6 to 12 m, 170 to 240 s.
 
-Each case runs in memory through the import of a CSV folder whose scenario states the noise of
-sensor and odometry and nothing else (`stress_world`). A line gives the map's error as it lies, the
-worst landmark in its standard deviations, NEES per degree of freedom, and the causes reported.
+Each case runs in memory, from a CSV folder whose scenario states only the noise of sensor and
+odometry (`stress_world`). A line gives the map's error without alignment, the worst landmark in
+its standard deviations, NEES per degree of freedom, and the reported causes.
 
 named: the right cause is among them. silent: the worst landmark is beyond 4 sigma (for many
-landmarks, beyond the same chance), and nothing is reported: neither a cause, nor a robot left out,
-nor a warning. The exit status is 1 if a map is silently wrong, or if the cause is named in less
-than 90 % of the runs in which it shifts the map by more than 2 sigma.
+landmarks, beyond the same chance) without a cause, a robot left out, or a warning. Exit status 1
+if a map is silently wrong, or if the cause is named in less than 90 % of the runs in which it
+shifts the map by more than 2 sigma.
 """
 
 import argparse
@@ -40,7 +40,7 @@ HALF_S = 150.0
 
 
 class Case(NamedTuple):
-    """A world, and the causes of which one should be named; none where the estimator must cope."""
+    """A world, and the causes to name one of; none where the estimator must cope."""
 
     world: StressWorld
     causes: frozenset[str] = frozenset()
@@ -110,7 +110,7 @@ CASES: Mapping[str, Case] = {
 
 
 def draw(world: StressWorld, seed: int) -> StressWorld:
-    """Draw another world with the same faults; those at a time are at the same share of the run."""
+    """Draw another world with the same faults, at the same share of the run."""
     rng = np.random.default_rng([1, seed])
     seconds = float(rng.choice([170.0, 240.0]))
     late = seconds / world.seconds
@@ -132,7 +132,7 @@ def draw(world: StressWorld, seed: int) -> StressWorld:
 
 
 def _faulty(world: StressWorld) -> set[str]:
-    """Return the robots of a world's faults that not all robots have."""
+    """Robots of a world's faults that not all robots have."""
     by_robot = (world.late, world.odometry_scale, world.yaw_bias, world.bearing_offset)
     names = {name for each in (*by_robot, world.range_offset) for name in each}
     if names == {*ALL}:
@@ -141,7 +141,7 @@ def _faulty(world: StressWorld) -> set[str]:
 
 
 class Outcome(NamedTuple):
-    """Errors of a run's map and the reported causes; `is_said`: anything at all is reported."""
+    """Errors of a run's map and the reported causes; `is_said`: anything is reported."""
 
     rmse_m: float
     worst_sigmas: float
@@ -161,7 +161,6 @@ class Outcome(NamedTuple):
 
 
 def run(world: StressWorld) -> Outcome:
-    """Run a team in a world, in memory."""
     with tempfile.TemporaryDirectory() as folder:
         place = write(world, folder)
         scenario = with_options(load(str(place / "scenario.toml")), dataset=place)
@@ -182,8 +181,8 @@ def run(world: StressWorld) -> Outcome:
 def _worst_sigmas(found: MapResult, *, aligned: bool) -> float:
     """Largest error of a landmark in the standard deviations of two numbers.
 
-    √χ² of the largest one, less the increase by chance of the largest of so many: a normal number
-    that is exceeded with the same probability.
+    √χ² of the largest one, less the chance of the largest of so many: a normal number with the
+    same tail probability.
     """
     error = (found.means - found.truth)[found.known]
     if not len(error):

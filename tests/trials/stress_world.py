@@ -1,9 +1,9 @@
-"""Write data sets with a known fault, by a generator of its own: it imports nothing of the project.
+"""Write data sets with a known fault, by a generator that imports nothing of the project.
 
     write(StressWorld(hidden=True, carried_off=(CarriedOff("r2", 15.0, 2.0, 150.0),)), folder)
 
 Robots drive exact arcs in a square and measure landmarks by range and bearing. A fault changes the
-measurements alone, never the truth. SI units, radians.
+measurements, never the truth. SI units, radians.
 """
 
 import math
@@ -24,7 +24,7 @@ SPEED = 1.0
 
 @dataclass(frozen=True)
 class CarriedOff:
-    """A robot is put elsewhere at a time, and its odometry does not measure it."""
+    """A robot is displaced at a time, unmeasured by its odometry."""
 
     robot: str
     metres: float
@@ -34,7 +34,7 @@ class CarriedOff:
 
 @dataclass(frozen=True)
 class MovedLandmark:
-    """A landmark is elsewhere from a time on: another place, by (dx, dy)."""
+    """A landmark is displaced by (dx, dy) from a time on."""
 
     landmark: int
     shift: tuple[float, float]
@@ -43,7 +43,7 @@ class MovedLandmark:
 
 @dataclass(frozen=True)
 class Burst:
-    """A robot's detections have wild bearings and ranges for a while, all by the same errors."""
+    """A robot's detections share wild errors of bearing and range for a while."""
 
     robot: str
     from_s: float
@@ -56,17 +56,16 @@ class Burst:
 class StressWorld:
     """A world and its faults.
 
-    late: by robot, the time by which its detections are stamped after the truth [s].
-    odometry_scale: factor on the logged speeds, by robot. yaw_bias: added to the logged yaw rates
-    [rad/s], by robot. bearing_offset, range_offset: added to all bearings [rad] and ranges [m], by
-    robot. bursts: spans of wild detections. mirrored: robots whose bearings have the wrong sign.
-    same_id: pairs (a, b): landmark b is measured with the identity of a. noise: factor on the noise
-    of odometry and sensor. grid: landmarks are a grid of so many by so many, 5 m apart; 0: spread
-    at random. clutter: number of false detections in each scan, without identities. tails: degrees
-    of freedom of Student's t of the sensor's errors; 0: normal. correlated_s: time over which the
-    sensor's errors are correlated, half of their variance; 0: none. corridor: whether the landmarks
-    are in the outer fifths of the square alone. step_s: time between two odometry intervals; scans
-    come every half second, or with each interval where that is longer.
+    late: delay [s] of a robot's detections after their stamps. odometry_scale: factor on the
+    logged speeds, by robot. yaw_bias: added to the logged yaw rates [rad/s], by robot.
+    bearing_offset, range_offset: added to all bearings [rad] and ranges [m], by robot. bursts:
+    spans of wild detections. mirrored: robots whose bearings have the wrong sign. same_id: pairs
+    (a, b): landmark b is measured with the identity of a. noise: factor on the noise of odometry
+    and sensor. grid: columns and rows of landmarks, 5 m apart; 0: random. clutter: false
+    detections per scan, without identities. tails: degrees of freedom of Student's t of the
+    sensor's errors; 0: normal. correlated_s: correlation time of half the variance of the sensor's
+    errors; 0: none. corridor: landmarks are in the outer fifths of the square alone. step_s: time
+    between odometry intervals; scans come every half second, or with each longer interval.
     """
 
     seed: int = 1
@@ -127,9 +126,7 @@ window_s = 10.0
 
 
 def write(world: StressWorld, folder: Path | str) -> Path:
-    """Write the CSV tables of a world, with the scenario that states its noise; returns the
-    folder.
-    """
+    """Write a world's CSV tables and the scenario with its noise; return the folder."""
     place, rng = Path(folder), np.random.default_rng(world.seed)
     place.mkdir(parents=True, exist_ok=True)
     points = _spread(world, rng)
@@ -279,7 +276,7 @@ def _scans(
 def _errors(
     world: StressWorld, rng: np.random.Generator
 ) -> Generator[np.ndarray, bool | None, None]:
-    """Draw errors of range and bearing in standard deviations, one for each True that is sent.
+    """Errors of range and bearing in standard deviations, one for each True that is sent.
 
     None marks the next scan. Of correlated errors, half of the variance is an Ornstein-Uhlenbeck
     process of the scans.

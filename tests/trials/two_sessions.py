@@ -4,16 +4,15 @@
     python -m tests.trials.two_sessions --set cityTrees10000.txt --robots 4 --by 1
     python -m tests.trials.two_sessions --set victoria --robots 4 --by 1
 
-Each row is a map: error after alignment, NEES per degree of freedom and its 95 % band, number of
-landmarks, and the landmarks that are reported as moved or gone. `whole` is one session. It is cut
-into two halves of time, and into its first, third, … robots and the others; the recording of a
-single robot is cut into --robots pieces for this. Robots of different sessions do not measure each
-other: `robots: whole` is one session with the measurements and starts of both sessions, without
-those between the groups. In `displaced` the landmark that the second session observes most has been
-moved by --by metres before. Landmarks without identities count for the nearest true one. Ends with
-1 if the error of two sessions exceeds 1.05 times that of one session with the same measurements,
-the NEES of a joined map is above the band, a change is reported falsely, or the displacement is not
-found within 4 standard deviations.
+Each row is a map: error after alignment, NEES per degree of freedom with its 95 % band, number of
+landmarks, and those reported as moved or gone. `whole` is one session, cut into two halves of
+time, and into its first, third, … robots and the others; a single robot's recording is first cut
+into --robots pieces. `robots: whole` is one session with the measurements and starts of both,
+without measurements between the groups. In `displaced` the landmark that the second session
+observes most has been moved by --by metres before. Landmarks without identities are compared with
+the nearest true one. Ends with 1 if the error of two sessions exceeds 1.05 times that of one
+session with the same measurements, a joined map's NEES is above the band, a change is reported
+falsely, or the displacement is not found within 4 standard deviations.
 """
 
 import argparse
@@ -134,7 +133,7 @@ def displace(
 
 
 def most_observed(world: WorldStreams, since_ns: dict[str, int], known: set[int]) -> int:
-    """Choose the known landmark that is observed most, of those first observed since a time."""
+    """The known landmark observed most, of those first observed since a time."""
     counts, early = Counter[int](), {int(NO_LABEL)}
     for stream in world.streams:
         seen = stream.landmark_detections
@@ -145,7 +144,6 @@ def most_observed(world: WorldStreams, since_ns: dict[str, int], known: set[int]
 
 
 def row(name: str, fused: m.FusedMap, world: WorldStreams) -> Figures:
-    """Print a row of the table."""
     found = figures(fused, world)
     told = {k: each.state for k, each in changed(fused).items() if each.state != "new"}
     shown = f"{found.rmse:8.4f} {found.nees:6.2f} ({found.limit:.2f}) {len(found.truth):4d}"
@@ -154,7 +152,7 @@ def row(name: str, fused: m.FusedMap, world: WorldStreams) -> Figures:
 
 
 def joined(name: str, first: Session, second: Session, limit_m: float, by: np.ndarray) -> bool:
-    """Run two sessions, and again with a displaced landmark; whether all is as it should be."""
+    """Run two sessions, also with a displaced landmark; return whether all bounds hold."""
     samples, centre, _ = day(1, scenario=first.scenario, streams=first.world)
     of_first = row(f"{name}: first", final_map(samples), first.world)
     saved = centre.maps.fold.save_map("first")
@@ -223,7 +221,7 @@ def of_robots(session: Session, robots: Sequence[str], *, begins: bool) -> Sessi
 
 
 def in_one(whole: Session, parts: Sequence[Session]) -> Session:
-    """Put the robots of several sessions into one session, in the order of the whole."""
+    """Put the robots of several sessions into one, in the order of the whole."""
     of = {each.robot: each for session in parts for each in session.world.streams}
     streams = tuple(of[each.robot] for each in whole.world.streams)
     return Session(whole.scenario, replace(whole.world, streams=streams))
@@ -238,7 +236,6 @@ def until(world: WorldStreams, length_s: float | None) -> WorldStreams:
 
 
 def main() -> int:
-    """Run the sessions of one recording."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--set", type=Path, required=True)
     parser.add_argument("--length", type=float, help="seconds of the recording")

@@ -1,10 +1,10 @@
 """The walk of one measurement: the files and functions between a scan and the prior that returns.
 
 `python -m tests.trials.walk [SCENARIO] [--final] [--functions]`, in memory. A profiler around
-`handle` of every robot and of the centre collects the functions that are entered until the last
-running map: scan, keyframe, closed window, filing, fold, prior. `--final` adds the final map, the
-full solution. Of each file: its lines, the lines of the functions entered, and the files that call
-it. `--functions` lists the functions entered, too, each with its number of calls.
+`handle` of every robot and of the centre collects the functions entered until the last running
+map: scan, keyframe, closed window, filing, fold, prior. `--final` adds the final map. For each
+file: its lines, those of the functions entered, and the files that call it. `--functions` lists
+the functions with their numbers of calls.
 """
 
 import argparse
@@ -33,9 +33,9 @@ Node = TypeVar("Node", RobotNode, CentralNode)
 
 @dataclass
 class Walk:
-    """The functions entered inside `handle`, by code object: calls, and the files of the callers.
+    """Functions entered inside `handle`, by code object: calls, and the files of the callers.
 
-    final: whether messages that end the run are part of the walk.
+    final: whether messages that end the run count.
     """
 
     final: bool = False
@@ -80,7 +80,7 @@ class Walk:
 
 
 def _ends(message: m.Message) -> bool:
-    """Whether a message ends a stream or the run, so that the last window or map follows."""
+    """Whether a message ends a stream or the run, before the last window or map."""
     return isinstance(message, m.End | m.TeamEnd | m.Done) or (
         isinstance(message, m.FusedMap) and message.final
     )
@@ -88,7 +88,7 @@ def _ends(message: m.Message) -> bool:
 
 @dataclass(frozen=True)
 class Row:
-    """A file of the walk: its lines, those of the functions entered, and the files that call it."""
+    """A file of the walk: its lines, those of the functions entered, the calling files."""
 
     name: str
     lines: int
@@ -141,7 +141,6 @@ def _profiled(node: Node, walk: Walk) -> Node:
 
 
 def main() -> int:
-    """Print the table and both totals."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenario", nargs="?", default="waypoints")
     parser.add_argument("--final", action="store_true", help="with the final map")

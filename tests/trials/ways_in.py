@@ -4,15 +4,15 @@
 
 zip      the data set as it is
 csv      a folder of tables
-mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported
-rmw, bridge  the bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by a process
-         that has nothing of ours, at so many times real time, to `teamslam driver` for each robot
-         and a live team of processes
-log      the log of a team that was driven live, imported
+mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported rmw, bridge  the
+bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by an
+         independent process, at so many times real time, to a `teamslam driver` per robot and a
+         live team of processes
+log      the log of such a live team, imported
 
-A range and bearing become a point in a bag, which costs its last bit: the first two maps must be
-equal byte for byte, and so must the other five; the table says how far those are from the first.
-With --keep a way that was done before is read from the folder. Ends with 1 where maps differ.
+A range and bearing become a point in a bag, which costs the last bit: the first two maps must be
+equal byte for byte, and so must the other five, whose distance from the first is printed. --keep:
+reuse finished ways from the folder. Ends with 1 where maps differ.
 """
 
 import argparse
@@ -65,7 +65,7 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 
 
 def of_robot(stream: RobotStream) -> list[ros.Message]:
-    """Messages of all that a robot measured."""
+    """All measurements of a robot, as messages."""
     found: list[ros.Message] = []
     intervals = stream.intervals
     begins = (intervals.end_ns - intervals.duration_ns).tolist()
@@ -114,7 +114,7 @@ def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
 
 
 def publish(mode: str, bag: Path, port: int, speed: float) -> None:
-    """Publish a bag's bytes upon a line on standard input; each robot by a session of its own."""
+    """Publish a bag's bytes after a line on standard input, in a session per robot."""
     with opened_bag(bag) as there:
         kinds = {topic.name: topic.kind for topic in there.topics}
         messages = [(m.arrival_ns, m.topic, bytes(m.data)) for m in there.messages(list(kinds))]
@@ -182,7 +182,7 @@ def of_log(log: Path) -> tuple[bytes, bytes, bytes]:
 
 
 def typed(*words: object) -> str:
-    """Run a command; raises with what it said where it fails."""
+    """Run a command; an error carries its output."""
     done = subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, text=True, check=False,
                           env={**os.environ, **ONE_THREAD})  # fmt: skip
     if done.returncode:
@@ -191,14 +191,14 @@ def typed(*words: object) -> str:
 
 
 def imported(source: Path, folder: Path, *options: object) -> Scenario:
-    """A bag or a log as a data set of its own."""
+    """A bag or a log as a data set."""
     shutil.rmtree(folder, ignore_errors=True)
     print(typed("import", source, "-o", folder, *options).strip().splitlines()[-2], flush=True)
     return with_options(load(folder / "scenario.toml"), dataset=folder)
 
 
 def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
-    """A live team driven by topics; its log."""
+    """Log of a live team driven by topics."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -265,7 +265,7 @@ def awaited(log: Path, text: str, team: "subprocess.Popen[str]") -> None:
 
 
 def settled(run: Path, robots: list[str]) -> None:
-    """Return when the drivers' files do not grow any more."""
+    """Return when the drivers' files stop growing."""
     sizes, since = [0], time.monotonic()
     while time.monotonic() - since < QUIET_S:
         time.sleep(0.5)
@@ -338,7 +338,7 @@ def main() -> int:
 
 
 def judged(maps: dict[str, tuple[bytes, bytes, bytes]]) -> bool:
-    """Print the table; whether all maps are as they must be."""
+    """Print the table; return whether all maps are as required."""
     right = True
     zero = maps.get("zip")
     for group in (EXACT, BY_POINTS):

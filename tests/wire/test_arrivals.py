@@ -1,4 +1,4 @@
-"""Order and gaps of what arrives, and intervals of numbers."""
+"""Order and gaps of arrivals, and intervals of numbers."""
 
 import itertools
 
@@ -72,7 +72,7 @@ def test_what_the_publisher_has_no_more_is_gone_and_named():
 
 
 def test_numbers_of_32_bits_cost_no_memory_and_no_time():
-    """A heartbeat and a reply name them; a set of them asked for 240 GB."""
+    """A heartbeat and a reply name such numbers; sets of them would need 240 GB."""
     newest = 2**32 - 2
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.know(newest)
@@ -96,7 +96,7 @@ def test_a_publisher_that_leaves_gaps_without_end_is_not_tracked_without_end(mon
 
 
 def test_a_number_that_the_publisher_never_had_is_unlearnt():
-    """A heartbeat of another key that came under this one: the cache's reply corrects it."""
+    """A heartbeat of another key may arrive under this one: the cache's reply corrects it."""
     arrivals: Arrivals[int] = Arrivals(0)
     arrivals.take(0, 0)
     arrivals.know(500)

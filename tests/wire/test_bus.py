@@ -183,7 +183,7 @@ def test_an_answer_that_fails_is_told_to_the_asker(joined):
 def asked(
     asker: Bus, answerer: Bus, channel: c.Channel, name: str, request: m.Message
 ) -> list[bytes]:
-    """Ask while another thread runs the answering bus; again until its declaration is known."""
+    """Query while another thread runs the answering bus; repeat until its declaration is known."""
     done = threading.Event()
 
     def serve() -> None:

@@ -89,7 +89,7 @@ def test_a_motion_may_be_exact_in_some_direction(matrix):
 
 
 def test_a_number_of_numpy_is_encoded_as_the_float_that_it_is():
-    """An estimate computed of arrays is one; a valid increment of huge numbers gave it."""
+    """Estimates computed from arrays have this type."""
     plain = EXAMPLES["innovation/1"]
     computed = msgspec.structs.replace(plain, squared=np.float64(plain.squared))
     assert encoded(computed) == encoded(plain)

@@ -60,14 +60,14 @@ def view_table() -> str:
 
 
 def message_list() -> str:
-    """The fields of every message by position, and their types unless `usual_types` has them."""
+    """Fields of every message by position, with their types unless `usual_types` has them."""
     rows = [f"- `{tag}`: {_fields(message)}" for tag, message in sorted(m.BY_TAG.items())]
     rows += [f"- *{part.__name__}*: {_fields(part)}" for part in _parts()]
     return "\n".join(rows).replace(": \n", "\n")
 
 
 def fields_by_type() -> dict[str, str]:
-    """The common fields of each type, whose names the page lists beside the type."""
+    """Fields with the usual types, by type."""
     common: dict[str, list[str]] = {}
     for name, of in usual_types().items():
         common.setdefault(of, []).append(f"`{name}`")
@@ -75,7 +75,6 @@ def fields_by_type() -> dict[str, str]:
 
 
 def usual_types() -> dict[str, str]:
-    """The usual type of each common field."""
     types: dict[str, Counter[str]] = {}
     for cls in [*m.BY_TAG.values(), *_parts()]:
         for name, of in _types(cls):
@@ -98,7 +97,7 @@ def _is_part(cls: type) -> bool:
 
 
 def _fields(cls: type[msgspec.Struct]) -> str:
-    """Every message begins with its stamp, which the table omits."""
+    """Fields of a message without the stamp, with which all begin."""
     usual, fields = usual_types(), _types(cls)
     if issubclass(cls, m.Message):
         assert fields[0] == ("stamp_ns", "StampNs")

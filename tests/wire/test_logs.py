@@ -1,4 +1,4 @@
-"""Messages of others neither fill a log nor forge a line of it."""
+"""Foreign messages neither fill a log nor forge a line of it."""
 
 import logging
 

@@ -219,7 +219,7 @@ def test_a_publication_without_its_attachment_is_dropped_and_logged(endpoint, ca
 
 
 def put_beside(bus: ZenohBus, key: str, beside: bytes) -> None:
-    """Publish a submap on a key with another attachment than the bus would give it."""
+    """Publish a submap on a key with another attachment than the bus's."""
     bus._publishers[key].put(encoded(submap(1)), attachment=beside)
 
 
@@ -280,7 +280,7 @@ def test_a_sample_that_came_under_another_key_is_fetched_from_its_publisher(endp
 
 
 def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
-    """As Zenoh passed one on when links of fifty robots had been cut: two robots died of it."""
+    """Zenoh delivered such a heartbeat when links of fifty robots had been cut."""
     caplog.set_level("INFO")
     with ZenohBus("t", endpoint) as bus, client(endpoint, 5.0, None) as stranger:
         bus.subscribe(c.HEAD)
@@ -302,7 +302,7 @@ def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
 def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
     endpoint, monkeypatch, caplog
 ):
-    """Keys and publishers are names from the wire; what is beyond the bound is not requested."""
+    """Keys and publishers are names from the wire; those beyond the bound are not requested."""
     asked: list[tuple[str, str]] = []
     monkeypatch.setattr(
         Recovery, "_ask_cache", lambda self, key, publisher, *_: asked.append((key, publisher))
@@ -381,7 +381,7 @@ def test_close_wakes_a_receiver_and_ends_the_bus(endpoint):
 
 
 def join_late(endpoint: str, team: str, rng: random.Random) -> dict[str, list[int]]:
-    """The counters of each key that a bus receives which joins while four others publish."""
+    """Counters of each key that a bus receives which joins while four others publish."""
     robots, messages = [f"r{n}" for n in range(4)], 24
     buses = {robot: ZenohBus(team, endpoint) for robot in robots}
 
@@ -444,7 +444,7 @@ def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, 
 
 
 def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):
-    """A flood of them is neither queued nor passed on, and logs a few lines."""
+    """Such a flood is neither queued nor passed on, and logs a few lines."""
     status = build.status(state="x")
     with (
         ZenohBus("t", endpoint) as sink,

@@ -258,8 +258,8 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
 @pytest.mark.parametrize(("heading_sigma", "merged"), [(0.06, 3), (0.2, 0)])
 def test_far_landmarks_are_merged_that_near_ones_make_certain(heading_sigma, merged):
     """Three landmarks seen again at 4, 6 and 8 m under an error of the heading. The nearest one
-    alone is
-    too little evidence; the others are uncertain by more than `most_sd` until it is merged.
+    alone is too little evidence; the others are uncertain by more than `most_sd` until it is
+    merged.
     """
     known, most_sd = np.array([(4.0, 0.0), (0.0, 6.0), (-8.0, 0.0)]), 0.35
     profile = AssociationProfile(slack=0.03, density=0.05, same=0.5)

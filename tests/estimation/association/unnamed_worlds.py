@@ -26,8 +26,7 @@ def drive(
     pose_sd: tuple[float, float, float] = POSE_SD,
 ) -> tuple[list[Contribution], dict[LocalLandmark, int]]:
     """A submap between each two poses of a path, of all landmarks within reach in random order,
-    and its
-    truth; named: landmarks keep their numbers.
+    and its truth; named: landmarks keep their numbers.
     """
     submaps, truth = [], {}
     for k, (start, end) in enumerate(pairwise(path)):

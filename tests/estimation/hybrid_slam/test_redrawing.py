@@ -111,8 +111,7 @@ def submap_of(keyframes: list[Keyframe], seed: int) -> LocalMap:
 
 def differences(keyframes: list[Keyframe]) -> list[float]:
     """χ² (3 degrees of freedom) between the end poses of one window by two seeds each, in the
-    covariance
-    of one.
+    covariance of one.
     """
     maps = [submap_of(keyframes, seed) for seed in range(1, 5)]
     return [

@@ -89,8 +89,7 @@ def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements
 
 def test_the_clocks_derivative_changes_as_the_curvature_states():
     """In the true window's landmark places less those by a late one, S b + ½ D b² has a third of
-    the
-    spread of S b alone. Particles and smoother differ at first order by a displacement of all
+    the spread of S b alone. Particles and smoother differ at first order by a displacement of all
     landmarks.
     """
     late, errors = 0.8, dict.fromkeys(BIASES, 0.0)
@@ -173,8 +172,7 @@ def stated(window, motions, points):
 
 def measured_later(path, seconds, k, point):
     """∂(range, bearing)/∂(delay of the stamp), by differences along the motion from a quarter of a
-    second
-    before keyframe k to a quarter after.
+    second before keyframe k to a quarter after.
     """
     ends, times = [np.zeros(3), *path], np.append(0.0, np.cumsum(seconds))
     first = max(j for j in range(k + 1) if j == 0 or times[k + 1] - times[j] >= 0.25)

@@ -1,6 +1,5 @@
 """A final map shows no landmark twice: it leaves out possible duplicates, and landmarks that
-nearly
-all submaps miss.
+nearly all submaps miss.
 """
 
 import numpy as np

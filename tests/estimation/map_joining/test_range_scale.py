@@ -29,8 +29,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0)
     scale errors.
 
     own, common, marker: sigmas of the scale of each robot, of all, and of each landmark's marker;
-    way:
-    of each submap's end pose [m].
+    way: of each submap's end pose [m].
     """
     random = np.random.default_rng(seed)
     shared = common * random.standard_normal()

@@ -1,4 +1,4 @@
-"""Calibration: what was put into measurements comes out of them, within its own uncertainty."""
+"""Calibration recovers the simulated errors within its own uncertainty."""
 
 from dataclasses import replace
 from pathlib import Path as File
@@ -41,7 +41,7 @@ NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np
 
 
 def reference(name: str, **fields: Any) -> Reference:
-    """Build one robot's data on a known path, by default without detections."""
+    """One robot's data on a known path, by default without detections."""
     nothing = {"seen": NOTHING, "sighted": NOTHING, "names": (), "teammates": {}}
     return Reference(**(nothing | {"name": name, "gap_ns": SECOND, "landmarks": SEEN} | fields))
 
@@ -72,9 +72,9 @@ def driven(
 
 
 def seeing(seed: int) -> Reference:
-    """Standing at the middle, 4 Hz: ranges 0.95 d + 0.1, of σ 0.05 d; a fifth white, 5 s the rest.
+    """Standing at the middle, 4 Hz: ranges 0.95 d + 0.1, of σ 0.05 d, a fifth white, 5 s the rest.
 
-    Bearings are 0.02 rad too large, of σ 0.01, all white, and 3 % of them anywhere.
+    Bearings are 0.02 rad too large, of σ 0.01, all white, 3 % of them anywhere.
     """
     rng = np.random.default_rng(seed)
     n, dt = 1200, 0.25
@@ -164,7 +164,7 @@ def test_a_team_without_submaps_is_an_error_with_a_text():
 
 
 def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path):
-    """Figures of the motion, the sensor, the centre and the association; all else stays."""
+    """It changes figures of the motion, the sensor, the centre and the association."""
     motion = (Figure("forward_scale", 1.1, 0.01, ""), Figure("turn.per_m", 0.07, 0.002, "rad/√m"))
     sensor = (
         Figure("range_scale", 0.9, 0.001, ""),
@@ -273,7 +273,7 @@ def slipping():
 def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(
     slipping, tmp_path
 ):
-    """A set of two robots: of one the ground truth is missing, the other's is too short."""
+    """A set of two robots, one without ground truth, the other too short."""
     write_utias(slipping[1], tmp_path / "set")
     (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])

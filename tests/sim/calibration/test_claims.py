@@ -1,4 +1,4 @@
-"""Factors on claimed covariances and the sensor's place on the base come out of measurements."""
+"""Measurements determine factors on claimed covariances and the sensor's mount."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""A clock of a robot's detections that is off is found, and is not taken for a mount."""
+"""A clock offset of a robot's detections is found, and not taken for a mount."""
 
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """A data set whose clocks are right, and the same with late detections of r2."""
+    """A data set with right clocks, and the same with late detections of r2."""
     late = StressWorld(**{**vars(SMALL), "late": {"r2": OFFSET_S}})
     root = tmp_path_factory.mktemp("sets")
     return write(SMALL, root / "right"), write(late, root / "late")
@@ -31,9 +31,8 @@ def places(tmp_path_factory):
 def test_a_late_clock_is_found_without_a_mount_and_is_written_into_the_scenario(
     places, monkeypatch
 ):
-    """The scenario has a part of the offset already; the rest adds to it.
-
-    The figures of the joined map, which take most of the time, have tests of their own.
+    """The scenario has a part of the offset already; the rest adds to it. The joined map is tested
+    elsewhere.
     """
     monkeypatch.setattr(calibrate, "join_team", lambda *_: SimpleNamespace(fold=None))
     monkeypatch.setattr(calibrate, "central_figures", lambda *_: ())
@@ -82,7 +81,7 @@ def test_a_robot_whose_clock_was_not_learnt_stays_in_the_team(tmp_path):
 
 
 def test_a_late_robot_is_compared_with_its_teammates_at_one_time(places):
-    """Detections and odometry are moved to the clock of the true paths, which all robots share."""
+    """Detections and odometry are moved to the clock of the true paths."""
     streams = streams_of(scenario_in(places[0]))
     late = Clock(*(Figure(name, s, 0.01, "s") for name, s in (("a", 0.3), ("b", -0.2), ("c", 0.5))))
     before, after = (world.streams[1] for world in (streams, on_one_clock(streams, {"r2": late})))

@@ -1,4 +1,4 @@
-"""The covariance factor is learnt from how far single robots' maps are from the others'."""
+"""The covariance factor is calibrated from the distances of single robots' maps."""
 
 from dataclasses import replace
 from functools import cache
@@ -22,7 +22,7 @@ SIGMAS = (0.05, 0.01, 0.1)
 
 @cache
 def folds_of(seeds, claimed=1.0):
-    """Build teams of four whose submaps claim `claimed` times their true variance."""
+    """Teams of four whose submaps claim `claimed` times their true variance."""
     folds: list[Fold] = []
     for seed in seeds:
         world = team(seed, robots=4, submaps=8, landmarks=8, reach=30.0, sigmas=SIGMAS)

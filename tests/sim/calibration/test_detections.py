@@ -1,4 +1,4 @@
-"""Rates of clutter and of missed detections, and what is claimed, are learnt without identities."""
+"""Rates of clutter and missed detections, and claimed covariances, calibrate without identities."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ REACH_M = 12.0
 
 
 def world(seed, clutter, missed):
-    """A hidden world of two robots with this share of clutter and of missed detections."""
+    """A hidden world of two robots with these shares of clutter and missed detections."""
     scenario = load("waypoints")
     changed = msgspec.structs.replace(
         scenario.world, size_m=60.0, landmark_count=60, visible_to_m=REACH_M, steps=150,

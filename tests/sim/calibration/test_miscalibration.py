@@ -49,7 +49,7 @@ class Run:
 
 
 def joined(biases: tuple[Bias, ...], true_scale: float) -> Run:
-    """The team's map, and its size over the true one, where each true way is so much longer."""
+    """The team's map, and its size over the true one, where each true path is so much longer."""
     told = fast_team(biases)
     truly = tuple(
         msgspec.structs.replace(

@@ -1,4 +1,4 @@
-"""Calibration distinguishes cameras that differ, and a depth from a distance."""
+"""Calibration distinguishes cameras that differ, and depth from distance."""
 
 from dataclasses import replace
 

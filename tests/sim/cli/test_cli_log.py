@@ -20,7 +20,7 @@ from tests.sim.logs import scenario, streams, world_log
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit status, standard output and standard error; a `LogError` is what `main` makes of it."""
+    """Exit status, standard output and standard error; a `LogError` as `main` prints it."""
     result = CliRunner().invoke(app, ["log", *map(str, arguments)], env={"COLUMNS": "80"})
     if isinstance(result.exception, LogError):
         return WRONG_USE, result.stdout, f"error: {result.exception}"
@@ -29,7 +29,7 @@ def run(*arguments: object) -> tuple[int, str, str]:
 
 
 def published() -> list[Sample]:
-    """A world of two robots; each key counts from 0, as a bus does."""
+    """A world of two robots; each key counts from 0, as on a bus."""
     counts: dict[str, int] = {}
     samples = []
     for sample in world_log(scenario(robots=2)):

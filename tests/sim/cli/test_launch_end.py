@@ -1,4 +1,4 @@
-"""The end of a launch: interruption, full disk, and a router killed as the run ends."""
+"""The end of a launch: interruption, full disk, a router killed as the run ends."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Mistakes of a user: exit status 2 and one clear message, without a traceback."""
+"""Wrong use: exit status 2 and one clear message, without a traceback."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ from tests.support import ROOT
 
 
 def message_in(said: str, status: object) -> str:
-    """The one message of a command that was used wrongly."""
+    """The one message of a wrongly used command."""
     assert "Traceback" not in said
     assert status == WRONG_USE, said
     errors = [line for line in said.splitlines() if line.startswith("error: ")]
@@ -21,7 +21,7 @@ def message_in(said: str, status: object) -> str:
 
 @pytest.fixture
 def told(monkeypatch, tmp_path, capfd):
-    """Run a command that can not do what it is asked for, in an empty folder; its message."""
+    """Run a command in an empty folder where it must fail; return its message."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
 

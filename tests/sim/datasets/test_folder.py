@@ -26,7 +26,7 @@ from tests import teams
 
 
 def data_set(path: Path, **tables: str) -> Path:
-    """A robot's tables by name; `landmarks` lies beside it."""
+    """A robot's tables by name, beside `landmarks`."""
     for name, text in tables.items():
         place = path if name == "landmarks" else path / "r1"
         place.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def only(path: Path, **options: object) -> RobotStream:
 
 
 def same(a: object, b: object) -> bool:
-    """Equal in every array's type and bits, whatever is noted."""
+    """Equal type and bits of every array, apart from notes."""
     if dataclasses.is_dataclass(a):
         fields = [f.name for f in dataclasses.fields(a) if f.name not in ("notes", "source")]
         return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in fields)
@@ -118,7 +118,7 @@ def test_increments_come_with_their_covariances(tmp_path):
 
 
 def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path):
-    """A mark at the beginning, CRLF, quotes, spaces, empty rows and columns, numbers as pandas'."""
+    """A byte order mark, CRLF, quotes, spaces, empty rows and columns, numbers as pandas'."""
     plain = only(data_set(tmp_path / "plain", odometry=SPEEDS, observations=SEEN))
     odd = tmp_path / "odd" / "r1"
     odd.mkdir(parents=True)

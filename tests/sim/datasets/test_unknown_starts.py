@@ -1,4 +1,4 @@
-"""Real data of which only one start pose is declared: the team finds together all the same."""
+"""Real data with one stated start pose: all robots join."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 
 
 def slice_of_set_6() -> Scenario:
-    """Its first 100 s, with poses once a window: nothing here judges the running ones."""
+    """Its first 100 s, with a pose per window."""
     scenario = with_options(load("utias"), dataset=SET_6)
     world = msgspec.structs.replace(scenario.world, duration_s=100.0)
     robots = tuple(msgspec.structs.replace(robot, pose_s=60.0) for robot in scenario.robots)

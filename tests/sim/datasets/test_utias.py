@@ -55,7 +55,7 @@ def folder(tmp_path, simulated):
 
 
 def edited(path: Path, change: Callable[[list[str]], list[str]]) -> None:
-    """Change the rows of a file, its two comment lines apart."""
+    """Change the rows of a file after its two comment lines."""
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:2] + change(lines[2:])) + "\n")
 
@@ -252,7 +252,7 @@ def test_a_set_without_the_files_of_a_robot_is_run_by_the_others(folder):
 
 
 def mapped_by_waypoints(path):
-    """The first 25 s of a set, with few particles and the models of the robots that made it."""
+    """The first 25 s of a set, with few particles and the models of its robots."""
     scenario = with_options(load("utias"), robots=2, dataset=path)
     robots = tuple(
         msgspec.structs.replace(

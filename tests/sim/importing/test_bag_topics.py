@@ -127,8 +127,8 @@ def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_pa
 def shared_tf(*, bases: tuple[str, str], odoms: tuple[str, str], linked: bool = True) -> list[Any]:
     """Two robots, each with its odometry and camera, and one /tf with both robots' tags in it.
 
-    linked: whether /tf has the moving transform from each robot's odometry frame to its base and
-    /tf_static the one from there to its camera.
+    linked: /tf has the moving transform from odometry frame to base, /tf_static the one to the
+    camera.
     """
     messages: list[Any] = []
     for robot, base, odom, ahead in zip(("ann", "bob"), bases, odoms, (0.2, 0.7), strict=True):

@@ -1,4 +1,4 @@
-"""`teamslam import`: bags, CSV files with names of their own and logs become the same tables."""
+"""`teamslam import`: bags, CSV files of other layouts and logs become the same tables."""
 
 from pathlib import Path
 

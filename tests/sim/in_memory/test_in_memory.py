@@ -1,4 +1,4 @@
-"""A whole team in one process, and the bits of its map whoever runs it."""
+"""A team in one process, with the same map in any process."""
 
 import os
 import subprocess

@@ -19,7 +19,7 @@ SECOND = 1_000_000_000
 
 
 def scenario():
-    """Three robots; the third one meets the second one only."""
+    """Three robots; the third meets the second only."""
     scenario = with_options(load("thesis"), robots=3)
     return msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, steps=32)
@@ -61,9 +61,9 @@ def test_every_peers_final_map_is_the_central_runs_though_it_meets_one_teammate_
 
 
 def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(central):
-    """Two by two they meet, r2 carries; it dies, once behind the end, and has lost what it kept.
+    """Pairs meet, r2 carries; it dies, once after the end, and has lost its disk.
 
-    A centre is there for a while, meets r1 only, dies, and comes back with what it kept.
+    A centre is there for a while, meets r1 only, dies, and restarts from its disk.
     """
     windows = meetings(
         [
@@ -100,7 +100,7 @@ def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(cen
 
 
 def test_the_fold_of_a_set_that_changed_or_grew_is_the_fold_of_what_it_is_now(central):
-    """A robot that contradicts itself, and one that grows behind a final map."""
+    """A robot that contradicts itself, and one that grows after a final map."""
     team, _ = peers(Air())
     seat = team.seats["r1"]
     before = seat.node.final

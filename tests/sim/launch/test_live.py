@@ -1,5 +1,3 @@
-"""The plain lines of a run."""
-
 from io import StringIO
 
 from rich.console import Console

@@ -1,4 +1,4 @@
-"""The consistency shown during a launch equals figures computed independently."""
+"""Consistency during a launch equals figures computed independently."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def truth(seconds: list[float], poses: np.ndarray) -> m.Truth:
 
 
 def line(seconds: list[float]) -> np.ndarray:
-    """Drives along x with 1 m/s and turns by 1 rad/s through the cut of the circle."""
+    """Drive along x with 1 m/s and turn by 1 rad/s, across ±π."""
     return np.array([[s, 0.0, (3.0 + s + np.pi) % (2 * np.pi) - np.pi] for s in seconds])
 
 

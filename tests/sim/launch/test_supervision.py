@@ -17,7 +17,7 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 
 
 class Quiet(Child):
-    """A process that is there."""
+    """A running process."""
 
     pid = 0
     exit = None
@@ -28,7 +28,7 @@ class Quiet(Child):
 
 
 class Stopped(Quiet):
-    """A process that does not run."""
+    """A stopped process."""
 
     is_stopped = True
 
@@ -41,7 +41,7 @@ class Service(Supervised):
 
 
 class Team:
-    """Processes that are there, a clock that is set by hand, and what is noted of them."""
+    """Running processes, a manual clock, and the notes on them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
         self.now = 1000.0
@@ -84,7 +84,7 @@ class Ending(Quiet):
 
 
 def test_a_process_that_fails_five_times_is_given_up_whatever_it_says():
-    """No router that answers ends a process with status 2, as wrong use does; it may come back."""
+    """Without a router a process ends with status 2, as on wrong use; it may restart."""
     service = Service(0)
     service.fruitless, service.reached, service.given_up = 0, -1.0, False
     given_up = []

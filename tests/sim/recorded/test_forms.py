@@ -1,4 +1,4 @@
-"""A stream that mixes forms of measurements: from a log to tables and back, message for message."""
+"""A stream of mixed measurement forms, from a log to tables and back, message for message."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -39,7 +39,7 @@ def seeing(at_s: float, kind: type[m.Measurement], **fields: Any) -> m.Measureme
 
 
 def stream(measurements: Sequence[m.Measurement]) -> list[m.Message]:
-    """Numbered by time, the initial pose first."""
+    """Number by time, the initial pose first."""
     begin = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
     kinds = m.AnyOdometry
     ordered = sorted(measurements, key=lambda each: (each.stamp_ns, isinstance(each, kinds)))

@@ -1,5 +1,3 @@
-"""Logs as graph files and data sets as logs."""
-
 import json
 from pathlib import Path
 

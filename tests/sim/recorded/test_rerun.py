@@ -35,7 +35,7 @@ ODOMETRY_OF_SUBMAP_3 = 35
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory):
-    """A run whose measurements come second by second, so that maps come back while robots drive."""
+    """A run with measurements second by second, so that maps return while robots drive."""
     hurried = written(tmp_path_factory.mktemp("log") / "log.mcap", team_samples(thesis(STEPS)))
     return changed_run(hurried, Changes())
 
@@ -61,7 +61,7 @@ def with_one_bit(message: m.Message) -> m.Message:
 
 
 def flipped(samples: list[Sample]) -> list[Sample]:
-    """One bit of one odometry measurement of r2 is another."""
+    """Flip one bit of one odometry measurement of r2."""
     counter = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3].number
 
     def change(message: m.Message) -> m.Message:
@@ -98,7 +98,7 @@ def test_what_every_other_pair_says_comes_out_again(estimator, fusion, tmp_path)
 
 
 def shifted(samples: list[Sample], channel: ch.Channel, victim: m.Message) -> list[Sample]:
-    """The fourth mean of one map of the channel is 0.25 m larger."""
+    """Add 0.25 m to the fourth mean of one map of the channel."""
 
     def change(message: m.Message) -> m.Message:
         if message != victim:
@@ -152,7 +152,7 @@ def test_a_missing_measurement_is_named_and_the_windows_behind_it_come_out(sampl
 def test_what_was_made_of_a_map_that_is_lost_can_not_be_judged_and_all_else_is_equal(
     samples, tmp_path
 ):
-    """A log that was filled late: the centre and the recorder were killed one after the other."""
+    """The centre and the recorder were killed one after the other."""
     (lost, *_) = messages(samples, ch.PRIOR, "r2")
     poses = [x for x in messages(samples, ch.TEAM_POSE, "r2") if x.map_digest == lost.digest]
     assert poses
@@ -184,9 +184,9 @@ def test_on_another_platform_numbers_are_compared_within_a_tolerance(samples, tm
 
 
 def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team:
-    """Two robots in any order of delivery; r1 is killed on the way, and comes again or not.
+    """Two robots in any order of delivery; r1 is killed, and restarts or not.
 
-    cache: how many measurements its source has kept then; with too few a new incarnation begins.
+    cache: number of measurements that its source still has; with too few a new incarnation begins.
     """
     robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
     team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))

@@ -1,4 +1,4 @@
-"""Scenarios: built-in ones, a user's file, a command line, and errors in them."""
+"""Scenarios: built-in ones, files, the command line, and errors in them."""
 
 from pathlib import Path
 

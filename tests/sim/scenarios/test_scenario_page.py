@@ -1,4 +1,4 @@
-"""docs/scenario.md has every field with its values and its default; what pages show does run."""
+"""docs/scenario.md has every field with its values and default; examples on pages run."""
 
 import re
 
@@ -42,7 +42,7 @@ AT_THE_TOP = {"estimator", "fusion", "seed"}
 
 
 def described(cls: type[msgspec.Struct]) -> dict[str, str]:
-    """The default of each field as the page writes it; nothing for what has no plain default."""
+    """Default of each field as the page writes it; empty without a plain default."""
     left_out = AT_THE_TOP if cls in {RobotConfig, CentralConfig} else set()
     fields = msgspec.structs.fields(cls)
     return {field.name: default_of(field) for field in fields if field.name not in left_out}
@@ -57,7 +57,7 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
 
 
 def rows_of(page: str, cls: type[msgspec.Struct]) -> dict[str, list[str]]:
-    """The cells of the table below the heading that names the class, by field."""
+    """Cells of the table below the heading that names the class, by field."""
     section = page.partition(f": `{cls.__name__}`\n")[2].partition("\n## ")[0]
     cells = [line.strip("| ").split(" | ") for line in section.splitlines() if "| `" in line[:3]]
     return {name.strip("`"): rest for name, *rest in cells}

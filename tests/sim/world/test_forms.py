@@ -1,5 +1,3 @@
-"""Forms of simulated measurements, layouts of landmarks, hidden identities."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The simulated odometry has the moments that the filter's models claim, whichever the model."""
+"""The simulated odometry has the moments that the filter's models claim."""
 
 import msgspec
 import numpy as np
@@ -141,7 +141,7 @@ def test_a_clock_offset_that_the_robot_does_not_know_is_found_out():
 
 
 def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
-    """Return the robot's submaps of its stream, without a centre."""
+    """Submaps of the robot's stream, without a centre."""
     sent = driven(RobotNode(robot), published(world.streams[0]))
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 
@@ -151,7 +151,7 @@ def cost_per_dof(of: m.FusedMap) -> float:
 
 
 def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
-    """Stamp, motion and ranges of each keyframe of the first robot, as the centre cuts them."""
+    """Stamp, motion and ranges of each keyframe of the first robot at the centre."""
     keyframes = TeamKeyframes([robot.id])
     keyframes.configure(robot.id, robot)
     measurements = published(world.streams[0])

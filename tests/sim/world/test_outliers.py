@@ -1,4 +1,4 @@
-"""Outliers of the simulated world: as many as asked, of its kind, and nothing else is touched."""
+"""Simulated outliers: as many as asked, of the given kind, and nothing else changes."""
 
 import msgspec
 import numpy as np

@@ -28,7 +28,7 @@ def world_of(scenario: Scenario, seed: int = 1) -> WorldStreams:
 
 
 def content(stream: RobotStream) -> list[bytes]:
-    """All that the robot itself measures, without its teammates' sightings."""
+    """Measurements without sightings of teammates."""
     seen, odometry = stream.landmark_detections, stream.intervals
     arrays = [odometry.forward, odometry.yaw_rate, seen.offsets, seen.ids, seen.ranges]
     assert stream.truth is not None
@@ -36,7 +36,7 @@ def content(stream: RobotStream) -> list[bytes]:
 
 
 def true_detections(stream: RobotStream, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Range and bearing, from truth, of every observation of a stream with a message per step."""
+    """True range and bearing of every observation of a stream with a message per step."""
     seen = stream.landmark_detections
     step = np.repeat(np.arange(1, len(seen.offsets)), np.diff(seen.offsets))
     across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]

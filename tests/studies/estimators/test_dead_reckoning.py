@@ -1,4 +1,4 @@
-"""Dead reckoning is the composition of its increments, and its Gaussian is true on SE(2)."""
+"""Dead reckoning composes its increments, and its Gaussian is true on SE(2)."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -32,7 +32,7 @@ def reckoned(steps, start=START, measurements=NOTHING):
 
 
 def drive(seed, steps=20):
-    """Told increments of a robot, and where they truly led it."""
+    """Measured increments of a robot, and its true path."""
     rng = np.random.default_rng(seed)
     told = [increment_of(MOTION, 1.0, 0.98, rng.uniform(-0.15, 0.15)) for _ in range(steps)]
     truth = START
@@ -43,7 +43,7 @@ def drive(seed, steps=20):
 
 
 def mean_nees(covariance_of, runs=80):
-    """The mean over runs of ξᵀ C⁻¹ ξ / 3 with truth = mean ∘ Exp(ξ)."""
+    """Mean over runs of ξᵀ C⁻¹ ξ / 3 with truth = mean ∘ Exp(ξ)."""
     total = 0.0
     for seed in range(runs):
         told, truth = drive(seed)
@@ -59,7 +59,7 @@ def test_its_covariance_is_true_and_one_that_is_only_added_up_is_not():
 
 
 def added_up(told):
-    """The covariance of a robot that never turns; a little more, since so it is singular."""
+    """Covariance of a robot that never turns, enlarged a little since it is singular."""
     covariance = sum(step.covariance for step in told)
     return covariance + 1e-9 * np.diag(np.diag(covariance))
 

@@ -135,9 +135,7 @@ def test_a_first_sight_adds_the_landmark_with_its_cross_terms_and_changes_nothin
 
 @functools.cache
 def short_run(seed, repeat):
-    """NEES, NIS and their dofs of ten steps among six landmarks, each measurement `repeat`
-    times.
-    """
+    """NEES, NIS and dofs of ten steps among six landmarks, each measurement `repeat` times."""
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-12.0, 12.0, (6, 2))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.005)

@@ -1,4 +1,4 @@
-"""The innovation of a keyframe: what it is, and that it tells right models from wrong ones."""
+"""The innovation of a keyframe: its definition, and its power to reject wrong models."""
 
 import numpy as np
 import pytest

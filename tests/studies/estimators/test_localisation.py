@@ -32,7 +32,7 @@ def sights(pose, landmarks=LANDMARKS):
 
 
 def log_likelihood(poses, seen, ranges, bearings, sensor=SENSOR):
-    """Σ log p(z | pose) of each of many poses, by broadcasting."""
+    """Σ log p(z | pose) of many poses, by broadcasting."""
     d = LANDMARKS[seen] - poses[:, None, :2]
     r = np.hypot(d[..., 0], d[..., 1])
     sigma = np.hypot(sensor.range_sigma, sensor.range_sigma_per_m * r)
@@ -79,7 +79,7 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
 
 @functools.cache
 def short_run(seed, repeat):
-    """Compute NEES and NIS of eight steps; each measurement counts `repeat` times."""
+    """NEES and NIS of eight steps; each measurement counts `repeat` times."""
     random, judged = np.random.default_rng(seed), innovations.NOTHING
     truth, state = np.zeros(3), localisation.initial_state(np.zeros(3), 1000, IDS, LANDMARKS)
     for _ in range(8):

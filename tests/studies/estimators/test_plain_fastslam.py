@@ -1,4 +1,4 @@
-"""FastSLAM over a whole run: the same filter as a window's, and as over-confident as known."""
+"""FastSLAM over a whole run: a window's filter, with the known overconfidence."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ def test_the_map_is_the_mixture_of_the_particles_maps_by_id():
 
 
 def short_run(seed, repeat):
-    """Compute the map's NEES and dof; each measurement counts `repeat` times."""
+    """NEES and dof of the map; each measurement counts `repeat` times."""
     told = drive(seed, ACCURATE, steps=8)
     start = plain_fastslam.initial_state(np.zeros(3), 500, "fastslam2", 0.5)
     state = filtered(told, ACCURATE, start, np.random.default_rng(seed), repeat)

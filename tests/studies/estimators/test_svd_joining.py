@@ -1,4 +1,4 @@
-"""Downs' joining against least squares written again, and what its covariances are worth."""
+"""Downs' joining against an independent least squares, and its covariances."""
 
 import numpy as np
 import pytest
@@ -72,7 +72,7 @@ def test_the_identity_gives_the_least_squares_map_and_its_covariance(robots):
 
 
 def map_nees(weighting, honest, runs=80):
-    """NEES and dof of the map over many teams; spherical submaps are drawn as they are weighted."""
+    """NEES and dof of the map over many teams; spherical submaps are drawn as weighted."""
     values = []
     for seed in range(runs):
         made = team(seed, robots=2, submaps=3, sigmas=(0.05, 0.05, 0.05))
@@ -106,7 +106,7 @@ def test_where_errors_are_spherical_the_map_is_consistent_and_where_they_are_not
 
 
 def two_maps(seed, sigma=0.1, common=4):
-    """Maps of overlapping landmarks about a truth, the second in a frame of its own."""
+    """Maps of overlapping landmarks about a truth, the second in its own frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-10.0, 10.0, (common + 4, 2))
     a_from_b = np.array([*rng.uniform(-20.0, 20.0, 2), rng.uniform(-3.0, 3.0)])

@@ -1,4 +1,4 @@
-"""Robots that run an estimator over a stream, with and without landmark names."""
+"""Robots that run an estimator over a stream, with and without identities."""
 
 import msgspec
 import numpy as np
@@ -43,7 +43,7 @@ def of_name(estimator, **options):
 
 
 def fed(member, measurements=MEASUREMENTS):
-    """Everything that is new, in order."""
+    """All new messages, in order."""
     driven = []
     for measurement in measurements:
         if isinstance(measurement, m.Observations):

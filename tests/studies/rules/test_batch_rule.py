@@ -1,4 +1,4 @@
-"""The rule `batch`: equal to GTSAM on the same measurements; it names what it neglects."""
+"""The rule `batch`: equal to GTSAM on the same measurements; it reports what it neglects."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""Fusion of whole maps: one-dimensional cases by hand, and the properties of each rule."""
+"""Fusion of whole maps: one-dimensional cases by hand, and each rule's properties."""
 
 import numpy as np
 from hypothesis import given, settings
