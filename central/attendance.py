@@ -1,4 +1,4 @@
-"""Track which robots are present, how far each is, and which the final map awaits."""
+"""Track the presence and progress of each robot, and which the final map awaits."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,9 +16,9 @@ MOST_NOTED = 1_000
 class Attendance:
     """The progress and presence of one robot at the centre.
 
-    done: the accepted one of the `Done` messages; dones: all that arrived. began: the latest
-    incarnation that has begun; 0: none. head: the newest head of its driver, in a live team.
-    driver: whether its driver is present; None: unknown.
+    done: the accepted one of the `Done` messages `dones`. began: the latest incarnation that has
+    begun; 0: none. head: the newest of its driver, in a live team. driver: whether that is present;
+    None: unknown.
     """
 
     alive: bool = False
@@ -48,9 +48,7 @@ class Attendance:
 
     @property
     def has_all(self) -> bool:
-        """Whether the robot has consumed all that its driver numbered, and the stream is not
-        open.
-        """
+        """Whether the robot has consumed all that its driver numbered, and the stream has ended."""
         head, done = self.head, self.done
         if head is None or done is None or head.state == "open":
             return False
@@ -61,7 +59,7 @@ S = TypeVar("S")
 
 
 class Awaited(Generic[S]):
-    """Tests whether any of many is awaited: the last awaited one first, then all."""
+    """Tests whether any of many is awaited, the last awaited one first."""
 
     def __init__(self) -> None:
         self._left: list[S] = []
@@ -77,7 +75,7 @@ class Awaited(Generic[S]):
 
 
 class Least:
-    """The least of many named values that change one by one; infinite without any."""
+    """The least of named values that change one by one; infinite without any."""
 
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
@@ -118,9 +116,9 @@ Processed = Callable[[tuple[str, int]], int]
 class TeamAttendance:
     """Progress and presence of each robot of the team.
 
-    now_ns: the newest team time in any message. world_end: the last counters that the world
-    announced. ends: all announced ends, refused ones included; one that the robots' `Done` messages
-    confirm becomes world_end. ordered: an operator has ordered the live team to end.
+    now_ns: the newest team time in any message. world_end: the world's last counters. ends: all
+    announced ends, refused ones included; one that the robots' `Done` messages confirm becomes
+    world_end. ordered: an operator has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
@@ -202,7 +200,7 @@ class TeamAttendance:
             self._changed.add(name)
 
     def note_end(self, end: m.End) -> None:
-        """Keep an announced end, accepted or refused: the robots' `Done` may confirm it."""
+        """Keep an announced end, even a refused one: the robots' `Done` may confirm it."""
         note(end, self.ends)
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
@@ -257,7 +255,7 @@ class TeamAttendance:
         )
 
     def contradicts(self, end: m.End) -> str | None:
-        """Give the reason why this cannot be the end of the team's streams, if any."""
+        """Give the reason why this cannot be the end of the team's streams."""
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
@@ -276,7 +274,7 @@ class TeamAttendance:
         """Whether the final map need not wait for this robot: all its submaps arrived, it was given
         up, or it was withdrawn and is offline.
 
-        The map waits for a lost robot: it may return, and the map must not depend on when.
+        It waits for a lost robot, whose return must not change the map.
         """
         return self._is_excused(name) or self._never_measured(name) or self.is_complete(name)
 
@@ -288,7 +286,7 @@ class TeamAttendance:
     def missing(self) -> list[str]:
         """List the robots whose streams are not complete.
 
-        In a live team that was ordered to end, also those whose drivers may have measured more.
+        After an order to end, also those whose drivers may have measured more.
         """
         return [
             name
@@ -312,7 +310,7 @@ class TeamAttendance:
         return incarnation >= self._last.get(name, incarnation)
 
     def is_concluded(self) -> bool:
-        """Whether the streams have ended and the final map waits for no robot."""
+        """Whether the streams have ended and no robot is awaited."""
         return self._all_settled() or (self._accept_confirmed_end() and self._all_settled())
 
     def _all_settled(self) -> bool:
@@ -323,8 +321,8 @@ class TeamAttendance:
     def _accept_confirmed_end(self) -> bool:
         """Accept an announced end and the robots' `Done` messages that confirm each other.
 
-        Without keys, a stranger can announce an end and a `Done` beyond the last measurement; those
-        of the world and of its robots still name the same counters.
+        Without keys a stranger can announce a later end and a `Done`; the world and its robots
+        still name the same counters.
         """
         for end in self._possible_ends():
             found = {s.robot: self._confirmed(s) for s in end.streams}
@@ -358,7 +356,7 @@ class TeamAttendance:
         return next(filter(self.has_received, same), None)
 
     def takes_part(self, name: str) -> bool:
-        """Whether the robot may still send a map; a lost one may return."""
+        """Whether the robot, even a lost one, may still send a map."""
         robot = self.robots[name]
         return robot.done is None and not robot.given_up
 
@@ -366,7 +364,7 @@ class TeamAttendance:
     def watermark_ns(self) -> float:
         """The least progress of the live robots: every submap that ends before it has arrived.
 
-        Only robots with a message since the last call are evaluated again.
+        Only robots with a message since the last call are evaluated.
         """
         of_all = (self.end, self.withdrawn, self.ordered, self._has_head)
         if of_all != self._of_all:
@@ -378,8 +376,8 @@ class TeamAttendance:
         return self._least.value
 
     def _until_ns(self, name: str) -> float:
-        """Progress of one robot if all its submaps until then have arrived; infinite where the map
-        does not wait for it.
+        """Progress of one robot if all its submaps until then have arrived; infinite where it is
+        not awaited.
         """
         robot = self.robots[name]
         if robot.lost or self._is_away(robot) or self.is_settled(name):
@@ -390,9 +388,7 @@ class TeamAttendance:
         return progress.stamp_ns
 
     def _is_away(self, robot: Attendance) -> bool:
-        """Whether a robot of a live team has not begun or has no driver; late messages roll the
-        fold back.
-        """
+        """Whether a robot of a live team has not begun or has no driver."""
         if not self.is_live:
             return False
         head = robot.head

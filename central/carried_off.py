@@ -1,8 +1,7 @@
 """Describe the seams at which the fold cut a stream: its robot was carried off or slipped.
 
-Without landmark names the fold cuts a stream where its view changes at once (`continuity`). With
-names it needs no cut: the robust loss discounts the one submap in which the robot was carried off,
-the others lie where their landmarks are, and the diagnosis (`hypotheses`) names the jump.
+With landmark names the fold makes no cut: the robust loss discounts the submap in which the robot
+was carried off, and the diagnosis (`hypotheses`) names the jump.
 """
 
 import math
@@ -28,11 +27,11 @@ Pose = Float[np.ndarray, "3"]
 class CarriedOff(NamedTuple):
     """A motion of a robot that its odometry did not measure.
 
-    before, after: numbers of the last submap before it and of the first one after it. begin_ns,
-    end_ns: their end and beginning, equal where no submap is between. by: the motion in the map's
-    frame (x [m], y [m], turn [rad]). in_all: `by` includes the robot's own motion between the two,
-    since the submap between them is spoilt. evidence: log-likelihood ratio of a view that changed
-    at once. place: (x, y) [m] in the map. `by` is empty until the later part has a place there.
+    before, after: numbers of the submaps around it. begin_ns, end_ns: end of the former and
+    beginning of the latter, equal where no submap is between. by: the motion in the map's frame (x
+    [m], y [m], turn [rad]); empty until the later part has a place there. in_all: `by` includes the
+    robot's own motion in a spoilt submap. evidence: log-likelihood ratio. place: (x, y) [m] in the
+    map.
     """
 
     robot: str
@@ -47,10 +46,9 @@ class CarriedOff(NamedTuple):
 
 
 def cuts_of(fold: Fold) -> list[CarriedOff]:
-    """Describe the seams at which a fold has cut streams, and the motion where both parts are in
-    one island.
+    """Describe the cuts of a fold, and the motion where both parts are in one island.
 
-    Not carried off is a part that lies where the odometry puts it.
+    A part that lies where the odometry puts it was not carried off.
     """
     found = []
     for cut in fold.cuts:
@@ -81,7 +79,7 @@ def cuts_of(fold: Fold) -> list[CarriedOff]:
 
 
 def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
-    """Return the motion from the end of a part to the oldest start of the next one, and its χ²."""
+    """Return the motion between the ends of two parts, and its χ²."""
     island = fold.islands[fold.home[earlier]]
     nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
     mean, covariance = joint_marginal(island, nodes)

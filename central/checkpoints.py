@@ -17,8 +17,8 @@ NEAR = 4
 class Checkpoint:
     """The fold after a tick.
 
-    tested: number of submaps when suspects were last tested. number: count of folded ticks, this
-    one included. ahead: the same fold condensed, cached for the next tick.
+    tested: number of submaps when suspects were last tested. number: count of folded ticks. ahead:
+    the same fold condensed, for the next tick.
     """
 
     tick: int
@@ -29,7 +29,7 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """A stack of checkpoints by tick: a tick is pushed, a late input pops those that lack it."""
+    """A stack of checkpoints by tick; a late input pops those that lack it."""
 
     def __init__(self) -> None:
         self.kept: tuple[Checkpoint, ...] = ()
@@ -46,11 +46,11 @@ class Checkpoints:
 
     @property
     def tested(self) -> int:
-        """Number of submaps in the fold when suspects were last tested; 0 if never."""
+        """Number of submaps when suspects were last tested; 0 if never."""
         return self.kept[-1].tested if self.kept else 0
 
     def push(self, tick: int, fold: Fold) -> None:
-        """Push the fold after one more tick; compact older ones and thin them by age."""
+        """Push the fold after a tick; compact older ones and thin them by age."""
         *before, last = self.kept or (None,)
         number = 1 if last is None else last.number + 1
         older = () if last is None else (*before, _compacted(last))
@@ -70,7 +70,7 @@ class Checkpoints:
         return ahead
 
     def note_tested(self, size: int) -> None:
-        """Note that suspects were tested in the last fold, with this number of submaps."""
+        """Note that suspects were tested in the last fold."""
         self.kept = (*self.kept[:-1], replace(self.kept[-1], tested=size))
 
     def roll_back(self, tick: float) -> None:
@@ -84,10 +84,10 @@ def _compacted(checkpoint: Checkpoint) -> Checkpoint:
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
-    """Select the checkpoints to keep, ever fewer with age.
+    """Select the checkpoints to keep: two to four of those that are n to 2n ticks old.
 
-    Two to four of those that are n to 2n ticks old are kept: a late submap is folded from a
-    checkpoint at most twice as old as itself, and there are about twenty in all.
+    A late submap is folded from a checkpoint at most twice as old as itself; there are about
+    twenty.
     """
     last = kept[-1].number
     return tuple(each for each in kept if each.number % _spacing(last - each.number) == 0)

@@ -20,11 +20,9 @@ ClassName = Annotated[str, Meta(pattern="^[A-Za-z][A-Za-z0-9_ -]{0,31}$")]
 
 
 class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Prior standard deviations of the errors shared by all robots, beside each robot's own; 0:
-    none.
+    """Prior standard deviations of the errors shared by all robots; 0: none.
 
-    marker: share of the range by which a landmark's marker appears too far to every robot, since it
-    hangs higher or differs in size.
+    marker: share of the range by which a landmark's marker appears too far to every robot.
     """
 
     bearing: NonNegative = 0.0
@@ -38,8 +36,7 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A landmark ~ N((x, y), P) in the team's frame [m].
 
-    landmark: its number. sigma_m: standard deviation of each coordinate. covariance: xx, xy, yy of
-    P [m²] instead.
+    landmark: its number. sigma_m: of each coordinate. covariance: xx, xy, yy of P [m²] instead.
     """
 
     landmark: Annotated[int, Meta(ge=0, lt=UNNAMED)]
@@ -65,32 +62,29 @@ class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fusion rule and its parameters.
 
     fusion: `join` joins submaps by least squares; `teamslam.team.pairs` lists the inputs of the
-    others. Under rules with feedback the robots' covariance counts measurements more than once,
-    save that of `covariance-intersection`. tick_s: span of team time that is folded at once.
-    broadcast_s: least team time between two broadcasts of the map. batch_robust_c: under `batch`
-    and for `batch-reference`, scale of the Cauchy loss on sqrt(chi2) of each measurement (a range
-    and a bearing); absent: plain squares. landmark_submaps: number of consistent submaps that a
-    landmark needs to enter the map; above 1 where outliers are expected. covariance_factor: scales
-    the submaps' covariances; 1 for errors independent from measurement to measurement.
-    normal_scale: the monitor's covariance scale where the covariances are right: 1 where the errors
-    of windows are independent; less where part of them outlasts a window. particles: of
-    `joint-fastslam`.
-    bias_sigma: of the errors whose sensitivities robots send. common_bias_sigma: of the part of
-    them that all robots share, in addition. joined_ranges: for errors proportional to the range,
-    weight a submap's landmarks by the range in the joined map: weighted by the measured range,
-    short measurements weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per
-    direction, of the measured point of a landmark, the same for all robots, about the landmark's
-    place (the front of a cylinder, a marker beside its post); added to the map's covariance of each
-    landmark. withdraw_above: a robot is withdrawn if the cost of the team's submaps per degree of
-    freedom exceeds this with it, and the rest of the team agrees without it and without no other
-    robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of one
-    submap; one below them has its covariance raised by them, and is named; 0: none. bounds:
-    submaps, inter-robot measurements and initial poses beyond them are refused. association:
-    thresholds for merging landmarks without identities, by kind of sensor. surveyed: landmarks at
-    known places, which fix the team's frame. datum: latitude and longitude of that frame's origin,
-    where x is east and y is north: results are given in degrees, too. classes: names of the
-    landmarks' classes by their numbers 0, 1, …, in tables and reports. localise: robots are
-    localised in the loaded saved map, which is neither changed nor extended; under `join`.
+    others. Rules with feedback but `covariance-intersection` count measurements more than once in
+    the robots' covariance. tick_s: team time that is folded at once. broadcast_s: least team time
+    between two maps. batch_robust_c: for `batch` and `batch-reference`, scale of the Cauchy loss on
+    sqrt(chi2) of each measurement; absent: plain squares. landmark_submaps: number of consistent
+    submaps that a landmark needs to enter the map; above 1 where outliers are expected.
+    covariance_factor: scales the submaps' covariances; 1 for independent errors. normal_scale: the
+    monitor's covariance scale where covariances are right; below 1 where part of the errors
+    outlasts a window. particles: of `joint-fastslam`.
+
+    bias_sigma: of the errors whose sensitivities robots send. common_bias_sigma: of the part that
+    all robots share, in addition. joined_ranges: for errors proportional to the range, weight a
+    submap's landmarks by the range in the joined map; by the measured range short measurements
+    weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per direction, of the
+    point that all robots measure about the landmark's place (the front of a cylinder); added to the
+    map's covariance. withdraw_above: a robot is withdrawn if the cost of the team's submaps per
+    degree of freedom exceeds this with it, and the rest of the team agrees without it and without
+    no other robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of
+    one submap, which raise smaller ones; 0: none. bounds: submaps, inter-robot measurements and
+    initial poses beyond them are refused. association: thresholds for merging landmarks without
+    identities, by kind of sensor. surveyed: landmarks at known places, which fix the team's frame.
+    datum: latitude and longitude of that frame's origin (x east, y north), for results in degrees.
+    classes: names of the classes 0, 1, …, in tables and reports. localise: localise robots in the
+    loaded saved map, which stays as it is; under `join`.
     """
 
     fusion: FusionRule = "join"

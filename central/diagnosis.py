@@ -1,9 +1,9 @@
-"""The diagnosis of a map: the causes of its misfit, the best one first, with remedies.
+"""The causes of a map's misfit, the best one first, with remedies.
 
 A pure function of the fold and the withdrawn robots' submaps. Landmarks with two places and robots
-that were carried off are hypotheses that are solved (`map_joining.hypotheses`). Errors that all
-submaps of a robot share are states of the map. A mirrored robot's submaps fit the others' map by a
-reflection. The covariance scale is judged last, beside all accepted causes.
+that were carried off are hypotheses that are solved (`map_joining.hypotheses`). Shared errors of a
+robot's submaps are states of the map. A mirrored robot's submaps fit the map by a reflection. The
+covariance scale is judged last, beside all accepted causes.
 """
 
 import math
@@ -56,7 +56,7 @@ MIRRORED_REMEDY = (
 
 
 class _SharedError(NamedTuple):
-    """An error that a robot's submaps share: cause, least size, unit, words, and remedy."""
+    """A shared error of a robot's submaps: cause, least size, unit, words, remedy."""
 
     cause: m.Cause
     least: float
@@ -112,9 +112,9 @@ def diagnose(
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
-    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the covariance
-    scale where covariances are right; scale: the team's, or its cost per degree of freedom. final:
-    see `monitor.finding`.
+    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the right
+    covariance scale; scale: the team's, or its cost per degree of freedom. final: see
+    `monitor.finding`.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
@@ -150,9 +150,9 @@ def diagnose(
 
 
 def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
-    """Whether an apparent jump has less evidence than an error that the robot's submaps share.
+    """Whether an apparent jump has less evidence than an error of the robot's submaps.
 
-    The windows of a robot whose clock is late are bent where it turns, beyond their sensitivities.
+    A late clock bends windows where the robot turns, beyond their sensitivities.
     """
     if jump.cause != CARRIED_OFF:
         return False
@@ -172,12 +172,11 @@ def _shared_errors(
 ) -> Iterator[m.Diagnosis]:
     """Find errors that differ from the robot's configuration beyond doubt.
 
-    Their standard deviation is the larger of two: the stated one times the root of a covariance
-    scale above 1, and that from the scatter of the submaps. Errors that change slowly look like a
-    shared one, but the submaps scatter about it. Of that scatter, known from few independent
-    submaps, an error must exceed more than chance does once in a thousand (Student's t). The
-    standard deviation of a large error grows by the error of its sensitivities, which vanishes with
-    it.
+    Their standard deviation is the larger of the stated one, times the root of a covariance scale
+    above 1, and that from the scatter of the submaps: errors that change slowly look like a shared
+    one, but scatter about it. Of that scatter an error must exceed more than chance does once in a
+    thousand (Student's t). A large error's standard deviation grows by the error of its
+    sensitivities.
     """
     for found in biases:
         (robot, _), bias, value, stated = found
@@ -200,8 +199,8 @@ def _shared_errors(
 
 
 def _student(sigmas: float, freedom: float) -> float:
-    """Return the multiple of an estimated standard deviation that chance exceeds as rarely as that
-    of an exact one: t ≈ √(ν (exp(z²/ν) − 1)) (Wallace 1959).
+    """Multiple of an estimated standard deviation as rare as that of an exact one: t ≈ √(ν
+    (exp(z²/ν) − 1)) (Wallace 1959).
     """
     if freedom == math.inf:
         return sigmas
@@ -227,7 +226,7 @@ def _of_cut(each: CarriedOff) -> m.Diagnosis:
 
 
 def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> Iterator[m.Diagnosis]:
-    """Find robots whose submaps fit the others' landmarks reflected, and not as they are.
+    """Find robots whose submaps fit the others' landmarks only reflected.
 
     With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
     leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
@@ -272,9 +271,9 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
 def _gain_of_reflection(
     places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
 ) -> float | None:
-    """Evaluate χ² of a submap's landmarks by the best rotation less that by the best reflection.
+    """χ² of a submap's landmarks by the best rotation less that by the best reflection.
 
-    places: the map's landmarks x + iy [m], by id. sole: those that the robot alone observes.
+    places: landmarks x + iy [m] by id. sole: those that the robot alone observes.
     """
     ids = submap.local.ids.tolist()
     own = [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
@@ -316,9 +315,7 @@ def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
 
 
 def _remedy_of_scale(robot: str, value: float) -> str:
-    """Describe the remedy for a covariance scale: other sigmas within MOST_SCALE, since noise is
-    hardly stated further off; a saved map has none.
-    """
+    """Describe the remedy: other sigmas within MOST_SCALE; none for a saved map."""
     if robot.startswith(MAP):
         if value < 1.0:
             return "leave out days that the saved map contains already: each counts once"
@@ -335,9 +332,7 @@ def _remedy_of_scale(robot: str, value: float) -> str:
 
 
 def widening(found: Sequence[m.Diagnosis]) -> float:
-    """Return the factor on the final map's covariances: the team's covariance scale where it is
-    above 1 beyond doubt, else 1.
-    """
+    """Return the team's covariance scale where above 1 beyond doubt, else 1."""
     scales = (each.value[0] for each in found if each.cause == NOISY and not each.robot)
     return next(scales, 1.0)
 
@@ -398,7 +393,7 @@ def _describe_shared_error(found: m.Diagnosis) -> str:
 
 
 def to_object(found: m.Diagnosis) -> dict[str, object]:
-    """Make the JSON object of a cause; `value` is a number, or [dx, dy] of a moved landmark."""
+    """Make the JSON object of a cause; `value`: a number, or [dx, dy]."""
     values: list[object] = []
     for numbers in (found.value, found.sigma):
         if found.cause == MOVED:

@@ -1,10 +1,9 @@
-"""Warnings about fixes that contradict the map, with the delay or antenna that would explain them.
+"""Warnings about fixes that contradict the map, with a delay or antenna that explains them.
 
-At a pose node (p, θ) with the body's velocity v, a fix z of the antenna a with the covariance σ² I
-leaves the residual e = R(θ)ᵀ (z − p) − a. Fixes that are late by δ, of an antenna that is off by b,
-have e = b − δ v. Weighted least squares over a robot's nodes give (b, δ) with their covariance,
-scaled by the residuals that remain. The map follows its fixes in part, so that an error is rather
-larger than the estimate.
+At a pose node (p, θ) with velocity v, a fix z of the antenna a with covariance σ² I leaves e =
+R(θ)ᵀ (z − p) − a. Fixes late by δ, of an antenna off by b, have e = b − δ v. Weighted least squares
+give (b, δ) with covariance, scaled by the remaining residuals. The map follows its fixes in part,
+so an error is rather larger than the estimate.
 """
 
 import math
@@ -39,7 +38,7 @@ PRIOR_SIGMA = 10.0
 
 
 class _Residual(NamedTuple):
-    """Residual e [m], the body's velocity v [m/s], and the information w/σ² of one fix."""
+    """Residual e [m], velocity v [m/s], and information w/σ² of one fix."""
 
     e: Float[np.ndarray, "2"]
     v: Float[np.ndarray, "2"]
@@ -47,7 +46,7 @@ class _Residual(NamedTuple):
 
 
 def fix_warnings(fold: Fold) -> Iterator[str]:
-    """Warn of robots many of whose fixes contradict the map, and of late or displaced fixes."""
+    """Warn of robots with many contradictory fixes, and of late or displaced ones."""
     if fold.main_key is None:
         return
     island = fold.main
@@ -80,7 +79,7 @@ def fix_warnings(fold: Fold) -> Iterator[str]:
 
 
 def _residual(island: Island, fix: Encounter, weight: float, around: tuple[int, int]) -> _Residual:
-    """Residual of a fix, with the velocity between the robot's pose nodes of the stamps around."""
+    """Residual of a fix, with the velocity between pose nodes around."""
     seen = fix.sighting
     before, after = (_pose(island, island.graph.poses[seen.stream, each]) for each in around)
     body = inverse(_pose(island, fix.teammate))
@@ -99,7 +98,7 @@ def _pose(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _explained(stream: Stream, residuals: Sequence[_Residual]) -> Iterator[str]:
-    """Word the antenna's displacement and the delay that the residuals show beyond chance."""
+    """Word the antenna's displacement and the delay that are beyond chance."""
     J = np.zeros((2 * len(residuals), 3))
     J[0::2, 0] = J[1::2, 1] = 1.0
     J[:, 2] = [-value for each in residuals for value in each.v.tolist()]

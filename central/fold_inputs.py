@@ -1,10 +1,10 @@
 """The inputs of a fold by ticks of team time: submaps, initial poses and verdicts.
 
-They only grow, except for verdicts, which an operator may withdraw. None depends on a fold, so a
-fold without some robots reads the same inputs.
+They only grow, except for verdicts, and depend on no fold: a fold without some robots reads the
+same inputs.
 
-A contribution, a decoded submap, is several times as large as its message; it is decoded on demand
-and cached while some fold has it.
+A contribution is several times as large as its message; it is decoded on demand and cached while
+some fold has it.
 """
 
 import math
@@ -47,7 +47,7 @@ STORED_DIGESTS = 4
 
 
 class Members:
-    """Submaps by tick, with the inter-robot measurements from them and the digests of both.
+    """Submaps by tick, with their inter-robot measurements and the digests of both.
 
     Tick b has the submaps that end in (b·tick, (b + 1)·tick].
     """
@@ -55,9 +55,7 @@ class Members:
     def __init__(
         self, tick_ns: int, least_sigma: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
     ) -> None:
-        """File members. factor: the join's on the covariances of submaps, which a saved map's
-        covariance contains.
-        """
+        """File members. factor: on the covariances of submaps, as a saved map's contains it."""
         self.tick_ns = tick_ns
         self._factor = factor
         self._least_sigma = least_sigma
@@ -77,7 +75,7 @@ class Members:
         sightings: Sequence[SightingFactor],
         own: OwnBiases = NO_OWN,
     ) -> int:
-        """File a submap, named by `digest`, with the `sightings` from it; return its tick.
+        """File a submap with the `sightings` from it; return its tick.
 
         own: the errors of single robots in a saved map.
         """
@@ -102,7 +100,7 @@ class Members:
         return (end_ns - 1) // self.tick_ns
 
     def behind(self, after: float, last: float = math.inf) -> list[int]:
-        """List the ticks with members after this one, up to the last, ascending."""
+        """List the ticks with members in (after, last], ascending."""
         found = []
         for tick in reversed(self._order):
             if tick <= after:
@@ -112,7 +110,7 @@ class Members:
         return found[::-1]
 
     def has(self, tick: int, gone: Collection[str]) -> bool:
-        """Whether a tick has a submap of a robot that is not withdrawn."""
+        """Whether a tick has a submap of a robot still in the team."""
         return any(key[1] not in gone for key in self._ticks[tick])
 
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
@@ -149,7 +147,7 @@ class Members:
         return self._sightings.get(key, ())
 
     def concerns(self, tick: int, robot: str) -> bool:
-        """Whether a tick has a submap of a robot or an inter-robot measurement of it."""
+        """Whether a tick has a submap or an inter-robot measurement of a robot."""
         return any(
             key[1] == robot or any(each.teammate == robot for each in self.sightings(key))
             for key in self._ticks[tick]
@@ -160,7 +158,7 @@ class Members:
     ) -> bytes:
         """Digest these parts and the members up to a tick, in canonical order.
 
-        The digest of the ticks up to `closed` is cached, by the parts before them.
+        The digest up to `closed` is cached, by the parts before it.
         """
         until, digest = self._named.pop(before, (math.inf, Digest()))
         if until > closed:
@@ -180,10 +178,7 @@ class Members:
 
 
 class FoldInputs:
-    """The set of submaps by ticks, with initial poses and an operator's verdicts.
-
-    robots: those with a submap.
-    """
+    """The set of submaps by ticks, with initial poses and an operator's verdicts."""
 
     def __init__(self, config: CentralConfig) -> None:
         self.robots: set[str] = set()
@@ -211,8 +206,8 @@ class FoldInputs:
         sightings: Sequence[SightingFactor],
         own: OwnBiases = NO_OWN,
     ) -> int:
-        """Add a submap with the inter-robot measurements from it, all named by `digest`; return the
-        first tick that this changes. own: the errors of single robots in a saved map.
+        """Add a submap with the inter-robot measurements from it; return the first tick that this
+        changes. own: see `Members.add`.
 
         The first fix adds the station, before all of the team's time.
         """
@@ -230,27 +225,25 @@ class FoldInputs:
         return self._members.add(submap, digest_of(encoded(submap)), ())
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
-        """Replace the verdicts; return the first tick with both landmarks of a changed one, else
-        infinity.
-        """
+        """Replace the verdicts; return the first tick that judges a changed one, else infinity."""
         changed = self._verdicts.symmetric_difference(verdicts)
         self._verdicts = set(verdicts)
         ticks = (self._tick_judging(each) for each in changed)
         return min((tick for tick in ticks if tick is not None), default=math.inf)
 
     def _tick_judging(self, verdict: Verdict) -> int | None:
-        """Return the first tick with both landmarks' submaps; None while one is missing."""
+        """Return the first tick with both landmarks' submaps."""
         ticks = [self._tick_with.get(each[:3]) for each in verdict[:2]]
         known = [tick for tick in ticks if tick is not None]
         return max(known) if len(known) == len(ticks) else None
 
     def first_tick_of(self, robot: str) -> float:
-        """Return the first tick with a submap or a measurement of a robot, else infinity."""
+        """Return the first tick that concerns a robot, else infinity."""
         ticks = self._members.behind(-math.inf)
         return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
 
     def ticks_after(self, last: float, without: Collection[str]) -> list[int]:
-        """List the ticks after this one with a submap of any other robot, ascending."""
+        """List the ticks after this one with a submap of any other robot."""
         ticks = self._members.behind(last)
         return [tick for tick in ticks if self._members.has(tick, without)]
 
@@ -259,7 +252,7 @@ class FoldInputs:
         return len(self._members.keys(tick, without))
 
     def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
-        """Return the submaps of each of a robot's streams within the bounds, in order."""
+        """Return the submaps of each of a robot's streams within the bounds."""
         found: dict[Stream, list[Contribution]] = {}
         for tick in self._members.behind(-math.inf):
             for key in self._members.keys(tick, ()):
@@ -274,14 +267,13 @@ class FoldInputs:
         return submap_beyond(submap.local, bounds)
 
     def raised(self, without: Collection[str]) -> Mapping[str, int]:
-        """Count, by robot, the folded submaps whose covariance was raised to the least one."""
+        """Count, by robot, the folded submaps of raised covariance."""
         return self._members.raised(without)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """Return the members of a tick without some robots' submaps and measurements of these.
 
-        Submaps, inter-robot measurements and initial poses beyond the bounds are refused, with the
-        reason.
+        Those beyond the bounds are refused, with the reason.
         """
         order = self._members.keys(tick, without)
         submaps = [self._members.contribution(key) for key in order]
@@ -324,7 +316,7 @@ class FoldInputs:
         return sightings, refused
 
     def restore_submaps(self, fold: Fold, last: float, without: Collection[str]) -> Fold:
-        """Restore the condensed submaps of a fold of the ticks up to the last."""
+        """Restore the condensed submaps of a fold up to this tick."""
         if not fold.condensed_count:
             return fold
         ticks = self._members.behind(-math.inf, last)
@@ -336,7 +328,7 @@ class FoldInputs:
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]
     ) -> bytes:
         """Digest a fold's set: `more`, the robots left out, initial poses and verdicts, then the
-        submaps in canonical order. closed: the last tick whose digest is worth caching.
+        submaps in canonical order. closed: the last tick worth caching.
         """
         starts = [
             digest_of(

@@ -1,4 +1,4 @@
-"""The message of a fused map, for rules that do not join submaps."""
+"""The message of a fused map, for rules other than joining."""
 
 import msgspec
 
@@ -29,11 +29,10 @@ def fused_message(
     cost: tuple[float, int] = (0.0, 0),
     reasons: tuple[str, ...] = (),
 ) -> m.FusedMap:
-    """Make the message of a map with its members; without `joint`, with each landmark's own
-    covariance.
+    """Make the message of a map with its members; without `joint`, with one covariance per
+    landmark.
 
-    exchange: number of the lockstep round, if there are rounds. cost: (χ², dof). Landmarks that no
-    receiver accepts are left out (`receivable`).
+    exchange: the lockstep round, if any. cost: (χ², dof). Unreceivable landmarks are left out.
     """
     joint = joint and len(value.ids) <= JOINT_LANDMARKS
     fused = m.FusedMap(
@@ -58,15 +57,13 @@ def fused_message(
 
 
 def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
-    """Make the entry of a version vector for all submaps of (robot, incarnation) up to
-    `sequence`.
-    """
+    """Make the entry for all submaps of (robot, incarnation) up to `sequence`."""
     robot, incarnation = stream
     return m.VersionEntry(robot=robot, incarnation=incarnation, sequence=sequence)
 
 
 def receivable(fused: m.FusedMap) -> m.FusedMap:
-    """Reduce a map to what every receiver accepts; `reasons` gains the reasons for omissions."""
+    """Reduce a map to what every receiver accepts, with `reasons` for omissions."""
     if find_error(fused) is None:
         return fused
     refusals = []

@@ -1,4 +1,4 @@
-"""Make the messages of a map from a fold: the map, priors for robots, their paths."""
+"""Make the messages of a fold: the map, priors for robots, their paths."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -79,7 +79,7 @@ def team_map(
 ) -> m.FusedMap:
     """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
 
-    The covariance is joint in a final map of at most JOINT_LANDMARKS, else each landmark's own.
+    The covariance is joint in a final map of at most JOINT_LANDMARKS.
     """
     joint = tail == "final" and len(shown) <= JOINT_LANDMARKS and bool(fold.contributions)
     ids, means, covariance = _landmarks(fold, shown, joint=joint)
@@ -141,9 +141,8 @@ class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
     Left out: undecided, possible duplicates of a shown one; weak, observed only by submaps of a
-    poorly known heading; missed, by nearly all submaps that look there; those of `repeated`, parts
-    of the map that repeat others. headings: largest heading standard deviation [rad] of each lost
-    stream.
+    poorly known heading; missed, by nearly all submaps that look there; those of `repeated` parts
+    of the map. headings: largest heading standard deviation [rad] of each lost stream.
     """
 
     ids: Sequence[int] = ()
@@ -157,8 +156,8 @@ class Shown(NamedTuple):
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     """Select the landmarks of the map.
 
-    The final map has only those known to be different; unnamed ones must be placed from a known
-    heading and not be missed by most submaps.
+    The final map has only those known to be different; unnamed ones need a known heading and few
+    misses.
     """
     if not fold.contributions:
         return Shown()
@@ -190,7 +189,7 @@ def reasons(
 ) -> tuple[str, ...]:
     """List why robots and landmarks are not in the map, and warnings about it.
 
-    is_explained: whether the diagnosis names a cause of the map's misfit.
+    is_explained: the diagnosis names a cause of the misfit.
     """
     diagnosed = (RIVAL, MISFIT) if is_explained else (RIVAL,)
     return (
@@ -216,7 +215,7 @@ def _lost(shown: Shown) -> Iterator[str]:
 
 
 def _repeated(shown: Shown) -> Iterator[str]:
-    """Describe where the map repeats itself, with two causes that the set cannot tell apart."""
+    """Describe where the map repeats itself, with two indistinguishable causes."""
     for each in shown.repeated:
         x, y = each.place
         dx, dy, turn = each.displacement
@@ -258,10 +257,10 @@ def _listed(names: Sequence[str], most: int) -> str:
 def priors(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: Collection[Stream]
 ) -> list[Outgoing]:
-    """Make the priors of these streams: in the team's map their estimate in its frame, else a
-    message that withdraws earlier priors.
+    """Make the priors of these streams: in the team's map their estimate, else a message that
+    withdraws earlier priors.
 
-    After the final map robots need no estimate: those named are withdrawn.
+    The final map withdraws those of the robots named.
     """
     given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
     parts = [fold.latest_part(stream) for stream in given]
@@ -292,9 +291,8 @@ def priors(
 def gets_landmarks_alone(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, stream: Stream
 ) -> bool:
-    """Whether a stream's prior is the landmarks of a running map, by which it may be placed.
-
-    The stream is outside the team's map, neither withdrawn nor cut.
+    """Whether a stream outside the team's map, neither withdrawn nor cut, gets the landmarks of a
+    running map to be placed by.
     """
     is_out = fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream)
     named_ones = sum(id_ < UNNAMED for id_ in shown)
@@ -302,7 +300,7 @@ def gets_landmarks_alone(
 
 
 def _landmarks_alone(fold: Fold, shown: Sequence[int]) -> LandmarkGaussian:
-    """Make the joint Gaussian of the main island's named landmarks nearest to the origin."""
+    """Joint Gaussian of the main island's named landmarks nearest to the origin."""
     chosen = sorted(id_ for id_ in shown if id_ < UNNAMED)
     if len(chosen) > LANDMARKS_ALONE:
         points = landmark_view.points_of(fold.main, chosen)
@@ -314,9 +312,7 @@ def _landmarks_alone(fold: Fold, shown: Sequence[int]) -> LandmarkGaussian:
 def trajectories(
     fold: Fold, digest: bytes, submaps: Mapping[Stream, Sequence[m.Submap]]
 ) -> list[Outgoing]:
-    """Make the path of every stream, or part of one, in the team's frame: the end poses of its
-    submaps.
-    """
+    """Make the path of every stream or part in the team's frame: the end poses of its submaps."""
     paths = []
     for part in sorted(stream for stream in fold.home if not is_map(stream)):
         if fold.home[part] != fold.main_key:
@@ -342,8 +338,8 @@ def trajectories(
 def _apart(fold: Fold) -> Iterator[str]:
     """Give, for each island beside the team's map, the reason why its robots are not joined.
 
-    Where landmarks have no names, it is the test that the island's best attempt failed, among
-    islands that still exist.
+    Without landmark names it is the test that the island's best attempt failed, among existing
+    islands.
     """
     frames = {min(fold.islands[key].graph.streams): key for key in fold.islands}
     for frame in sorted(frames):

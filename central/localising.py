@@ -1,8 +1,8 @@
-"""Localise robots in a saved map: the map's island, and runs that do not change the map.
+"""Localise robots in a saved map, which stays unchanged (`localise`).
 
-With `localise` of the configuration the fold has the landmarks of the saved map only: others are
-left out of the robots' submaps, which is their marginal. Robots have no start, so the frame is the
-map's. The published map is the saved one; priors and paths are those of the joint solution.
+Landmarks that the saved map lacks are left out of the robots' submaps, which is their marginal.
+Robots have no start, so the frame is the map's. The published map is the saved one; priors and
+paths are those of the joint solution.
 """
 
 from collections.abc import Iterable
@@ -29,7 +29,7 @@ from teamslam.team.wire.arrays import (
 
 
 def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
-    """Leave out the named landmarks of a robot's submap that no saved map has."""
+    """Leave out the named landmarks of a submap that no saved map has."""
     numbers = ids(submap.ids, "ids")
     known = [ids(each.ids, "ids") for each in maps]
     keep = (numbers >= UNNAMED) | np.isin(numbers, np.concatenate([numbers[:0], *known]))
@@ -55,7 +55,7 @@ def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
 
 
 def in_saved_map(fold: Fold) -> Fold:
-    """Return the fold with the island of the saved map alone, an empty one if there is none."""
+    """Return the fold with the island of the saved map alone, or empty."""
     key = next((key for stream, key in sorted(fold.home.items()) if is_map(stream)), None)
     if key is None:
         return EMPTY_FOLD
@@ -64,13 +64,13 @@ def in_saved_map(fold: Fold) -> Fold:
 
 
 def lone_newcomer(fold: Fold) -> Stream | None:
-    """Return the robot that is the main island alone, without a start, beside a saved map."""
+    """Return the robot that is alone in the main island, without a start, beside a saved map."""
     there = [stream for stream, key in fold.home.items() if key == fold.main_key]
     return there[0] if len(there) == 1 and there[0] not in fold.starts else None
 
 
 def saved_landmarks(fused: m.FusedMap, saved: m.SavedMap) -> m.FusedMap:
-    """Replace the landmarks of a team's map by those of the saved map, as they were saved."""
+    """Replace the landmarks of a team's map by those saved."""
     n = len(ids(saved.ids, "ids"))
     joint = fused.final and n <= JOINT_LANDMARKS
     P = unpacked(floats(saved.covariance, "covariance"), 2 * n)

@@ -23,11 +23,11 @@ _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTI
 
 
 class StoredSet:
-    """A centre's set on disk: the messages of robots and operators, as they were sent, each once.
+    """A centre's set on disk: the messages of robots and operators, each once (format:
+    `teamslam.team.peers.set_file`).
 
-    The file format is a peer's (`teamslam.team.peers.set_file`). A restarted centre continues from
-    it: no member is sent again, and the same set gives the same map. Raises SetFileError if the
-    file is unusable.
+    A restarted centre continues from it: no member is sent again, and the map is the same. Raises
+    SetFileError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -86,8 +86,7 @@ class CentralShell:
     """The centre's process: it subscribes, answers requests for its set, runs, and leaves last.
 
     patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
-    that the scenario does not name. store: file of the set, from which a restarted centre
-    continues. maps: saved maps of earlier days.
+    that the scenario does not name. store: file of the set. maps: saved maps of earlier days.
     """
 
     def __init__(
@@ -205,7 +204,7 @@ class CentralShell:
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
-        """The members missing in the set's file, and the absent robots that the map awaits."""
+        """The members missing in the set's file, and the awaited absent robots."""
         now = time.monotonic()
         warnings = [] if self._stored is None else [*self._stored.warnings]
         for robot in self.node.awaited:
@@ -225,7 +224,7 @@ class CentralShell:
     def _request_orders(self) -> None:
         """Query the router for the operator's orders at intervals.
 
-        The operator's command exits at once, and this process may have been offline then.
+        The operator's command exits at once, perhaps while this process is offline.
         """
         now = time.monotonic()
         if now >= self._orders_due:
@@ -233,10 +232,9 @@ class CentralShell:
             self._bus.request(ch.KEPT, "", _ORDERS)
 
     def _gather(self) -> None:
-        """Request submaps that robots have sent and the centre lacks; from robots that appear, all
-        of them.
+        """Request submaps that the centre lacks; of robots that appear, all of them.
 
-        Submaps that a resumed robot took over from an earlier process are in no publisher's cache.
+        Those that a resumed robot took over are in no publisher's cache.
         """
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
@@ -253,7 +251,7 @@ class CentralShell:
             self._bus.request(ch.SENT, stream[0], requested[stream])
 
     def _leave_last(self) -> None:
-        """Wait until all have left, since one that missed the final map may request it."""
+        """Wait until all have left, to answer requests for the final map."""
         deadline = time.monotonic() + FAREWELL_S
         while not self._stop.is_set() and time.monotonic() < deadline:
             self._shell.note(self._patient(self._bus.receive(WAIT_S)))

@@ -1,8 +1,7 @@
 """Decide when the centre publishes a map, and announce withdrawn robots.
 
-Team time is cut into ticks, whose submaps are folded together, and into broadcasts. A running map
-is *closed* where every submap up to its time has arrived, else *provisional*; the *final* one comes
-at the end.
+Submaps are folded by ticks of team time, maps published by broadcasts. A running map is *closed*
+where every submap up to its time has arrived, else *provisional*; the *final* one comes at the end.
 """
 
 import math
@@ -50,10 +49,10 @@ class MapPublisher:
     # Maps.
 
     def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Fold the closed ticks; publish a map if one is due, or for a robot that has begun at an
-        unknown pose, which needs its landmarks.
+        """Fold the closed ticks; publish a map if one is due, or if a robot has begun at an unknown
+        pose, which needs its landmarks.
 
-        closed_ns: every submap that ends up to here has arrived.
+        closed_ns: every submap until then has arrived.
         """
         self.fold.fold_until(closed_ns)
         withdrawals = self._announce_withdrawals(now_ns)
@@ -70,9 +69,8 @@ class MapPublisher:
         return []
 
     def publish_newest(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish a map of the whole set at once, if the last one lacks a submap.
-
-        Submaps ahead of the watermark make it provisional.
+        """Publish a map of the whole set, if the last one lacks a submap; provisional if ahead of
+        the watermark.
         """
         if not self._has_news(math.inf):
             return []
@@ -92,8 +90,8 @@ class MapPublisher:
     def _publish_closed(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
         """Publish the map of the closed ticks, or of the whole set if that has more submaps.
 
-        A teammate's new submap helps most the robots that measure the same landmarks, so it need
-        not wait for the end of its tick. No map has less than the one before it.
+        A teammate's new submap helps at once the robots that measure the same landmarks. No map has
+        less than the one before it.
         """
         ticks_end_ns = closed_ns
         if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]
@@ -123,7 +121,7 @@ class MapPublisher:
     # Version vectors.
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
-        """Return the last submap of each stream up to a time, without the robots left out."""
+        """Last submap of each stream up to a time, without the robots left out."""
         left_out = self._left_out
         lasts = (
             (stream, bisect_right(chain, until_ns, key=_end_ns) - 1)
@@ -149,9 +147,9 @@ class MapPublisher:
     # Withdrawals.
 
     def withdraw(self, order: m.Withdrawal) -> bool:
-        """Withdraw a robot by an order; return False if it was withdrawn before.
+        """Withdraw a robot by an order; return whether this is new.
 
-        Its submaps stay stored, since others may request them.
+        Its submaps stay stored for requests.
         """
         is_new = order.robot not in self.withdrawn
         self.store.add(order)
@@ -160,7 +158,7 @@ class MapPublisher:
         return is_new
 
     def _announce_withdrawals(self, now_ns: int) -> list[Outgoing]:
-        """Publish the withdrawals by the fold since the last call; late submaps may revoke one."""
+        """Publish the fold's withdrawals since the last call; late submaps may revoke one."""
         found = self.fold.convicted
         for robot in sorted(self._announced.keys() - found.keys()):
             del self._announced[robot]

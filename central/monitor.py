@@ -1,11 +1,11 @@
 """The consistency monitor: tests the robots' covariances by their submaps, without the truth.
 
-Two figures, both 1 where every covariance is right. The joint cost per degree of freedom is sharp
-(1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but a robust loss bounds it. The
-covariance scale, the median of the submaps' unweighted χ² relative to its expectation
-(docs/decisions/22), is unbounded, insensitive to a minority of outliers, and also shows covariances
-that are too large. With few degrees of freedom it scatters, so a scale out of bounds is one that
-chance alone reaches less than once in a thousand. `teamslam.central.diagnosis` reports it.
+Two figures are 1 where every covariance is right. The joint cost per degree of freedom is sharp
+(1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but bounded by a robust loss.
+The covariance scale, the median of the submaps' unweighted χ² relative to its expectation
+(docs/decisions/22), is unbounded, insensitive to a minority of outliers, and also shows too large
+covariances. A scale out of bounds is one that chance alone reaches less than once in a thousand.
+`teamslam.central.diagnosis` reports it.
 """
 
 import math
@@ -33,7 +33,7 @@ SCALE_SIGMAS = 3.3
 
 
 class Misscale(NamedTuple):
-    """A covariance scale out of bounds, of a robot or of the team (empty)."""
+    """A covariance scale out of bounds, of a robot or the team (empty)."""
 
     robot: str
     value: float
@@ -48,7 +48,7 @@ class Finding:
     misscaled: tuple[Misscale, ...]
 
     def with_biases(self, biases: Sequence[BiasEstimate]) -> "Finding":
-        """Add each bias and its sigma to the figures, by robot and name."""
+        """Add each bias and its sigma, by robot and name."""
         figures = {}
         for (robot, _), bias, value, sigma in biases:
             figures[f"bias.{robot}.{bias}"] = value
@@ -60,11 +60,11 @@ NOTHING = Finding({}, ())
 
 
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
-    """Describe where the team's data contradict the models of all robots together.
+    """Describe where the team's data contradict the models of all robots.
 
-    Odometry and ranges both determine the size of a map. Where they contradict each other, the
-    robots' range scales, each held near its model's, move in the same direction: the joint cost
-    hardly shows it, their mean does.
+    Odometry and ranges both determine the size of a map. Where they contradict, the robots' range
+    scales, each held near its model's, move in one direction: their mean shows it, the joint cost
+    hardly.
     """
     ranges = _mean_of(biases, "range_scale")
     if ranges is None:
@@ -77,7 +77,7 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
 
 
 def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
-    """Mean of one bias over the robots, if too large for errors of single robots."""
+    """Mean of a bias over the robots, if too large for errors of single ones."""
     known = np.array([(value, sigma) for _, bias, value, sigma in biases if bias == name])
     if not len(known):
         return None
@@ -90,9 +90,9 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
 def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) -> Finding:
     """Compute the team's and every robot's figures, and the scales out of bounds.
 
-    normal: the covariance scale where the covariances are right; the reported scale is relative to
-    it. final: of the final map. Before it, covariances that are too large are not reported: the
-    submaps of a robot that has not closed a loop yet hardly contradict each other.
+    normal: the right covariance scale, to which the reported one is relative. final: only the final
+    map reports too large covariances, since before a loop closure a robot's submaps hardly
+    contradict each other.
     """
     figures = {}
     if agreement.dof >= 1.0:
@@ -107,7 +107,7 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
-    """Compute the covariance scale of the team (the empty name) and of each robot."""
+    """Compute the covariance scale of the team (empty name) and each robot."""
     rows = columns_of(submaps)
     places: dict[str, list[int]] = {}
     for place, each in enumerate(submaps):
@@ -122,7 +122,7 @@ def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
 
 
 def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> tuple[Misscale, ...]:
-    """Select the scales out of bounds: the team's, unless a minority of the robots explains it."""
+    """Select the scales out of bounds, the team's unless a minority explains it."""
     judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
     robots = [who for who, each in judged.items() if who and _is_beyond(each, ROBOT_WARN)]
     team = "" in judged and _is_beyond(judged[""], SCALE_WARN)

@@ -5,9 +5,8 @@
             ──> fold         the ticks behind the watermark
             ──> maps         map, priors, withdrawals; at the end the final map
 
-The node subscribes to submaps, progress and liveliness, and to nothing that contains the fused map.
-The centre of a comparison method (`teamslam.sim.studies.rules`) is a subclass with other inputs and
-maps.
+The node subscribes to nothing that contains the fused map. The centre of a comparison method
+(`teamslam.sim.studies.rules`) is a subclass.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -38,9 +37,9 @@ MOST_ROBOTS = 100
 class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
-    inputs: the channels of the set. fold_class: class of its fold. announcement: the configuration,
-    whose digest maps carry. admit: a robot that the scenario does not name joins the team when it,
-    or its driver, appears. warnings: failures in words, the newest last.
+    inputs: the channels of the set. fold_class: of its fold. announcement: the configuration, whose
+    digest maps carry. admit: a robot that the scenario does not name joins when it, or its driver,
+    appears. warnings: failures in words, the newest last.
     """
 
     inputs: ClassVar[tuple[ch.Channel, ...]] = (
@@ -80,7 +79,7 @@ class CentralNode:
         self.final: m.FusedMap | None = None
 
     def restart(self) -> None:
-        """Begin with an empty set, whose members are filed again; the attendance stays."""
+        """Begin with an empty set, to be filed again; the attendance stays."""
         self._begin_set()
         self.attendance.forget_members()
 
@@ -97,7 +96,7 @@ class CentralNode:
         self._loaded = tuple(maps)
 
     def begin(self) -> list[Outgoing]:
-        """Make the first messages of the node: its configuration, and the maps of earlier days."""
+        """Make the first messages: the configuration and saved maps."""
         for saved in self._loaded:
             self.file(saved)
         maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._loaded]
@@ -106,9 +105,7 @@ class CentralNode:
     # Receive.
 
     def refusal(self, message: m.Message) -> str | None:
-        """Give the reason why a message cannot be true of this team: robots, counters, stamps or
-        end.
-        """
+        """Give the reason why a message cannot be true of this team."""
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
@@ -120,7 +117,6 @@ class CentralNode:
         return refused
 
     def _admit(self, message: m.Message) -> None:
-        """Admit a robot that announces itself, or whose driver begins its stream."""
         robot = message.robot if isinstance(message, m.InitialPose) else None
         if isinstance(message, m.Configuration):
             robot = ch.robot_of(message.node)
@@ -132,9 +128,7 @@ class CentralNode:
             self._admitted.append(robot)
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Process one message; `now_ns`, the team time of its arrival, is unused: stamps are
-        time.
-        """
+        """Process one message; `now_ns` is unused: stamps are time."""
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None
@@ -147,11 +141,11 @@ class CentralNode:
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Continue after an exception in the handling of a message, and give its sender the credit.
+        """Continue after an exception in `handle`, and give the sender the credit.
 
         A member that could not be filed counts as refused. A running map that raises does not
-        affect the final one, which the newest computable map replaces if it raises, provisional and
-        with the reason.
+        affect the final one; the newest computable map replaces a final one that raises,
+        provisional and with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)
@@ -169,7 +163,7 @@ class CentralNode:
     # File.
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a member of the set; return the credit of its sender, or the order to repeat."""
+        """File a member of the set; return its sender's credit, or the order to repeat."""
         match message:
             case m.Submap():
                 return self._file_submap(message)
@@ -186,7 +180,7 @@ class CentralNode:
         return self._credit_of(submap, self.store.acknowledged(_stream_of(submap)))
 
     def _file_sighting(self, sighting: m.SightingFactor) -> list[Outgoing]:
-        """File an inter-robot measurement; the last one from a submap completes the submap."""
+        """File an inter-robot measurement, the last of which completes its submap."""
         stream = _stream_of(sighting)
         before = self.store.processed(stream)
         self._warn_of_refusal(self.store.add_sighting(sighting))
@@ -194,9 +188,7 @@ class CentralNode:
         return self._credit_of(sighting, count) if count > before else []
 
     def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Mark a submap as refused if its handling, or that of its inter-robot measurements,
-        raised.
-        """
+        """Mark a submap as refused where it, or a measurement from it, raised."""
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self.store.refuse(message)
@@ -220,10 +212,9 @@ class CentralNode:
         return [Outgoing(ch.CENTRAL_PROGRESS, member.robot, progress)]
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Follow an order, and repeat it for robots that join later: the operator's command has
-        exited.
+        """Follow an order, and repeat it for later robots: the operator's command has exited.
 
-        An order that this centre itself gave in an earlier process is found again by its fold.
+        The fold finds an order of this centre's earlier process again.
         """
         if order.by == "central" or not self.maps.withdraw(order):
             return []
@@ -239,13 +230,11 @@ class CentralNode:
         return out + self._conclude() if self._is_over else out
 
     def publish_due(self) -> list[Outgoing]:
-        """Fold the ticks closed by the least progress of the live robots; make the maps that are
-        due.
-        """
+        """Fold the ticks closed by the live robots' least progress; make the due maps."""
         return self.maps.publish_due(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_newest(self) -> list[Outgoing]:
-        """Make a map of the whole set, if the last one lacks a member."""
+        """Make a map of the whole set, unless the last one has it."""
         return self.maps.publish_newest(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_final(self) -> list[Outgoing]:
@@ -259,7 +248,7 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """Make a map of the whole set when there is time, if the last one lacks a member."""
+        """Make a map of the whole set when there is time, unless the last one has it."""
         return [] if self.finished else self._counted(self.publish_newest())
 
     # Conclude.
@@ -318,7 +307,7 @@ class CentralNode:
 
     @property
     def ends(self) -> bool:
-        """Whether all streams have ended, as announced by the world or the drivers."""
+        """Whether all streams have ended, by the world or the drivers."""
         return self.attendance.end is not None
 
     def requests(self) -> list[m.MeasurementsRequest]:
@@ -326,7 +315,7 @@ class CentralNode:
         return []
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """Request the submaps that robots have announced and no map can have yet."""
+        """Request the submaps announced by robots that no map can have."""
         if self.finished:
             return []
         sent: dict[Stream, int] = {}
@@ -349,9 +338,8 @@ class CentralNode:
         return [encoded(message) for message in self.store.messages_of(robot)]
 
     def answer_site(self, request: bytes) -> Iterable[bytes]:
-        """Answer a `FoldRequest` with a saved map of the present set, solved in full.
-
-        The set is folded anew, so the running fold stays as it is. Raises NothingToSaveError.
+        """Answer a `FoldRequest` with a saved map of the present set, folded anew and solved in
+        full. Raises NothingToSaveError.
         """
         decoded(request, m.FoldRequest)
         fold = self.maps.fold

@@ -1,4 +1,4 @@
-"""Saved maps and the fold: save its final map, and list what has changed since earlier days."""
+"""Saved maps and the fold: save its final map, and list changes since earlier days."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -44,7 +44,7 @@ REMAINDER = 1e-3
 
 
 class NothingToSaveError(ValueError):
-    """A map that cannot be saved; the text gives the reason and the remedy."""
+    """A map that cannot be saved, with reason and remedy."""
 
 
 def save_map(
@@ -56,17 +56,17 @@ def save_map(
     datum: Datum | None = None,
 ) -> m.SavedMap:
     """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
-    firsts: digest of the first submap of each robot's stream in the map, by which maps with
-    measurements in common are recognised. datum: of the map's frame.
+    firsts: digest of the first submap of each robot's stream, which reveals maps with measurements
+    in common. datum: of the map's frame.
 
     With the biases c that all sensors share, landmarks and errors of single robots, y = (o, x), are
-    N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. The map also has the likelihood of
-    (c, o) by the measurements alone. It leaves out the priors, which the later day's settings give:
-    each counts once, and its Student's t keeps the tails that a joint Gaussian would lose.
+    N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. The map also has the likelihood
+    of (c, o) by the measurements alone: the priors are the later day's, so that each counts once,
+    as Student's t.
 
     Landmarks that are gone are left out. One that moved by e, which chance explains at SEQUENTIAL,
-    may be an error of today: its covariance is P_ii + e eᵀ. Where no common bias has the scale of
-    ranges, that of the map is uncertain by SCALE about the landmarks' centre.
+    has covariance P_ii + e eᵀ. Without a common bias of the ranges' scale, that of the map is
+    uncertain by SCALE about the landmarks' centre.
     """
     gone = {each.landmark for each in fused.changes if each.state == "gone"}
     chosen = [id_ for id_ in ids(fused.ids, "ids").tolist() if id_ not in gone]
@@ -125,7 +125,7 @@ def save_map(
 
 
 def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
-    """Encode the evidence of the classes of landmarks without identity, if any has one."""
+    """Encode the class evidence of landmarks without identity, if any."""
     if not any(each.observation.unnamed.classes.size for each in fold.main.graph.observed):
         return b""
     view = view_island(fold.main, fold.landmarks)
@@ -134,9 +134,9 @@ def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
 
 
 def _own_errors(island: Island) -> dict[RobotBias, int]:
-    """Return the nodes of the errors of today's robots that last, each of the robot's last stream.
+    """Return the nodes of the lasting errors of today's robots, each of the last stream.
 
-    Those of robots of earlier days alone stay part of the landmarks' covariance.
+    Those of robots of earlier days stay part of the landmarks' covariance.
     """
     found: dict[RobotBias, int] = {}
     for (stream, bias), node in sorted(
@@ -152,9 +152,9 @@ def _evidence(
 ) -> tuple[Float[np.ndarray, " E"], Float[np.ndarray, "E E"]]:
     """Compute the likelihood N(mean, J⁻¹) of some biases by the island's measurements: (mean, J).
 
-    J = Σ⁻¹ − D with their posterior covariance Σ and the information D of their priors, which are
-    about 0. The error of an earlier day that a bias drifted from is eliminated from J without its
-    prior, too. A part REMAINDER of D stays, so that J is positive definite.
+    J = Σ⁻¹ − D with their posterior covariance Σ and the information D of their priors about 0. The
+    error of an earlier day that a bias drifted from is eliminated without its prior. A part
+    REMAINDER of D stays, so that J is positive definite.
     """
     if not nodes:
         return np.zeros(0), np.zeros((0, 0))
@@ -190,7 +190,7 @@ def _counts(
 
 
 def sensor_warnings(fold: Fold) -> Iterator[str]:
-    """Warn of robots whose own errors are not those that a saved map has of them."""
+    """Warn of robots whose own errors differ from a saved map's."""
     if fold.main_key is None:
         return
     for each in replaced_sensors(fold.main):
@@ -205,9 +205,9 @@ def sensor_warnings(fold: Fold) -> Iterator[str]:
 def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange, ...]:
     """List the state of each landmark against the saved maps in the main island, by number.
 
-    One that several maps have counts as the one that changed most. A landmark that one submap
-    places elsewhere, while none sees it at its former place beyond chance, is gone: a single wrong
-    number does not move it.
+    Of several maps the one with the largest change counts. A landmark that one submap places
+    elsewhere, while none sees it at its former place beyond chance, is gone: a single wrong number
+    does not move it.
     """
     if fold.main_key is None:
         return ()

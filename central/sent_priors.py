@@ -1,12 +1,10 @@
-"""Select the robots that need a prior: those it gives information that they cannot have themselves.
+"""Select the robots that need a prior: those it gives information from teammates (moved landmarks,
+inter-robot measurements), or landmarks that they come near to.
 
-A robot joins its last prior with its own later submaps, so a new prior is worth its bytes only for
-information from teammates (moved landmarks, inter-robot measurements), or for landmarks that it
-comes near to. Priors are most of the centre's traffic.
+A robot joins its last prior with its later submaps, and priors are most of the centre's traffic.
 
-A robot outside the team's map gets the map's landmarks alone by the same rule, as if it was at the
-origin, or one message that withdraws its earlier priors, also from a restarted centre, which has
-sent none.
+A robot outside the team's map gets the landmarks alone by the same rule, as if at the origin, or
+one message that withdraws its earlier priors, also from a restarted centre.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -42,8 +40,8 @@ NEVER = -1
 class _Sent:
     """The map of a robot's last prior and the landmarks in it.
 
-    encounter_ns: team time of the newest inter-robot measurement of the robot or by it. since:
-    number of broadcasts since. frame: the team's, at that time. alone: without a pose.
+    encounter_ns: team time of the newest inter-robot measurement of or by the robot. since: number
+    of later broadcasts. frame: the team's, then. alone: without a pose.
     """
 
     blocks: LandmarkBlocks
@@ -60,7 +58,7 @@ def in_main_island(fold: Fold, stream: Stream) -> bool:
 
 
 class SentPriors:
-    """The last prior of each stream; depends on the broadcasts before, not on the set alone."""
+    """The last prior of each stream; depends on the broadcasts, not on the set alone."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -74,10 +72,10 @@ class SentPriors:
         shown: Sequence[int],
         alone: Collection[Stream] = (),
     ) -> list[Stream]:
-        """Select the streams to which a prior of this fold with these landmarks is to be sent.
+        """Select the streams to which to send a prior of this fold with these landmarks.
 
         alone: those that get landmarks alone. Others outside the team's map are selected once, to
-        withdraw their priors.
+        withdraw theirs.
         """
         inside = [each for each in streams if each in alone or in_main_island(fold, each)]
         out = self._withdrawn({*streams} - {*inside})
@@ -97,7 +95,7 @@ class SentPriors:
         ]
 
     def void(self, fold: Fold, streams: Sequence[Stream]) -> list[Stream]:
-        """Select the streams outside the final map, or whose last prior is in another frame."""
+        """Select the streams outside the final map, or of a prior in another frame."""
         outside = []
         for stream in streams:
             old = self._sent.get(stream)
@@ -119,8 +117,8 @@ class SentPriors:
         encounter_ns: int = NEVER,
         frame: Stream | None = None,
     ) -> bool:
-        """Whether to send a prior at this pose in this map; if so, note it as sent. None: one of
-        landmarks alone.
+        """Whether to send a prior at this pose (None: of landmarks alone); if so, note
+        it as sent.
         """
         offsets = blocks.means if pose is None else blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")

@@ -1,7 +1,6 @@
 """The fold of the stored set, and the messages of a map: the map itself, priors and paths.
 
-The map is a pure function of the set (law 2). Centre, peers and verification run this class: a
-recorded map is reproduced from the set that it names.
+The map is a pure function of the set (law 2). Centre, peers and verification run this class.
 """
 
 import math
@@ -48,7 +47,7 @@ from teamslam.team.wire.digest import digest_of
 
 
 class RecordedFields(NamedTuple):
-    """The fields of a recorded map, and its priors, that do not follow from its set."""
+    """The fields of a recorded map and priors that do not follow from its set."""
 
     missing: tuple[m.VersionEntry, ...]
     arrived: int
@@ -58,8 +57,8 @@ class RecordedFields(NamedTuple):
 class SubmapFold:
     """Folds the stored set tick by tick and makes the messages of its maps.
 
-    warnings: failures in words, the newest last. landmarks: number in the newest map. not_folded:
-    number of refused inputs. finding, diagnosis, reasons: of the newest map.
+    warnings: failures in words, the newest last. landmarks, finding, diagnosis, reasons: of the
+    newest map. not_folded: number of refused inputs.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class SubmapFold:
         *,
         convicts: bool = True,
     ) -> None:
-        """Fold a store. convicts: False for a recorded set: no further robot is withdrawn."""
+        """Fold a store. convicts: False for a recorded set, which withdraws no further robot."""
         self.config = config
         self.config_digest = digest
         self.store = SubmapStore() if store is None else store
@@ -106,8 +105,8 @@ class SubmapFold:
     ) -> list[Outgoing]:
         """Make a map of the stored set and the messages that accompany it.
 
-        The final map is the full solution, and the last message. Other maps have the ticks that end
-        at `closed_ns` or before and, with `ahead`, all later ones.
+        The final map is the full solution, and the last message. Others have the ticks up to
+        `closed_ns` and, with `ahead`, all later ones.
         """
         self._file_members()
         ticks, self._accused = self._ticks, {}
@@ -126,7 +125,7 @@ class SubmapFold:
         return self._messages(ticks, fold, tail, recorded)
 
     def save_map(self, name: str) -> m.SavedMap:
-        """Make a saved map of the final map, the last one made; raises NothingToSaveError."""
+        """Save the final map, the last one made; raises NothingToSaveError."""
         if self.config.localise:
             raise NothingToSaveError("a team that is localised in a saved map makes no map")
         if self._final is None or not self._final[0].contributions:
@@ -137,9 +136,9 @@ class SubmapFold:
         return save_map(fold, fused, name, before, self._first_submaps(fold), datum)
 
     def _first_submaps(self, fold: Fold) -> list[bytes]:
-        """List the digests of the first submaps of the robots' streams in the team's map.
+        """Digests of the first submaps of the robots' streams in the team's map.
 
-        Two maps of a team have a measurement in common only if they have a stream in common.
+        Two maps share a measurement only if they share a stream.
         """
         main = [stream for stream, key in fold.home.items() if key == fold.main_key]
         streams = {whole_of(stream) for stream in main if not is_map(stream)}
@@ -148,7 +147,7 @@ class SubmapFold:
         return [digest_of(encoded(self.store.chains[stream][0])) for stream in sorted(streams)]
 
     def _file_members(self) -> None:
-        """Add the store's new members to the ticks; folded ticks are folded again."""
+        """Add the store's new members; folded ticks are folded again."""
         store, ticks = self.store, self._ticks
         for robot in sorted(store.withdrawals.keys() - self._without):
             ticks.withdraw_robot(robot)
@@ -184,7 +183,7 @@ class SubmapFold:
 
     @property
     def suspended(self) -> Mapping[str, str]:
-        """The robots that the newest map leaves out until they are tested again."""
+        """Robots left out of the newest map until tested again."""
         return {**self._ticks.suspended, **self._accused}
 
     @property
@@ -194,7 +193,7 @@ class SubmapFold:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """Causes of misfit, reasons why robots are not joined, and warnings about the map."""
+        """Causes of misfit, reasons and warnings about the map."""
         return (*map(describe, self.diagnosis), *self._warnings)
 
     @property
@@ -299,8 +298,8 @@ class SubmapFold:
         shown: Sequence[int],
         recorded: RecordedFields | None,
     ) -> list[Outgoing]:
-        """Make the priors that have news, or the recorded ones, each of the latest stream of a
-        robot: from the team's fold, or from the robot's own while robots contradict each other.
+        """Make the priors that have news, or the recorded ones, of each robot's latest stream: from
+        the team's fold, or the robot's own while robots contradict each other.
         """
         out = []
         streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)
@@ -327,7 +326,7 @@ class SubmapFold:
         return out
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
-        """List the latest stream of each robot that is in the map, withdrawn or a newcomer."""
+        """List the latest stream of each robot in the map, withdrawn or a newcomer."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         joined = {(x.robot, x.incarnation) for x in fused.members}
@@ -338,7 +337,7 @@ class SubmapFold:
         return sorted(latest.items())
 
     def _receivable(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """Withhold messages that not every receiver accepts, with a warning."""
+        """Withhold messages that some receiver would refuse, with a warning."""
         accepted = []
         for each in out:
             why = find_error(each.message)

@@ -1,8 +1,8 @@
-"""Surveyed landmarks as a member of the set: a map whose frame is that of the survey.
+"""Surveyed landmarks as a member of the set: a saved map
+(`teamslam.team.estimation.map_joining.saved_maps`) whose start is exactly known.
 
-It is a saved map (`teamslam.team.estimation.map_joining.saved_maps`) whose start is known exactly:
-landmark i ~ N(surveyed place, P_i) in the team's frame, independent of the others. Streams without
-an initial pose are placed by it; a landmark that contradicts the rest is separated from it.
+Landmark i ~ N(surveyed place, P_i) in the team's frame, independent of the others. The survey
+places streams without an initial pose; a contradictory landmark is separated from it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -34,7 +34,7 @@ DIGEST = bytes(8)
 
 
 def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPoseFactor]:
-    """Make the submap of surveyed landmarks about their centroid, and its exact start there."""
+    """Make the submap of surveyed landmarks about their centroid, and its exact start."""
     order = sorted(surveyed, key=lambda each: each.landmark)
     points = np.array([[each.x, each.y] for each in order])
     origin = points.mean(axis=0)
@@ -53,17 +53,17 @@ def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPose
 
 
 def station() -> tuple[Submap, InitialPoseFactor]:
-    """Make the station of fixes, a submap without landmarks, and its exact start."""
+    """Make the station of fixes, a submap without landmarks, and its start."""
     submap = member_of(GNSS, b"", np.zeros(0), np.zeros((0, 0)), b"", config=DIGEST)
     return submap, InitialPoseFactor(*STATION, STATION_POSE)
 
 
 def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -> Datum | None:
-    """Return the datum of a map's frame: that of the configuration, else of a loaded map in the
+    """Return the datum of a map's frame: the configuration's, else that of a loaded map in the
     survey's frame.
 
-    None where the frame is not absolute, no datum is stated, or a landmark is farther than
-    FARTHEST_M from it, as with coordinates of a national grid.
+    None where the frame is not absolute, or a landmark is farther than FARTHEST_M, as with
+    coordinates of a national grid.
     """
     places = floats(fused.means, "means")
     if fused.frame != SURVEY_FRAME or np.abs(places).max(initial=0.0) > FARTHEST_M:
@@ -73,8 +73,8 @@ def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -
 
 
 def survey_warnings(fold: Fold) -> Iterator[str]:
-    """Warn of surveyed landmarks that the rest of the map places elsewhere beyond chance, and of
-    saved maps that already contain a survey.
+    """Warn of surveyed landmarks that the map places elsewhere beyond chance, and of saved maps
+    that already contain a survey.
     """
     if not fold.contributions:
         return

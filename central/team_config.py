@@ -1,4 +1,4 @@
-"""The configuration of a team: its robots, its centre, and their common settings."""
+"""The configuration of a team: robots, centre, common settings."""
 
 from typing import Annotated
 
@@ -15,11 +15,11 @@ KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
     """A scenario without its world: every robot and the centre have the seed, estimator and rule.
 
-    name: of the scenario. team: the chunk of the keys `team/<team>/…` that separates two teams on
-    one network. exchange: with "rendezvous" a robot sends its submaps only when it observes a
-    teammate or is observed. peers: every robot keeps and folds the team's set
-    (docs/without_a_centre.md). centre: whether there is a central computer; without one, robots are
-    peers. Fields that only a world has are ignored in decoding.
+    team: the chunk of the keys `team/<team>/…` that separates two teams on one network. exchange:
+    with "rendezvous" a robot sends its submaps only when it observes a teammate or is observed.
+    peers: every robot keeps and folds the team's set (docs/without_a_centre.md). centre: whether
+    there is a central computer; else robots are peers. Fields of a world alone are ignored in
+    decoding.
     """
 
     name: KeyChunk

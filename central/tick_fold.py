@@ -8,21 +8,19 @@ tick has arrived, so the fold is final.
                                    │ without the robot    └────fold─────┤
                                    └── Conviction <── agreement(fold) <─┘
 
-Each of the three pieces of state has one owner. The inputs depend on no fold. The checkpoints are a
-stack: a tick pushes one; a late submap, a verdict or a withdrawal rolls it back, and the ticks are
-folded again. The conviction, the robots that contradict the rest beyond chance
-(`teamslam.central.withdrawal`), is replaced as a whole; a change folds all ticks again without
-these robots. Agreement is tested after the first tick of each broadcast's time and after the full
-solution, so a withdrawal depends on the set alone, not on order or time of arrival.
+The inputs depend on no fold. A tick pushes a checkpoint; a late submap, a verdict or a withdrawal
+rolls back, and the ticks are folded again. A change of the conviction, the robots that contradict
+the rest beyond chance (`teamslam.central.withdrawal`), folds all ticks again without these.
+Agreement is tested after the first tick of each broadcast's time and after the full solution, so a
+withdrawal depends on the set alone.
 
-A robot with few submaps is suspended: running maps leave it out at once, but it is withdrawn only
-once it has enough of them, or by the full solution. Until then it is tested again, with all its
-submaps, whenever the set has grown by GROWTH. A provisional map is tested by itself.
+Running maps leave out (suspend) a robot with few submaps; it is withdrawn once it has enough, or by
+the full solution. Until then all its submaps are tested whenever the set has grown by GROWTH. A
+provisional map is tested by itself.
 
-The running fold is bounded (`condensing`): its old submaps are condensed before each tick. A tick
-that contradicts them is folded with all of them restored (`relinearising`), and so is the full
-solution. Where landmarks have no names, the full solution folds the ticks again with nothing
-condensed (but see FULL_UNNAMED).
+Old submaps are condensed before each tick (`condensing`), and restored by a tick that contradicts
+them (`relinearising`) and by the full solution. Without landmark names the full solution folds the
+ticks again with nothing condensed (but see FULL_UNNAMED).
 """
 
 import math
@@ -97,9 +95,9 @@ def join_settings(config: CentralConfig) -> JoinSettings:
 class TickFold:
     """Folds a set of submaps tick by tick.
 
-    limits: sizes by which old submaps are condensed; None: never. inputs: those of another fold,
-    read only. convicts: whether the fold withdraws robots by itself. undecided: in words, robots
-    that contradicted each other at the last test, with the wrong one undetermined.
+    limits: sizes for condensing; None: never. inputs: those of another fold, read only. convicts:
+    whether the fold withdraws robots by itself. undecided: in words, contradictory robots of the
+    last test, with the wrong one undetermined.
     """
 
     def __init__(
@@ -140,11 +138,9 @@ class TickFold:
         sightings: Sequence[SightingFactor] = (),
         own: OwnBiases = NO_OWN,
     ) -> None:
-        """Add a submap with the inter-robot measurements from it, all named by `digest`.
+        """Add a submap with the inter-robot measurements from it; roll back to before its tick.
 
         own: the errors of single robots in a saved map.
-
-        The fold is rolled back to before the submap's tick.
         """
         tick = self._inputs.add_submap(submap, digest, sightings, own)
         if submap.robot not in self._gone or tick <= self._conviction.at:
@@ -153,22 +149,18 @@ class TickFold:
             self._roll_back_others(tick)
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> None:
-        """Replace an operator's verdicts on pairs of unnamed landmarks, in present or future
-        submaps.
+        """Replace an operator's verdicts on pairs of unnamed landmarks, present or future.
 
-        The ticks are folded again from the first one with both landmarks of a new or withdrawn
-        verdict.
+        The ticks are folded again from the first that judges a changed verdict.
         """
         tick = self._inputs.set_verdicts(verdicts)
         if math.isfinite(tick):
             self._fold_again(tick)
 
     def withdraw_robot(self, robot: str) -> None:
-        """Leave out a robot's submaps, and the inter-robot measurements by or of it, now and in
-        future.
+        """Leave out a robot's submaps, and inter-robot measurements by or of it, now and in future.
 
-        The result is that of a team without the robot: the ticks are folded again from its first
-        submap, or the first measurement of it.
+        The result is that of a team without the robot.
         """
         if robot not in self._ordered:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
@@ -181,9 +173,8 @@ class TickFold:
         self.fold_until(until_ns)
 
     def roll_back(self, tick: float) -> None:
-        """Drop the ticks folded from this one on, and a conviction based on them.
-
-        A convicted robot was left out from the first tick on: no checkpoint contains it.
+        """Drop the ticks from this one on, and a conviction based on them, with all checkpoints
+        since they lack the robot.
         """
         if tick <= self._conviction.at:
             self._restart(Conviction())
@@ -208,7 +199,7 @@ class TickFold:
 
     @property
     def suspended(self) -> Mapping[str, str]:
-        """The robots that running maps leave out for now, with the reason in words."""
+        """Robots that running maps leave out, with the reason."""
         return {robot: each.reason for robot, each in self._conviction.suspended.items()}
 
     @property
@@ -225,9 +216,9 @@ class TickFold:
         return (self.checkpoints.tick + 1) * self._inputs.tick_ns
 
     def fold_until(self, watermark_ns: float) -> bool:
-        """Fold every tick that ends at the watermark or before; return whether there was one.
+        """Fold every tick up to the watermark; return whether there was one.
 
-        A conviction restarts the fold at its first tick.
+        A conviction restarts the fold.
         """
         folded = False
         while ticks := self._open_ticks(watermark_ns):
@@ -238,12 +229,11 @@ class TickFold:
         return folded
 
     def _open_ticks(self, watermark_ns: float = math.inf) -> list[int]:
-        """List the unfolded ticks up to the watermark, withdrawn robots left out."""
         ticks = self._inputs.ticks_after(self.checkpoints.tick, self._gone)
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
-        """Fold a tick and test it where due; return whether the conviction changed."""
+        """Fold a tick and test it; return whether the conviction changed."""
         before = self.checkpoints.tick
         fold = self._fold_tick(self.fold, tick)
         self.checkpoints.push(tick, fold)
@@ -257,7 +247,7 @@ class TickFold:
         return fold.size >= GROWTH * self.checkpoints.tested and self._convict(fold, tick)
 
     def _fold_tick(self, fold: Fold, tick: int) -> Fold:
-        """Fold a tick, with the condensed submaps restored if it contradicts them."""
+        """Fold a tick, with condensed submaps restored if contradicted."""
         members = self._inputs.tick(tick, self._gone)
         size = fold.size
         if self._limits is None or size <= self._limits.begin:  # nothing is condensed yet
@@ -275,14 +265,14 @@ class TickFold:
     # The robot that contradicts the rest.
 
     def agreement(self, fold: Fold) -> Agreement:
-        """Return the agreement of a fold, cached for the last one, which broadcasts reuse."""
+        """Return the agreement of a fold, cached for the last one."""
         if self._agreed is None or self._agreed[0] is not fold:
             found = marginals.joint_cost(fold)
             self._agreed = fold, found, disagreement(found, least=1)
         return self._agreed[1]
 
     def disagreement(self, fold: Fold) -> Mapping[str, float]:
-        """Return each robot's disagreement in a fold, be it by a single submap; cached likewise."""
+        """Return each robot's disagreement in a fold; cached likewise."""
         self.agreement(fold)
         assert self._agreed is not None
         return self._agreed[2]
@@ -300,8 +290,8 @@ class TickFold:
         return sum(self._inputs.size(each, gone) for each in ticks if each <= tick)
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Withdraw or suspend the robot that a trial of the fold finds, from the first tick on;
-        return whether there is one.
+        """Withdraw or suspend the robot that a trial of the fold finds; return whether there is
+        one.
 
         at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
         of the map, so a fold that withdraws no robot computes it, too.
@@ -346,14 +336,14 @@ class TickFold:
         return hold_trial(self._agreement_at_rest(fold), limit, without)
 
     def _agreement_at_rest(self, fold: Fold) -> Agreement:
-        """Return the agreement of a raw fold's full solution, or of a condensed fold as it is."""
+        """Agreement of a raw fold's full solution, or of a condensed fold."""
         at_rest = fold if fold.condensed_count else solve_fold(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
         """Fold the same inputs up to a time without some robots; withdraw no other.
 
-        The fold is kept and continued at the next call, until no robot is suspected.
+        The fold is kept and continued until no robot is suspected.
         """
         gone = self._gone.union(robots)
         other = self._others.get(gone)
@@ -374,12 +364,11 @@ class TickFold:
         return other
 
     def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
-        """Fold each robot's submaps by themselves where joining them contradicts; else nothing.
+        """Fold each robot's submaps by themselves where joining them contradicts.
 
-        It does where a robot's disagreement with the team, be it by a single submap, exceeds the
-        limit, and as many times its disagreement alone: too small covariances by themselves are no
-        contradiction. A fold in another frame than the team's is empty. ahead: the fold has the
-        ticks that are not closed.
+        It does where a robot's disagreement with the team exceeds the limit, and as many times its
+        disagreement alone: too small covariances are no contradiction. A fold in another frame than
+        the team's is empty. ahead: with the ticks that are not closed.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
@@ -414,11 +403,10 @@ class TickFold:
         return fold
 
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
-        """Find the robot that contradicts the rest in a provisional fold, with the reason in words.
+        """Find the robot that contradicts the rest in a provisional fold, with the reason.
 
-        There is none where nothing is ahead of the watermark: closed ticks have their own test. A
-        trial folds the set again for each candidate, so its result holds until the set has grown by
-        GROWTH.
+        None where nothing is ahead of the watermark: closed ticks have their own test. A trial's
+        result holds until the set has grown by GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
@@ -433,7 +421,7 @@ class TickFold:
     def solve(self) -> Fold:
         """Solve for all inputs in full, without the robots that are then withdrawn.
 
-        Suspended robots are tested with all their submaps, one after the other.
+        Suspended robots are tested one after the other.
         """
         while True:
             self.fold_until(math.inf)
@@ -459,7 +447,7 @@ class TickFold:
         return self._fold_others((), math.inf, None).fold
 
     def submaps_of_withdrawn(self) -> Mapping[str, Sequence[Contribution]]:
-        """Return the submaps of each robot that the fold leaves out, in order."""
+        """Return the submaps of each robot left out."""
         return {
             robot: [
                 each for _, chain in sorted(self._inputs.chains(robot).items()) for each in chain
@@ -479,8 +467,8 @@ class TickFold:
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """Return the version vector: the last sequence of each stream, folded or refused; without
-        surveyed landmarks, which are part of the configuration.
+        """Return the version vector: the last sequence of each stream, folded or refused, but for
+        the survey's.
         """
         last: dict[Stream, int] = {}
         parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]

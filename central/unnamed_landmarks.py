@@ -1,6 +1,4 @@
-"""Conversion of associations of unnamed landmarks, and of an operator's verdicts, to and from
-messages.
-"""
+"""Conversion of associations of unnamed landmarks, and of verdicts, to and from messages."""
 
 from collections.abc import Iterator
 from itertools import groupby
@@ -32,7 +30,7 @@ SHOWN = 1 + LAST
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
     """Tabulate the unnamed landmarks: member, identity, step.
 
-    every: all members of each landmark, else its first and last ones.
+    every: all members, else the first and last.
     """
     entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
     table = []
@@ -78,7 +76,7 @@ def _make_entry(member: MemberRecord, id_: int) -> Entry:
 
 
 def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
-    """List the newest closures and merges, then the deferred ones, by their streams."""
+    """List the newest closures and merges, then the deferred ones."""
     waits = [landmarks.waits[of] for of in sorted(landmarks.waits)][-DECISIONS:]
     return tuple(
         m.AssociationDecision(**each._asdict())

@@ -1,18 +1,16 @@
 """Find the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
-A robot's disagreement is the largest of three figures, all near or below 1 where its covariances
-are right, each counted where it is beyond chance: its share of the joint cost per degree of
-freedom, which the robust loss bounds; the unweighted χ²/dof that most of its submaps exceed, the
-newest ones if it has few; and that which most of the newest inter-robot measurements exceed that
-have it as observer or teammate. The robust loss discounts a minority, which is no reason to lose
-the robot. A robot whose odometry reports no motion has submaps that fit the map, but the others
-measure it elsewhere.
+A robot's disagreement is the largest of three figures, near or below 1 where its covariances are
+right, each counted beyond chance: its share of the joint cost per degree of freedom; the unweighted
+χ²/dof that most of its submaps exceed, the newest if it has few; and that which most of the newest
+inter-robot measurements by or of it exceed. The robust loss discounts a minority, which is no
+reason to lose the robot. The last figure finds a robot whose odometry reports no motion: its
+submaps fit the map, but the others measure it elsewhere.
 
-One wrong robot distorts the map and makes others disagree, too; one with overconfident covariances,
-or that fixes the frame, makes only others disagree. So no robot is judged by its own disagreement:
-each is left out in turn, and withdrawn only if the rest agree without it, and without no other. Two
-robots that contradict each other, and no third, are reported and both stay, unless one of them
-contradicts itself: when alone, one of its submaps contradicts its others.
+One wrong robot makes others disagree; one with overconfident covariances, or that fixes the frame,
+others only. So each is left out in turn, and withdrawn only if the rest agree without it, and
+without no other. Two robots that contradict each other, and no third, are reported and both stay,
+unless one of them contradicts itself when alone.
 """
 
 import math
@@ -49,9 +47,9 @@ Without = Callable[[Collection[str]], Agreement | None]
 
 @dataclass(frozen=True)
 class Trial:
-    """The robot that is wrong beyond chance, or None; and the reason in words.
+    """The robot that is wrong beyond chance, or None, with the reason.
 
-    undecided: in words, robots that contradict each other, with the wrong one undetermined.
+    undecided: in words, contradictory robots with the wrong one undetermined.
     """
 
     robot: str | None = None
@@ -63,7 +61,7 @@ class Trial:
 class Suspension:
     """Why a robot is left out of running maps.
 
-    retried: the number of submaps of the set at which the robot is tested again.
+    retried: size of the set at which it is tested again.
     """
 
     reason: str
@@ -74,8 +72,8 @@ class Suspension:
 class Conviction:
     """The robots that a fold leaves out by itself.
 
-    withdrawn: the reason by robot, in words. suspended: left out until tested again. at: the last
-    tick that this is based on. tested_from: the first tick tested under it.
+    withdrawn: the reason by robot. suspended: left out until tested again. at: the last tick that
+    this is based on. tested_from: the first tick tested under it.
     """
 
     withdrawn: Mapping[str, str] = field(default_factory=dict)
@@ -104,8 +102,8 @@ def disagreement(
 ) -> dict[str, float]:
     """Return the disagreement of each robot that can be judged.
 
-    chance: a cost that a sound robot exceeds with a probability above e^−chance is no disagreement.
-    least: fewest submaps from which a robot is judged.
+    chance: costs of a probability above e^−chance are no disagreement. least: fewest submaps to
+    judge a robot.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, *_ in agreement.submaps:
@@ -127,8 +125,7 @@ def disagreement(
 
 
 def _most(costs: Sequence[tuple[float, float]], chance: float, least: int = FEWEST) -> float | None:
-    """Return the χ²/dof that most submaps of a robot exceed, at most 1 where chance explains it;
-    None with too few submaps.
+    """χ²/dof that most submaps exceed, at most 1 where chance explains it; None with too few.
 
     costs: χ² and dof of each, oldest first.
     """
@@ -140,8 +137,8 @@ def _most(costs: Sequence[tuple[float, float]], chance: float, least: int = FEWE
 def _most_of_newest(
     costs: Sequence[tuple[float, float]], chance: float, least: int
 ) -> float | None:
-    """Return the χ²/dof that MOST_OF the NEWEST costs exceed, at most 1 where chance explains it;
-    None with too few.
+    """χ²/dof that MOST_OF the NEWEST costs exceed, at most 1 where chance explains it; None with
+    too few.
 
     The probability that k of n exceed χ² bounds of probability e^−x each is below C(n, k) e^(−kx).
     """
@@ -155,11 +152,9 @@ def _most_of_newest(
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:
-    """Return the joint cost per degree of freedom, at most 1 where chance explains it; None with
-    too few degrees of freedom.
+    """Joint cost per degree of freedom, at most 1 where chance explains it; None with too few.
 
-    A cost without degrees of freedom, or an infinite one, has overflown: a disagreement like any
-    other.
+    One without degrees of freedom, or infinite, has overflown: a disagreement.
     """
     if not math.isfinite(chi2) or not math.isfinite(dof):
         return math.inf
@@ -169,22 +164,22 @@ def _share(chi2: float, dof: float, chance: float) -> float | None:
 
 
 def _bound(dof: float, chance: float) -> float:
-    """χ² that is exceeded with a probability below e^−chance (Laurent & Massart 2000, lemma 1)."""
+    """χ² of a probability below e^−chance (Laurent & Massart 2000, lemma 1)."""
     return dof + 2.0 * math.sqrt(dof * chance) + 2.0 * chance
 
 
 def find_suspects(agreement: Agreement, limit: float) -> list[str]:
-    """List the robots whose disagreement is above the limit, the most suspect first."""
+    """List the robots with a disagreement above the limit, the most suspect first."""
     found = disagreement(agreement)
     wrong = sorted((-value, robot) for robot, value in found.items() if value > limit)
     return [robot for _, robot in wrong]
 
 
 def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
-    """Find the robot that is wrong beyond chance by leaving out one robot after the other.
+    """Find the robot that is wrong beyond chance by leaving out one after the other.
 
-    It is the only one without which the rest agree, and at least two others agree on that; or the
-    only one of those that contradicts itself when alone.
+    It is the only one without which the rest agree, at least two of them; or the only one of those
+    that contradicts itself when alone.
     """
     found = disagreement(agreement)
     suspected = find_suspects(agreement, limit)
@@ -222,8 +217,8 @@ def _contradict_alone(
 ) -> int:
     """Count the robots whose submaps disagree when alone, by more than the rest may.
 
-    Of two such robots one is left whoever is left out, so that no robot is cleared. Noise that the
-    team states too small is found so by a fold of each suspect, not of the team without each robot.
+    Of two such robots one is left whoever is left out. A fold of each suspect finds noise that the
+    team states too small.
     """
     if len(robots) < 2:
         return 0
@@ -233,13 +228,13 @@ def _contradict_alone(
 
 
 def cost_share(chi2: float, dof: float, chance: float) -> float:
-    """Return the cost per degree of freedom, at most 1 where e^−chance explains it."""
+    """Cost per degree of freedom, at most 1 where e^−chance explains it."""
     share = _share(chi2, dof, chance)
     return 1.0 if share is None else share
 
 
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
-    """Whether one of a robot's submaps contradicts its others, however little it weighs."""
+    """Whether one of a robot's submaps, however light, contradicts its others."""
     if alone is None:
         return False
     chance = SUSPICION + math.log(max(len(alone.submaps), 1))
