@@ -173,8 +173,9 @@ class TickFold:
         self.fold_until(until_ns)
 
     def roll_back(self, tick: float) -> None:
-        """Drop the ticks from this one on, and a conviction based on them, with all checkpoints
-        since they lack the robot.
+        """Drop the ticks from this one on; all of them if a conviction is based on one.
+
+        No checkpoint contains a convicted robot.
         """
         if tick <= self._conviction.at:
             self._restart(Conviction())

@@ -1,8 +1,8 @@
 """The native core: the numerical state of a window, and functions with defined bits.
 
-The library is built at two levels, for any x86-64 processor of the last decade and for those with
-AVX2; the results have the same bits. The better one that the processor has is imported; the
-environment variable TEAMSLAM_CORE (base or avx2) overrides the choice. docs/core.md describes it.
+Two builds, for x86-64 of the last decade and with AVX2, give the same bits. The better one that the
+processor has is imported; the environment variable TEAMSLAM_CORE (base or avx2) overrides the
+choice (docs/core.md).
 """
 
 import os

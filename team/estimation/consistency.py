@@ -24,7 +24,7 @@ FEW = 600
 def state_error(
     estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
+    """Error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
     error: Float[np.ndarray, " n"] = estimate - truth
     error[2] += 2.0 * np.pi * np.floor((np.pi - error[2]) / (2.0 * np.pi))
     return error
@@ -39,10 +39,10 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 
 @lru_cache
 def chi2_limit(dof: int, tail: float) -> float:
-    """Compute the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
+    """Value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
     Rounded to twelve digits. For few degrees by bisection of the finite sum (Abramowitz & Stegun
-    26.4.4 and 26.4.5).
+    26.4.4, 26.4.5).
     """
     if dof > FEW:
         return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
@@ -69,9 +69,9 @@ def _chi2_tail(value: float, dof: int) -> float:
 def chi2_quantile(
     probability: float, dof: Float[np.ndarray, " n"] | float | int
 ) -> Float[np.ndarray, " n"] | float:
-    """Compute the value that χ² of `dof` degrees of freedom does not exceed with this probability.
+    """Value that χ² of `dof` degrees of freedom does not exceed with this probability.
 
-    NaN for less than one degree of freedom. Rounded to 36 bits.
+    NaN for dof < 1. Rounded to 36 bits.
     """
     exact = core.chi2_quantiles(
         probability, 1.0 - probability, np.atleast_1d(np.asarray(dof, float))
@@ -82,9 +82,8 @@ def chi2_quantile(
 
 
 def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float]:
-    """Compute the two-sided interval of the mean over `runs` of NEES/dof with this probability.
-
-    The sum of the runs is χ² with dof·runs degrees of freedom.
+    """Two-sided interval of the mean over `runs` of NEES/dof; the sum is χ² with dof·runs degrees
+    of freedom.
     """
     tail = 0.5 * (1.0 - probability)
     total = dof * runs
@@ -94,15 +93,14 @@ def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float
 def coverage(
     nees_values: Float[np.ndarray, " runs"], dof: Float[np.ndarray, " runs"], probability: float
 ) -> float:
-    """Compute the share of runs whose NEES lies in the ellipsoid of this probability."""
+    """Share of runs with a NEES in the ellipsoid of this probability."""
     return float(np.mean(nees_values <= chi2_quantile(probability, dof)))
 
 
 class Scale(NamedTuple):
-    """Factor that the covariances need to agree with the observed errors.
+    """Factor by which the covariances must grow to agree with the errors.
 
-    value: 1 for correct covariances; 2: they are half as large as required. log_sigma: about one
-    standard deviation of its logarithm.
+    log_sigma: about one standard deviation of its logarithm.
     """
 
     value: float
@@ -116,8 +114,7 @@ def covariance_scale(
 ) -> Scale | None:
     """Estimate the scale s of terms s χ²(dof): the weighted median of squared_k / median χ²(dof_k).
 
-    Terms with less than one degree of freedom are left out; None where none is left. medians: of
-    χ²(dof), if available.
+    Terms with dof < 1 are left out; None where none is left. medians: of χ²(dof), if available.
     """
     judged = dof >= 1.0
     if not judged.any():

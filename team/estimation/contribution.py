@@ -1,4 +1,4 @@
-"""Contents of the team's map: submaps with their place in the set, and initial poses."""
+"""Contents of the team's map: submaps and initial poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -58,7 +58,7 @@ PART = 1 << 64
 def part_of(stream: Stream, first: int) -> Stream:
     """Name the part of a stream from submap `first` on, after a cut (`continuity`).
 
-    A fold treats it as an incarnation of its own. Submaps keep their sequence numbers.
+    A fold treats it as an incarnation; sequence numbers stay.
     """
     return stream[0], stream[1] % PART + first * PART
 
@@ -69,12 +69,12 @@ def whole_of(stream: Stream) -> Stream:
 
 
 def first_of(stream: Stream) -> int:
-    """Return the sequence number of the first submap of a stream or part."""
+    """Return the first sequence number of a stream or part."""
     return stream[1] // PART
 
 
 def named(stream: Stream) -> str:
-    """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, or `the saved map site`."""
+    """Name a stream: `r3 (incarnation 2)`, `…, from submap 12 on`, `the saved map site`."""
     if stream == STATION:
         return "the fixes"
     if is_absolute(stream):
@@ -87,7 +87,7 @@ def named(stream: Stream) -> str:
 
 
 def moment(stamp_ns: int) -> str:
-    """Format a team time: seconds, or the time of day (UTC) if it is Unix time."""
+    """Format a team time: seconds, or time of day (UTC) if Unix time."""
     seconds = 1e-9 * stamp_ns
     if seconds < UNIX_S:
         return f"{seconds:,.1f} s"
@@ -116,7 +116,7 @@ class RobotBias(NamedTuple):
 class OwnBiases:
     """Errors o of single robots in a saved map: given the errors b that all robots share,
 
-      o ~ N(mean + Gᵀ b, covariance),   cov(o, landmarks) = cross.
+    o ~ N(mean + Gᵀ b, covariance), cov(o, landmarks) = cross.
 
     errors: ascending. by_common: G, a row for each of the map's `biases`. likeliest, evidence: the
     likelihood N(likeliest, evidence⁻¹) of (b, o) without their priors.
@@ -164,10 +164,10 @@ NO_OWN = OwnBiases()
 
 @dataclass(frozen=True, eq=False)
 class Contribution:
-    """One submap of the set: `sequence` counts the submaps of (robot, incarnation) from 0.
+    """One submap of the set: `sequence` counts those of (robot, incarnation) from 0.
 
-    A saved map is a submap with landmarks only. own, by_own: the errors of single robots in it, and
-    ∂mean/∂o of `local`, which is given at o = 0.
+    A saved map has landmarks only. own, by_own: the errors of single robots in it, and ∂mean/∂o of
+    `local`, which is given at o = 0.
     """
 
     robot: str
@@ -205,12 +205,12 @@ class Contribution:
     ) -> dict[
         tuple[Bias | int | RobotBias, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]
     ]:
-        """Sensitivity and factor by the errors of the last graph with them (`Joined`)."""
+        """Sensitivity and factor by the errors of the last graph (`Joined`)."""
         return {}
 
     @cached_property
     def factor(self) -> core.SubmapFactor:
-        """The submap as a factor of a graph. Raises NotACovarianceError that names the submap."""
+        """The submap as a factor. Raises NotACovarianceError that names it."""
         local = self.local
         P, n = local.covariance, len(local.mean)
         x = np.arange(n - 2 * len(local.ids), n, 2)

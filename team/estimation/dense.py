@@ -1,7 +1,7 @@
 """Products and solutions of dense matrices with the same bits on every processor.
 
-An entry of a product is one sum in the order of its index; a BLAS orders sums by processor. Arrays
-of three and more axes are stacks of matrices, as in NumPy.
+Sums run in index order; a BLAS orders them by processor. Further leading axes are stacks, as in
+NumPy.
 """
 
 from teamslam.team.core import (

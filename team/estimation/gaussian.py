@@ -25,7 +25,7 @@ class PoseGaussian(NamedTuple):
 
 
 class LandmarkGaussian(NamedTuple):
-    """Joint Gaussian of the landmarks by ascending id: (x₁, y₁, x₂, …) in the map frame [m]."""
+    """Joint Gaussian of landmarks by ascending id: (x₁, y₁, x₂, …) in the map frame [m]."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
@@ -59,9 +59,9 @@ class CoreErrors:
 
 
 def cholesky_factor(covariance: Matrix, what: str) -> Matrix:
-    """Compute the lower L with L Lᵀ = covariance; `what` names the matrix in the error.
+    """Compute the lower L with L Lᵀ = covariance; `what` names it in the error.
 
-    Symmetry and rank are relative to the diagonal: a pivot exceeds n ε of its diagonal entry.
+    Symmetry and rank are relative: a pivot exceeds n ε of its diagonal entry.
     """
     factor, fault = core.factor_or_fault(covariance)
     if fault:
@@ -73,7 +73,7 @@ FAULTS = ("", "not finite", "not positive definite", "not symmetric")
 
 
 def deviation(variance: float) -> float:
-    """Return the standard deviation of a variance; 0 if rounding has made it negative."""
+    """Standard deviation; 0 if rounding has made the variance negative."""
     return math.sqrt(variance) if variance > 0.0 else 0.0
 
 
@@ -85,7 +85,7 @@ def information(covariance: Matrix, what: str) -> Matrix:
 
 
 def upper_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Return rows and columns of the upper triangle of an n × n matrix, row-major, read-only."""
+    """Rows and columns of the upper triangle of an n × n matrix, row-major, read-only."""
     return _small_triangle(n) if n <= SMALL else np.triu_indices(n)
 
 
@@ -110,8 +110,8 @@ def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
 def curved(pose: PoseGaussian) -> PoseGaussian:
     """Compute the covariance of (x, y, θ) about pose ∘ Exp(ξ), ξ ~ N(0, S), to second order.
 
-    The position is (f, l) + φ/2 (−l, f), which adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the
-    variance of f, and so on (Isserlis 1918). The mean stays the most likely pose.
+    The position (f, l) + φ/2 (−l, f) adds E[φ²l²]/4 = (S_φφ S_ll + 2 S_lφ²)/4 to the variance of f,
+    and so on (Isserlis 1918). The mean stays the most likely pose.
     """
     return PoseGaussian(
         pose.mean, core.curved_covariance(float(pose.mean[2]), np.asarray(pose.covariance))

@@ -1,9 +1,9 @@
-"""A teammate seen from a pose node: a range-bearing factor between pose nodes of two robots.
+"""A teammate seen from a pose node: a range-bearing factor between two robots' pose nodes.
 
-A fix of a robot's position (GNSS) is one, too: the station, an exact pose far away, measures the
-antenna. The observer's odometry T ∘ Exp(xi), xi ~ N(0, C), carries the observed point to the pose
-node: p' = T Exp(xi) p to an earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance grows
-by J C Jᵀ with J = R [I | (−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
+A fix (GNSS) is one, too: the station, an exact pose far away, measures the antenna. The observer's
+odometry T ∘ Exp(xi), xi ~ N(0, C), carries the point to the pose node: p' = T Exp(xi) p to an
+earlier node, p' = (T Exp(xi))⁻¹ p to a later one; its covariance grows by J C Jᵀ with J = R [I |
+(−p_y, p_x)ᵀ] and −[I | (−p'_y, p'_x)ᵀ].
 """
 
 from collections.abc import Sequence
@@ -33,9 +33,9 @@ SightingKey: TypeAlias = tuple[int, str, int, str]
 class InterRobotFactor:
     """An inter-robot measurement from the pose node at stamp_ns of submap `sequence`.
 
-    measurement: (range [m], bearing [rad]) of the teammate's pose node at the same stamp.
-    covariance: [m², m·rad, rad²]. A fix has the teammate GNSS and is measured from the station;
-    point: the antenna in the frame of the robot's pose node [m].
+    measurement: (range [m], bearing [rad]) of the teammate's node at the same stamp. covariance:
+    [m², m·rad, rad²]. A fix has the teammate GNSS, from the station; point: the antenna in the
+    frame of the robot's node [m].
     """
 
     robot: str
@@ -91,7 +91,7 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     """Locate a teammate at (range [m], bearing [rad]) that moves by about `drift` [m] until the
     node.
 
-    Its covariance is the sum of the sensor's, the marker's (marker_sigma) and the drift's.
+    The covariance sums those of sensor, marker (marker_sigma) and drift.
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = core.squared(sensor.marker_sigma) + drift * drift
@@ -109,7 +109,7 @@ def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
 
 
 def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
-    """Carry the point back to an earlier node, from which the observer has moved."""
+    """Carry the point back to an earlier node."""
     T = node_from_here.mean
     turn = _turn(float(T[2]))
     J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
@@ -120,7 +120,7 @@ def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
 
 
 def carry_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
-    """Carry the point on to a later node, to which the observer moves."""
+    """Carry the point on to a later node."""
     T = inverse(here_from_node.mean)
     point = transformed(T, seen.point)
     turn = _turn(float(T[2]))
@@ -139,9 +139,9 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 def reduced(
     carried: Sequence[CarriedPoint],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Reduce several measurements of a teammate from one node to one (range, bearing).
+    """Reduce several measurements from one node to one (range, bearing).
 
-    The median of each, with the mean of their covariances, since a camera repeats its error.
+    Their median, with the mean covariance, since a camera repeats its error.
     """
     ranges = [max(core.hypot(*each.point), NEAREST_M) for each in carried]
     bearings = [core.atan2(each.point[1], each.point[0]) for each in carried]

@@ -1,7 +1,7 @@
 """The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
 
-Thrun, Burgard and Fox 2005, sections 5.3 and 6.6, with the motion noise in the tangent space of the
-motion's end, so that motions compose.
+Thrun, Burgard and Fox 2005, sections 5.3 and 6.6; the motion noise is in the tangent space of the
+motion's end, so motions compose.
 """
 
 import math
@@ -34,8 +34,8 @@ __all__ = [
 class Increment(msgspec.Struct, frozen=True, gc=False):
     """b_from_b': truth = mean ∘ Exp(xi), xi ~ N(0, covariance) in (forward, left, turn).
 
-    mean: (x [m], y [m], theta [rad]). covariance: symmetric positive semi-definite, of any rank,
-    [m², m·rad, rad²].
+    mean: (x [m], y [m], theta [rad]). covariance: positive semi-definite, of any rank, [m², m·rad,
+    rad²].
     """
 
     mean: Pose
@@ -87,15 +87,14 @@ def _densities(noise: MotionNoise) -> tuple[float, float, float]:
 def increment_of(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Increment:
-    """Compute the motion of `forward` [m/s] and `yaw_rate` [rad/s] held for `duration_s`.
-
-    The equations are in `core.MotionModel.increment`.
+    """Compute the motion of speeds [m/s, rad/s] held for `duration_s`
+    (`core.MotionModel.increment`).
     """
     return Increment(*model_of(motion).increment(duration_s, forward, yaw_rate))
 
 
 def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
-    """Compute (σ_range² [m²], σ_bearing² [rad²]) at a range: σ_r² = range_sigma² + (per_m r)²."""
+    """σ_range² [m²], σ_bearing² [rad²] at a range: σ_r² = range_sigma² + (per_m r)²."""
     slope = sensor.range_sigma_per_m * predicted_range
     return core.squared(sensor.range_sigma) + slope * slope, core.squared(sensor.bearing_sigma)
 
@@ -121,10 +120,9 @@ Scanned = tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarra
 def scanned(
     sensor: Sensor, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
 ) -> Scanned:
-    """Correct raw measurements, and mark those in [min_range, max_range] and in the field of view.
+    """Correct raw measurements; mark those in [min_range, max_range] and the field of view.
 
-    Not marked: those not finite, of a corrected range that is not positive, and depths beyond
-    OFF_AXIS.
+    Unmarked: not finite, a corrected range not positive, depths beyond OFF_AXIS.
     """
     return calibration_of(sensor).correct(ranges, bearings)
 
@@ -134,13 +132,13 @@ def corrected(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Apply the calibration: ((r − range_offset)/range_scale, b − bearing_offset − lens(b)).
 
-    A depth is divided by cos(b − optical_axis) too; where that is below OFF_AXIS it is NaN.
+    A depth is divided by cos(b − optical_axis), too; NaN where below OFF_AXIS.
     """
     return scanned(sensor, ranges, bearings)[1:]
 
 
 class Noise(NamedTuple):
-    """Variances of a measurement, and the white share of each: the rest is constant."""
+    """Variances of a measurement, and the white share of each, the rest being constant."""
 
     range_variance: float
     range_per_m2: float

@@ -1,7 +1,7 @@
 """A sensor mounted off the origin of the robot's base.
 
-Within a window poses and motions are the sensor's. For a motion T of the base the sensor at m moves
-by m⁻¹ ∘ T ∘ m; the base's pose is m ∘ S ∘ m⁻¹ with S the sensor's.
+Within a window poses and motions are the sensor's: for a motion T of the base, m⁻¹ ∘ T ∘ m with the
+sensor at m; the base's is m ∘ S ∘ m⁻¹.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def of_base(step: Increment, mount: Pose) -> Increment:
 def start_of_sensor(
     pose: Pose, covariance: Matrix | None, mount: Pose
 ) -> tuple[Pose, Matrix | None]:
-    """Convert an initial pose of the base to the sensor's; covariance None: exactly known."""
+    """Convert an initial pose of the base to the sensor's; covariance None: exact."""
     known = np.zeros((3, 3)) if covariance is None else covariance
     found = moved_by(PoseGaussian(pose, known), mount) if mount.any() else PoseGaussian(pose, known)
     return found.mean, None if covariance is None else found.covariance

@@ -1,4 +1,4 @@
-"""One interval of odometry, and any part of it as a Gaussian on SE(2)."""
+"""An interval of odometry, and any part of it, as a Gaussian on SE(2)."""
 
 import math
 from typing import NamedTuple
@@ -15,9 +15,9 @@ from teamslam.team.shapes import Float
 
 
 class Moved(NamedTuple):
-    """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]) of the interval.
+    """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]).
 
-    covariance: the source's own, of the error in the tangent space of the motion's end.
+    covariance: reported, of the error in the tangent space of the motion's end.
     """
 
     twist: Pose
@@ -25,9 +25,9 @@ class Moved(NamedTuple):
 
 
 class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
-    """One odometry interval that ends at end_ns: mean forward speed [m/s] and yaw rate [rad/s].
+    """An odometry interval until end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
-    moved: a reported motion; the speeds are then those of its twist.
+    moved: a reported motion, whose twist gives the speeds.
     """
 
     end_ns: int
@@ -37,7 +37,7 @@ class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
     moved: Moved | None = None
 
     def part(self, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:
-        """Compute the motion of a part of the interval, which is followed by rest_ns of it."""
+        """Compute the motion of a part of the interval, rest_ns before its end."""
         if self.moved is None:
             return increment_of(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
         share, rest = duration_ns / self.duration_ns, rest_ns / self.duration_ns
@@ -53,7 +53,7 @@ class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def speed(self) -> float:
-        """Magnitude of the velocity [m/s]; without a reported motion, the signed forward speed."""
+        """Magnitude of the velocity [m/s]; without a reported motion, signed."""
         if self.moved is None:
             return self.forward
         forward, left, _ = self.moved.twist.tolist()
@@ -65,7 +65,7 @@ STANDING = OdometryInterval(0, 1, 0.0, 0.0)
 
 
 def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:
-    """Compute (forward [m/s], yaw rate [rad/s]) of a car from its wheel and steering encoders.
+    """Compute (forward [m/s], yaw rate [rad/s]) of a car from wheel and steering encoders.
 
     With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
     h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). NaN where the model is
@@ -82,5 +82,5 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
 
 
 def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
-    """Convert a motion whose end in the frame of its start is `increment`, |theta| ≤ π."""
+    """Convert a motion, given by its end in the frame of its start, |theta| ≤ π."""
     return Moved(logarithm(increment), covariance)

@@ -1,7 +1,6 @@
 """Check values against physical bounds; a refusal is a value with its reason.
 
-The wire checks the form of a message; this module checks whether it can be true of a robot on the
-ground.
+The wire checks a message's form, this module its plausibility for a robot on the ground.
 """
 
 from dataclasses import replace
@@ -35,9 +34,8 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
 
 
 def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
-    """Raise the submap's covariance P to P + F where P − F is not positive definite.
-
-    F = diag(least²) for coordinates [m] and headings [rad].
+    """Raise the submap's covariance P to P + F where P − F is not positive definite, F =
+    diag(least²) for coordinates [m] and headings [rad].
     """
     angles = _angles_of(local)
     sigmas = np.where(angles, least[1], least[0])
@@ -80,9 +78,9 @@ def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
 
 
 def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
-    """Return the reason to refuse a prior (x, y, θ, x₁, y₁, …), if any.
+    """Return the reason to refuse a prior (x, y, θ, x₁, y₁, …).
 
-    A variance of zero is a known constant; the agreement of many submaps allows any small one.
+    A variance of zero is a known constant; many submaps allow any small one.
     """
     points = np.arange(len(mean)) != 2
     why = _far(mean[points], bounds.coordinate_m, "of the origin")
@@ -93,13 +91,13 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
 
 
 def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
-    """Return whether the covariance of a motion on SE(2) is within the bounds."""
+    """Whether the covariance of a motion on SE(2) is within the bounds."""
     most = np.array([bounds.sigma_m[1], bounds.sigma_m[1], bounds.sigma_rad[1]])
     return bool((np.sqrt(np.diag(covariance)) <= most).all())
 
 
 def are_landmarks(covariance: Matrix) -> bool:
-    """Return whether a joint covariance is finite and each point's own block is a covariance."""
+    """Whether a joint covariance is finite and each point's block a covariance."""
     if not np.isfinite(covariance).all():
         return False
     variances = covariance.diagonal()

@@ -1,9 +1,9 @@
-"""Scans of landmarks, each measurement with its own covariance or with the sensor's.
+"""Scans of landmarks, each measurement with its own covariance or the sensor's.
 
-`own` has a row for each measurement: of length 0 where none has a covariance, else (rr [m²], rb
-[m·rad], bb [rad²], form). POLAR: of range and bearing. POINT: of a point in the sensor's frame, to
-first order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing. SENSOR: the
-sensor's noise, at the predicted range.
+`own` has no rows where no measurement has a covariance, else a row (rr [m²], rb [m·rad], bb [rad²],
+form) for each. POLAR: of range and bearing. POINT: of a point in the sensor's frame, to first
+order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing. SENSOR: the sensor's
+noise, at the predicted range.
 """
 
 from typing import NamedTuple
@@ -83,7 +83,7 @@ def calibrated(own: Own, sensor: Sensor) -> Own:
 
 
 def together(parts: list[tuple[int, Own]]) -> Own:
-    """Join the rows of several scans, given by count and rows; SENSOR if only some have rows."""
+    """Join the rows of scans, given by count and rows; SENSOR for those without."""
     if not any(own.size for _, own in parts):
         return unclaimed(sum(count for count, _ in parts))
     sensors = np.array([0.0, 0.0, 0.0, SENSOR])

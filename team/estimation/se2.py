@@ -1,7 +1,6 @@
 """SE(2): poses are (x [m], y [m], theta [rad]); `a_from_b` maps coordinates in b into a.
 
-Perturbations are on the right, in the tangent space of the pose they perturb:
-`pose ∘ Exp(xi)` with xi = (forward [m], left [m], turn [rad]). Every function returns a new array.
+Perturbations are on the right: `pose ∘ Exp(xi)`, xi = (forward [m], left [m], turn [rad]).
 """
 
 import numpy as np

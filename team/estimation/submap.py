@@ -1,4 +1,4 @@
-"""The submap that a robot sends: one Gaussian over poses and landmarks in its own frame."""
+"""The submap of a robot: one Gaussian over poses and landmarks in its own frame."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,9 +18,9 @@ NO_COLUMNS = np.empty((0, 0))
 class Unnamed:
     """Observations of a window's U unnamed landmarks, by ascending number.
 
-    counts: number of measurements of each, at least 1. seen: keyframes that observed it; two
-    landmarks in one keyframe are distinct. classes: ln P(its reported classes | class) of each, up
-    to a constant; without columns where none is reported.
+    counts: measurements of each, at least 1. seen: keyframes that observed it; two landmarks in one
+    keyframe are distinct. classes: ln P(its reported classes | class), up to a constant; without
+    columns where none is reported.
     """
 
     counts: UInt32[np.ndarray, " U"]
@@ -39,7 +39,7 @@ class Unnamed:
 
 
 class Slipped(NamedTuple):
-    """A slip of (forward, left, turn) that the odometry missed before the keyframe at stamp_ns."""
+    """A slip of (forward, left, turn) before the keyframe at stamp_ns."""
 
     stamp_ns: int
     by: Float[np.ndarray, "3"]
@@ -49,9 +49,8 @@ class Slipped(NamedTuple):
 class Became:
     """Outcomes of a window's detections without identities.
 
-    stamps: of M scans [ns]; counts: number of detections of each. By detection: rows, its index in
-    its scan's message; landmarks, its number in the submap, 0 for none; clutter, whether it is a
-    false detection.
+    stamps: of M scans [ns]; counts: detections of each. By detection: rows, its index in the
+    message; landmarks, its number in the submap, 0 for none; clutter, whether it is false.
     """
 
     stamps: Int64[np.ndarray, " M"]
@@ -80,13 +79,13 @@ NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
 class LocalMap:
     """N(mean, covariance) of (end pose, pose nodes, landmarks) in the frame of its start pose.
 
-    ids: identities of the L landmarks, strictly ascending. mean: (x [m], y [m], theta [rad]) of the
-    end pose and of K further poses of the robot, then (x₁, y₁, …, x_L, y_L); theta in (−π, π].
-    covariance: symmetric positive definite, [m², m·rad, rad²]. node_stamps: team time of the K pose
-    nodes [ns], strictly ascending. biases, sensitivity: errors b that the robot's submaps share,
-    ascending, and a row S = ∂mean/∂b of each. curvature: rows D = ∂²mean/∂b², zero but for the
-    clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of the landmarks from number 2³¹
-    on. The start pose is exactly zero: the submap contains no information from outside the window.
+    ids: of the L landmarks, strictly ascending. mean: (x [m], y [m], theta [rad]) of the end pose
+    and K pose nodes, then (x₁, y₁, …, x_L, y_L); theta in (−π, π]. covariance: positive definite,
+    [m², m·rad, rad²]. node_stamps: team time of the nodes [ns], strictly ascending. biases,
+    sensitivity: shared errors b of the robot's submaps, ascending, and a row S = ∂mean/∂b of each.
+    curvature: rows D = ∂²mean/∂b², zero but for the clock's: given b the mean is mean + Σ (S b + ½
+    D b²). unnamed: of the landmarks from number 2³¹ on. The start pose is exactly zero: the submap
+    contains no information from outside the window.
     """
 
     ids: UInt32[np.ndarray, " L"]

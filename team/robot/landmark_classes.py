@@ -1,4 +1,4 @@
-"""Evidence of the classes of a window's landmarks, from the detections associated with them."""
+"""Class evidence of a window's landmarks, from their associated detections."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ def classify_landmarks(
 ) -> ClosedWindow:
     """Sum ln P(reported class | class) of each unnamed landmark's detections, at a window's close.
 
-    Unchanged where no detection has a class. Detections of other numbers of classes are left out.
+    Unchanged without classes. Detections of other numbers of classes are left out.
     """
     rows = {
         each.stamp_ns: translate.classes_of(each, len(each.ranges) // 8)

@@ -1,4 +1,4 @@
-"""The ledger of law 1: the disposition of each measurement of an incarnation."""
+"""The ledger of law 1: the disposition of each measurement."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -21,10 +21,9 @@ it.
 class Ledger:
     """The number of an incarnation's measurements by their disposition.
 
-    used: the disposition of a measurement that the estimator takes. A measurement is counted as
-        used when it arrives; the window that closes lists those that it did not use after all, so
-        scans and inter-robot measurements are stored until then. on_disposition: receives the
-        disposition of each.
+    used: of a measurement that the estimator takes. It is counted on arrival; the closing window
+    lists those not used after all, so scans and inter-robot measurements are stored until then.
+    on_disposition: receives each.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class Ledger:
             self._on_disposition(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
-        """Recount measurements that were counted as used and were not, for this reason."""
+        """Recount measurements that were not used after all."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1
@@ -68,12 +67,11 @@ class Ledger:
             self._detections.pop(number, None)
 
     def _last_scans(self, count: int) -> list[int]:
-        """The last scans by their stamps."""
         by_stamp = sorted(self._scans, key=lambda number: (self._scans[number], number))
         return by_stamp[len(by_stamp) - count :]
 
     def cover(self, until_ns: int) -> None:
-        """Settle every scan up to this time as used, by an estimator without windows."""
+        """Settle every scan up to this time as used, for an estimator without windows."""
         self._scans = {n: at_ns for n, at_ns in self._scans.items() if at_ns > until_ns}
         self._detections.clear()
 

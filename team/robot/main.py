@@ -1,4 +1,4 @@
-"""The robot's process: the node's shell, which recovers what it missed and continues an earlier
+"""The robot's process: the node's shell, which recovers missed messages and continues an earlier
 process.
 """
 
@@ -33,10 +33,10 @@ _LOG = logging.getLogger("teamslam")
 
 
 class RobotShell:
-    """A robot's process: it subscribes, continues an earlier process if there was one, and runs.
+    """A robot's process: it subscribes, continues an earlier process, and runs.
 
-    `run` raises BusError when another process runs this robot for `patience_s`;
-    FaultyRunError, at its end, when messages were set aside.
+    `run` raises BusError when another process runs this robot for `patience_s`; FaultyRunError, at
+    its end, when messages were set aside.
     """
 
     def __init__(
@@ -109,9 +109,9 @@ class RobotShell:
             self._log_due_s = time.monotonic() + self._log_look_s
 
     def _complete_log(self) -> bool:
-        """Ask the source for what a death has cost the robot's own log; whether there was any.
+        """Request from the source what the robot's log lost; return whether there was any.
 
-        What the robot lacks, too, it asks for itself, and the log has the answer.
+        The log also has the answers to the robot's own requests.
         """
         lost = False
         tap: Tap | None = getattr(self.bus, "tap", None)
@@ -136,14 +136,14 @@ class RobotShell:
         return lost
 
     def _look_for_driver(self) -> None:
-        """Find out whether the robot's driver is present before any other message is handled."""
+        """Find out whether the driver is present, before other messages."""
         driver = ch.source_node(self.node.robot)
         there = m.Liveliness(stamp_ns=0, node=driver, alive=self.bus.is_alive(driver))
         self.node.handle(there, 0)
         self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
-        """Stay until the recorder has every submap: it can ask nobody else for them."""
+        """Stay until the recorder has every submap: it has no other source."""
         recorded: dict[int, int] = {}
 
         def take(samples: Sequence[Sample]) -> None:
@@ -171,7 +171,7 @@ class RobotShell:
                 )
 
     def _resume(self) -> bool:
-        """Take over the submaps of an earlier process from the centre; False if there are none."""
+        """Take over an earlier process's submaps from the centre; return whether there are any."""
         requested = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
             replies = self.bus.ask(ch.SUBMAPS, "", requested, ASK_TIMEOUT_S)
@@ -204,7 +204,7 @@ class RobotShell:
         return True
 
     def _catch_up(self) -> None:
-        """Ask the source for everything that it has published since the last submap."""
+        """Request everything that the source published since the last submap."""
         while True:
             first = self.node.next_measurement
             replies = self._missing.ask(
@@ -220,11 +220,10 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples without the ends and the initial poses that the source does not confirm.
+        """Drop the ends and initial poses that the source does not confirm.
 
-        A robot that begins a new incarnation leaves the one before, so it needs the source's own
-        answer, and begins with the initial pose in that answer. Where no source answers (a replayed
-        log) the message alone counts.
+        A new incarnation ends the one before it, so it begins only with the source's initial pose.
+        Without a source (a replayed log) the message alone counts.
         """
         passed = []
         for sample in samples:
@@ -257,10 +256,9 @@ class RobotShell:
         return passed
 
     def _is_doubted(self, sample: Sample) -> bool:
-        """Whether a sample is an announced end of the stream: it waits for the source's word.
+        """Whether a sample is an announced end, which the source must confirm.
 
-        Anyone may have announced it where there are no keys, or have published measurements behind
-        the true one.
+        Without keys anyone may announce one, or publish measurements behind it.
         """
         if sample.key != ch.END.key():
             return False
@@ -274,9 +272,8 @@ class RobotShell:
         return True
 
     def _ask_about_ends(self) -> None:
-        """Ask the source which of the ends that were announced is its own.
-
-        Where no source answers (a replayed log) the message alone counts.
+        """Ask the source which announced end is true; without a source (a replayed log) the message
+        counts.
         """
         self._ends_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
@@ -309,10 +306,7 @@ class RobotShell:
         return any(self.bus.is_alive(n) for n in ("world", ch.source_node(self.node.robot)))
 
     def _beginning_at_source(self) -> m.InitialPose | None:
-        """The initial pose of the incarnation that the stream is in by its source's answer.
-
-        None where nobody answers.
-        """
+        """The source's initial pose of the stream's current incarnation."""
         request = m.MeasurementsRequest(
             stamp_ns=0, robot=self.node.robot, incarnation=0, first=0, last=0
         )
@@ -326,7 +320,7 @@ class RobotShell:
 
 
 def _beginning(sample: Sample, robot: str) -> int | None:
-    """The incarnation of the robot's stream that a sample begins; None for other samples."""
+    """The incarnation of the robot's stream that a sample begins."""
     if sample.key != ch.START.key(robot):
         return None
     try:

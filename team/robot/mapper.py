@@ -3,8 +3,8 @@
     bounds → Hybrid-SLAM → ledger → submap → own map → poses
     check    estimate      account   publish
 
-Law 1 lives here: what is published for fusion depends on the robot's own measurements alone. The
-team's map comes in as a prior and goes out as `team/pose`, and nowhere else.
+Law 1: what is published for fusion depends on the robot's own measurements alone. The team's map is
+used for `team/pose` only.
 """
 
 from collections import deque
@@ -50,12 +50,12 @@ Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWi
 class Mapper:
     """Hybrid-SLAM on one incarnation of a robot's stream after the other.
 
-    Call `begin` with an initial pose, `take` for each measurement in its order, and `finish`; the
-    messages to publish are appended to `out`.
+    Call `begin` with an initial pose, `take` for each measurement in order, and `finish`; messages
+    are appended to `out`.
 
-    ledger: law 1's account of the incarnation. submaps: all that was closed. warnings: what is
-    implausible, in words. gated: number of measurements that no others of their window confirmed.
-    now_ns: the latest stamp. passed_ns: no further window ends at this time or before.
+    ledger: law 1's account. submaps: all closed ones. warnings: what is implausible. gated:
+    measurements that no others of their window confirmed. now_ns: the latest stamp. passed_ns: no
+    further window ends until then.
     """
 
     used = "in a submap"
@@ -112,7 +112,7 @@ class Mapper:
         self.own_map = OwnMap(initial)
 
     def _plausible_start(self, start: m.InitialPose) -> InitialPose:
-        """The initial pose and its covariance; one beyond the bounds is taken as unknown."""
+        """The initial pose and covariance; unknown if beyond the bounds."""
         value = translate.start_of(start)
         why = None if value is None else start_beyond(value, self.config.bounds)
         if why is not None:
@@ -121,7 +121,7 @@ class Mapper:
         return InitialPose(*translate.pose_of(start))
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Continue after the last of an incarnation's submaps, as an earlier process sent them."""
+        """Continue after an incarnation's last submap of an earlier process."""
         self.begin(start)
         for submap in submaps:
             self.submaps.restore(submap)
@@ -155,9 +155,9 @@ class Mapper:
         return False
 
     def _note_time(self, stamp_ns: int, passed_ns: int) -> bool:
-        """Note the team time of a measurement and the time that has passed with it.
+        """Note a measurement's team time and the time that has passed with it.
 
-        False where its clock has leapt so far that no receiver takes a submap with such a stamp.
+        False after a clock leap beyond the stamps that receivers take.
         """
         if another_time(stamp_ns, self._began_ns) is not None:
             return False
@@ -168,7 +168,7 @@ class Mapper:
         return True
 
     def account(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
-        """Account for the measurement in progress and add it to the open window."""
+        """Account for the current measurement and add it to the open window."""
         self.ledger.count(measurement, rejected)
         self._window.append(measurement)
         self._taking = None
@@ -192,9 +192,8 @@ class Mapper:
     def judge_interval(
         self, measurement: m.AnyOdometry
     ) -> tuple[OdometryInterval | None, Rejection | None]:
-        """The interval of an odometry message, and the reason if it, or its motion, is rejected.
-
-        Where only the motion is rejected, the interval's time is used.
+        """The interval of an odometry message, and the reason if it, or only its motion, is
+        rejected; then its time is still used.
         """
         interval = translate.interval_of(measurement, self.config)
         if not self._note_time(interval.end_ns, interval.end_ns):
@@ -203,9 +202,9 @@ class Mapper:
         return interval if rejected in UNMEASURED else None, rejected
 
     def _observe(self, measurement: m.Measurement) -> Rejection | None:
-        """Take a scan or an initial pose; returns the reason if it is rejected.
+        """Take a scan or an initial pose, or return the reason to reject it.
 
-        A scan comes before the odometry that ends at its stamp, and that may end a window.
+        A scan precedes the odometry of its stamp, which may end a window.
         """
         stamp_ns = measurement.stamp_ns
         is_near = self._note_time(stamp_ns, stamp_ns - 1)
@@ -258,9 +257,9 @@ class Mapper:
         measurement: m.Measurement | None = None,
         rejected: Rejection | None = None,
     ) -> None:
-        """Publish a submap before anything else can raise an exception, then join it.
+        """Publish a submap before anything can raise, then join it.
 
-        measurement: which closed the window; None: the stream ended.
+        measurement: which closed the window; None: the stream's end.
         """
         writer = self.writer
         if closed.became is not None:
@@ -294,10 +293,10 @@ class Mapper:
             self.publish_map(end_ns)
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether own map and particles are published at the end of this window: a multiple of
-        `pose_s` lies in it.
+        """Whether own map and particles are published at this window's end: it contains a multiple
+        of `pose_s`.
 
-        It depends on the stamps alone, so that a restarted robot publishes the same ones.
+        It depends on stamps alone, as a restarted robot needs.
         """
         period_ns = self._period_ns
         return period_ns == 0 or end_ns // period_ns > start_ns // period_ns
@@ -315,9 +314,8 @@ class Mapper:
         self._aside = 0
 
     def set_aside(self) -> bool:
-        """Reset to the state before the measurement whose handling raised an exception.
-
-        Returns False where no measurement was in progress.
+        """Reset to the state before the measurement whose handling raised; return whether there was
+        one.
         """
         if self._taking is None:
             return False
@@ -353,7 +351,7 @@ class Mapper:
     # The estimator.
 
     def note_input(self, number: int) -> None:
-        """Note that the open window names the measurement among its inputs, even if rejected."""
+        """Note a measurement, even a rejected one, as the open window's input."""
         self._slam.last_measurement = number
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
@@ -365,7 +363,7 @@ class Mapper:
         return self._slam.sight(measurement.stamp_ns, measurement.number, looks)
 
     def fix(self, measurement: m.Fix) -> Rejection | None:
-        """Take a fix of the antenna's position; returns the reason if it is rejected."""
+        """Take a fix of the antenna, or return the reason to reject it."""
         position = translate.fix_of(measurement, self.config)
         return self._slam.fix(measurement.stamp_ns, measurement.number, position)
 
@@ -381,7 +379,7 @@ class Mapper:
 
     @property
     def innovation(self) -> Innovation:
-        """The innovations of all windows of this incarnation that this process has computed."""
+        """Innovations of the incarnation's windows in this process."""
         return self._slam.innovation
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
@@ -393,5 +391,5 @@ class Mapper:
         return self.own_map.landmarks
 
     def open_window(self) -> RunningWindow | None:
-        """The Gaussian of the open window at its last keyframe, if there is one."""
+        """Gaussian of the open window at its last keyframe."""
         return self._slam.running()

@@ -1,9 +1,8 @@
-"""The robot's maps: its own, its submaps joined one after the other (Brooks and Bailey's back end),
-and the team's, kept between poses and computed anew with each prior.
+"""The robot's maps: its own, joined submap by submap (Brooks and Bailey's back end), and the
+team's, computed anew with each prior.
 
-The own map needs no teammate and no submap depends on it. Landmarks without identities are left
-out: the team's fold finds out which of them are one over several submaps, and until then the pose
-follows odometry and the landmarks with identities.
+No submap depends on the own map. It omits landmarks without identities, which only the team's fold
+associates across submaps.
 """
 
 from collections.abc import Sequence
@@ -46,7 +45,7 @@ CLOUD_PARTICLES = 32
 
 
 class InitialPose(NamedTuple):
-    """Where a stream begins: a pose (None: unknown) and its covariance (None: exact)."""
+    """A stream's first pose (None: unknown) and its covariance (None: exact)."""
 
     pose: Float[np.ndarray, "3"] | None
     covariance: Matrix | None
@@ -56,14 +55,14 @@ AT_ORIGIN = InitialPose(np.zeros(3), None)
 
 
 class Cloud(NamedTuple):
-    """A thinned particle cloud in the own map's frame: P poses and their weights, summing to 1."""
+    """Thinned particles in the own map's frame: P poses and their normalised weights."""
 
     poses: Float[np.ndarray, "P 3"]
     weights: Float[np.ndarray, " P"]
 
 
 def thin_out(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
-    """Thin out the particles evenly; origin: the pose of their frame in the own map's frame."""
+    """Thin out the particles evenly; origin: their frame's pose in the own map."""
     every = max(1, -(-len(particles.poses) // CLOUD_PARTICLES))
     logs = particles.log_weights[::every]
     weights = core.exp(logs - logs.max())
@@ -74,7 +73,7 @@ def thin_out(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
 class OwnMap:
     """The join of a robot's submaps so far, from its initial pose on.
 
-    whole: pose and landmarks. origin: the pose at which the last joined submap begins.
+    origin: the pose at which the last joined submap begins.
     """
 
     def __init__(self, initial: InitialPose = AT_ORIGIN) -> None:
@@ -82,7 +81,7 @@ class OwnMap:
         self.whole: WholeMap = initial_map(self.origin, initial.covariance)
 
     def join(self, local: LocalMap) -> None:
-        """Join the next submap, or its motion alone if it contradicts the map numerically."""
+        """Join the next submap, or its motion alone if it contradicts numerically."""
         self.origin, _ = self.whole.pose()
         named = local.named
         try:
@@ -94,7 +93,7 @@ class OwnMap:
         self.whole = after
 
     def pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The pose after the open window, or after its motion alone if it contradicts the map."""
+        """The pose after the open window, or its motion alone if contradictory."""
         try:
             return compose_pose(self.whole, None if window is None else window.map).pose
         except UNSOLVABLE:
@@ -112,14 +111,13 @@ CONDENSED = 16
 
 
 class TeamMap:
-    """The joint map of the last prior and the robot's later submaps; recomputed when they change.
+    """The joint map of the last prior and the robot's later submaps, recomputed on change.
 
-    While no prior comes, the oldest submaps are condensed with it to one Gaussian, CONDENSED at a
-    time by their order alone: a pose costs the same however long the centre is away.
+    Without new priors the oldest submaps are condensed with it to one Gaussian, CONDENSED at a
+    time: the cost of a pose is bounded.
 
-    known, refused: of the landmarks of the newest submap and the open window, the numbers that the
-    rest of the map has and contradicts. doubt: a warning about the last pose, in words; empty where
-    there is none.
+    known, refused: numbers of landmarks of the newest submap and the open window that the rest of
+    the map has and contradicts. doubt: a warning about the last pose.
     """
 
     def __init__(self) -> None:
@@ -137,10 +135,9 @@ class TeamMap:
     def pose(
         self, prior: m.Prior, submaps: Sequence[LocalMap], window: RunningWindow | None
     ) -> Posed:
-        """The robot's pose in the team's frame; `window`: the open one, if it has begun.
+        """The robot's pose in the team's frame after the open window.
 
-        A robot whose heading is badly known lies on an arc; its pose gets the covariance of that
-        arc.
+        A badly known heading gives the covariance of its arc.
         """
         given = self.join(prior, submaps)
         open_window = None if window is None else window.corrected(*self._shared)
@@ -153,8 +150,8 @@ class TeamMap:
     def place(
         self, prior: m.Prior, own: OwnMap, window: RunningWindow | None
     ) -> PoseGaussian | None:
-        """Estimate the robot's pose in the team's frame by a prior of landmarks alone; None where
-        they do not determine it.
+        """Estimate the pose in the team's frame by a prior of landmarks alone; None where
+        undetermined.
         """
         given, self.doubt = self.decode(prior), ""
         team = LandmarkGaussian(given.ids, given.means, given.covariance[3:, 3:])
@@ -168,7 +165,7 @@ class TeamMap:
         return curved(posed.pose)
 
     def decode(self, prior: m.Prior) -> RobotPrior:
-        """The estimate in a prior; that of the last one asked for is kept."""
+        """The estimate in a prior; the last one is cached."""
         if self._decoded is None or self._decoded[0] is not prior:
             self._decoded = prior, translate.prior_of(prior)
         return self._decoded[1]
@@ -187,11 +184,11 @@ class TeamMap:
         return ""
 
     def join(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
-        """Join the prior with those of the incarnation's submaps that it does not contain.
+        """Join the prior with the incarnation's submaps that it does not contain.
 
-        Landmarks without identities are left out: the robot can not compare them before the team's
-        fold has. The prior may contain more submaps than a robot that has come back. If prior and
-        submaps have no joint solution, that is found once and raised again at every keyframe.
+        Landmarks without identities are left out. The prior may contain more submaps than a robot
+        that has come back. If there is no joint solution, the cached error is raised at every
+        keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             if prior is not self._prior or len(submaps) < self._submaps:

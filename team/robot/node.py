@@ -6,8 +6,8 @@
     account   Ledger        law 1: each measurement is used once
     publish   Mapper.out    submaps, poses, maps; then how far the robot is
 
-A robot is at most CREDIT_SUBMAPS submaps ahead of a centre that is present, and reports its
-progress after each window and every PROGRESS_MEASUREMENTS measurements.
+A robot is at most CREDIT_SUBMAPS submaps ahead of a present centre, and reports progress after each
+window and every PROGRESS_MEASUREMENTS measurements.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,11 +36,11 @@ from teamslam.team.wire.digest import announce_configuration
 
 @dataclass
 class StreamAccount:
-    """The counts of the incarnation in progress, and the last statements of those before it.
+    """The counts of the current incarnation, and the last statements of earlier ones.
 
-    consumed: measurements; steps: odometry intervals that this process has consumed; all_steps:
-    those of all incarnations. acknowledged: submaps that the centre has dealt with. unreported:
-    measurements since the last report.
+    consumed: measurements; steps: odometry intervals consumed in this process; all_steps: of all
+    incarnations. acknowledged: submaps that the centre has dealt with. unreported: measurements
+    since the last report.
     """
 
     robot: str
@@ -53,7 +53,7 @@ class StreamAccount:
     ended: list[m.Done] = field(default_factory=list)
 
     def begin(self, incarnation: int, consumed: int = 0, acknowledged: int = 0) -> None:
-        """Begin an incarnation, or continue one behind the submaps of an earlier process."""
+        """Begin an incarnation, or continue an earlier process's."""
         self.incarnation, self.consumed = incarnation, consumed
         self.acknowledged, self.steps = acknowledged, 0
 
@@ -70,7 +70,7 @@ class StreamAccount:
             self.acknowledged = max(self.acknowledged, progress.submaps)
 
     def progress(self, mapper: Mapper) -> m.Progress:
-        """How many measurements were consumed and submaps sent, and the time that has passed."""
+        """Numbers of measurements consumed and submaps sent, and the time passed."""
         since_ns = mapper.submaps.since_ns
         return m.Progress(
             stamp_ns=mapper.passed_ns if since_ns is None else since_ns,
@@ -82,9 +82,9 @@ class StreamAccount:
         )
 
     def statement(self, mapper: Mapper, last: int | None) -> m.Done:
-        """The account of the incarnation, without what was consumed behind its end.
+        """The account of the incarnation up to its end.
 
-        last: its number of measurements; None while it has not ended.
+        last: its number of measurements, once it has ended.
         """
         return m.Done(
             stamp_ns=mapper.now_ns,
@@ -109,9 +109,9 @@ PROGRESS_MEASUREMENTS = 64
 class RobotNode:
     """The node of one robot: call `begin`, then `handle` for every message, until `finished`.
 
-    For recomputing a log: announced, the digest under which the configuration was announced; poses,
-    when and from which priors poses are published; replaced, what is sent instead of a window, to
-    show what that costs; on_window is given each window that closes.
+    For recomputing a log: announced, the configuration's digest; poses, when and from which priors
+    poses are published; replaced, sent instead of a window, to show what that costs; on_window
+    receives each closed window.
 
     finished: whether the team's final map, `final`, is there. withheld: number of messages that no
     receiver would have accepted.
@@ -177,7 +177,7 @@ class RobotNode:
 
     @property
     def submaps(self) -> int:
-        """Number of submaps of this incarnation that were sent, also by an earlier process."""
+        """Number of submaps of this incarnation that were sent, also earlier."""
         return self.mapper.submaps.sent
 
     @property
@@ -186,7 +186,7 @@ class RobotNode:
         return (ch.RENDEZVOUS,) if self.mapper.submaps.buffers else ()
 
     def request(self) -> m.MeasurementsRequest | None:
-        """The measurements that are missing and must be asked for at their source."""
+        """Missing measurements to request from their source."""
         missing = self.stream_end.missing()
         if missing is None:
             return None
@@ -216,9 +216,9 @@ class RobotNode:
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
     def take_over(self, stored: Sequence[m.Message]) -> None:
-        """Continue where the centre's set of this robot ends; the latest incarnation comes first.
+        """Continue where the centre's set of this robot ends, from the latest incarnation.
 
-        The submaps of an earlier process can then be requested from this one, too.
+        Submaps of an earlier process can then be requested here, too.
         """
         start = stored[0]
         assert isinstance(start, m.InitialPose)
@@ -230,9 +230,8 @@ class RobotNode:
             self.mapper.submaps.restore(message)
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Continue after the last of this robot's own submaps, as an earlier process sent them.
-
-        `submaps` are those of the latest incarnation, without a gap from sequence 0.
+        """Continue after this robot's submaps of an earlier process: those of the latest
+        incarnation from sequence 0.
         """
         self.mapper.resume(start, submaps)
         used = submaps[-1].last_measurement + 1
@@ -240,15 +239,11 @@ class RobotNode:
         self.inbox.resume(start.incarnation, used)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
-        """The answer to `SubmapsRequest`: everything sent for fusion, also by an earlier
-        process.
-        """
+        """Answer `SubmapsRequest` with everything sent for fusion, also earlier."""
         return self.mapper.submaps.answer(request)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message can not be true of this robot: it is another's, its counts are absurd,
-        or its end is too early.
-        """
+        """Why a message cannot be true of this robot."""
         if m.is_measurement(message):  # first: most messages are measurements
             own = message.robot == self.robot
             return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
@@ -271,7 +266,7 @@ class RobotNode:
     # Receive.
 
     def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Take one message; `now_ns` is the team time of its arrival (unused: stamps are time)."""
+        """Process one message; `now_ns` is unused: stamps are time."""
         if m.is_measurement(message):
             self.inbox.put(message)
         else:
@@ -305,10 +300,10 @@ class RobotNode:
                 self.warnings.append(f"no use for a {type(message).__name__}")
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Continue behind a measurement whose handling raised an exception, as if it had not come.
+        """Continue behind a measurement whose handling raised, as if it had not come.
 
-        The mapper is reset to its last submap and the window's other measurements. One that raises
-        as it closes its last window ends with `Done` without it.
+        The mapper is reset to its last submap and the window's other measurements. If its last
+        window raises it ends with `Done` without it.
         """
         self.mapper.set_aside()
         if self.done and not self._has_sent_done:
@@ -331,7 +326,7 @@ class RobotNode:
 
     @property
     def is_held(self) -> bool:
-        """Whether the robot waits for the centre's credit; an absent one need not give any."""
+        """Whether the robot waits for the credit of a present centre."""
         if not self._centre_alive:
             return False
         return self.mapper.submaps.sent - self.account.acknowledged > CREDIT_SUBMAPS
@@ -351,7 +346,7 @@ class RobotNode:
             self.report_progress()
 
     def _publish(self) -> list[Outgoing]:
-        """Take the messages of `out` that every receiver accepts; others are withheld and named.
+        """Take the messages of `out` that every receiver accepts; withhold and name others.
 
         Landmarks that rounding has made unsound are removed from a map.
         """
@@ -370,9 +365,7 @@ class RobotNode:
         return sound
 
     def _release(self, seen: tuple[str, ...]) -> None:
-        """Release the submaps buffered for an encounter; `seen`: the teammates that are to do
-        so, too.
-        """
+        """Release the submaps buffered for an encounter with the teammates `seen`."""
         released = self.mapper.submaps.release(seen, self.mapper.now_ns)
         if released:
             self.out += released
@@ -384,13 +377,13 @@ class RobotNode:
         self.out.append(Outgoing(ch.ROBOT_PROGRESS, self.robot, self.progress()))
 
     def progress(self) -> m.Progress:
-        """How many measurements were consumed and submaps sent, and the time that has passed."""
+        """Numbers of measurements consumed and submaps sent, and the time passed."""
         return self.account.progress(self.mapper)
 
     # An incarnation begins and ends.
 
     def _leave_incarnation(self) -> None:
-        """Close the current incarnation, if there is one, because a later one begins."""
+        """Close the current incarnation: a later one begins."""
         if not self.account.consumed:
             return
         if self.done:  # the driver had ended, and has come back: its last word is not the last
@@ -407,9 +400,7 @@ class RobotNode:
             self.report_progress()
 
     def _finish(self) -> None:
-        """Finish: the last incarnation's `Done` goes first, since with it the centre may
-        conclude.
-        """
+        """Finish with the last `Done` first, upon which the centre may conclude."""
         self.done = True
         self._close_incarnation()
         self._send_last_words()
@@ -428,7 +419,7 @@ class RobotNode:
 
 
 def robot_node(config: RobotConfig, exchange: Exchange = "continuous", **options: Any) -> RobotNode:
-    """The node of a robot: for a rule over submaps `RobotNode`, else the robot of a comparison."""
+    """Make the node of a robot: `RobotNode` for a rule over submaps, else a comparison's."""
     if PAIRS[config.estimator, config.fusion] == "submap":
         return RobotNode(config, exchange, **options)
     made: type[RobotNode] = load(COMPARISON_ROBOT, f"the estimator {config.estimator}")

@@ -1,9 +1,8 @@
 """A robot's running poses: by its own measurements, and given the team's map.
 
-A pose on team/pose is in the team's frame as long as the newest prior is in the frame that the pose
-names. When a newer prior is in another frame, or withdraws the robot's, the own pose goes out on
-team/pose: it is not in the team's frame, and takes the place of the pose before it for every
-receiver, late joiners included.
+A pose on team/pose is in the team's frame while the newest prior is in the frame that it names.
+When a newer prior is in another frame, or withdraws, the own pose on team/pose replaces it for
+every receiver, late joiners included.
 """
 
 import math
@@ -55,7 +54,7 @@ class SelfPlacing(Protocol):
 class RunningPoses:
     """Publishes poses every `pose_s`.
 
-    sigma_m: standard deviation of the last pose in the team's frame; 0 where there is none.
+    sigma_m: of the last pose in the team's frame; 0 without.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
@@ -73,9 +72,8 @@ class RunningPoses:
         self.sigma_m = 0.0
 
     def take_prior(self, prior: m.Prior) -> list[Outgoing]:
-        """Take a prior from the team's map; the newest one is used.
-
-        Returns the message that withdraws the last pose, if that was in another frame.
+        """Take a prior from the team's map; return the message that withdraws the last pose, if in
+        another frame.
         """
         if not is_newer_prior(prior, self._prior):
             return []
@@ -89,7 +87,7 @@ class RunningPoses:
         return [] if prior.ids and prior.frame == self._claimed else self._withdrawn_pose()
 
     def _withdrawn_pose(self) -> list[Outgoing]:
-        """The own pose on team/pose, if the last pose there was in another frame than the prior."""
+        """The own pose on team/pose, if the last one is not in the prior's frame."""
         prior = self._prior
         if prior is None:
             return []
@@ -109,12 +107,12 @@ class RunningPoses:
         return self._prior is not None and self._prior.in_team_frame
 
     def prior_of(self, incarnation: int) -> m.Prior | None:
-        """The prior with a pose of this incarnation; None where there is none."""
+        """The prior with a pose of this incarnation."""
         prior = self._prior if self.has_prior else None
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def _placing(self, incarnation: int) -> m.Prior | None:
-        """The newest prior if it places this incarnation, by a pose or by landmarks alone."""
+        """The newest prior if it places this incarnation, be it by landmarks alone."""
         prior = self._prior
         if prior is None or prior.incarnation != incarnation:
             return None
@@ -126,7 +124,7 @@ class RunningPoses:
             self._prior = None
 
     def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
-        """The messages of a new pose, if they are due; they take effect as published."""
+        """Make the messages of a new pose, if due."""
         if self._posed_ns is not None and stamp_ns - self._posed_ns < self._period_ns:
             return []
         self._posed_ns = stamp_ns
@@ -142,7 +140,7 @@ class RunningPoses:
     def estimate(
         self, stamp_ns: int, prior: m.Prior | None, estimator: PoseEstimator
     ) -> list[Outgoing]:
-        """The message of the own pose and, given a prior, of the pose in the team's map."""
+        """Make the messages of the own pose and, given a prior, the team's."""
         sequence, writer, window = estimator.sequence, estimator.writer, estimator.open_window()
         out = [writer.own_pose(stamp_ns, sequence, estimator.own_pose(window))]
         if prior is None:
@@ -166,7 +164,7 @@ class RunningPoses:
 
 
 def outside_team_frame(own: Outgoing) -> Outgoing:
-    """The own pose as the message on team/pose that withdraws the poses before it."""
+    """The own pose as a message on team/pose that withdraws earlier poses."""
     assert isinstance(own.message, m.PoseEstimate)
     message = msgspec.structs.replace(own.message, in_team_frame=False)
     return Outgoing(ch.TEAM_POSE, own.name, message)

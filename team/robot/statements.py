@@ -23,7 +23,7 @@ from teamslam.team.wire.digest import NO_MAP
 
 @dataclass(frozen=True)
 class MessageWriter:
-    """Writes the messages of one incarnation under an announced configuration (its digest).
+    """Writes the messages of one incarnation under a configuration's digest.
 
     started: whether its initial pose is known.
     """
@@ -63,9 +63,7 @@ class MessageWriter:
         return Outgoing(ch.ASSOCIATION, self.robot, message)
 
     def sighting(self, sequence: int, each: NodeSighting) -> m.SightingFactor:
-        """The inter-robot measurement from a pose node of a window, with the names of its
-        inputs.
-        """
+        """The inter-robot measurement from a window's pose node, with its inputs."""
         return m.SightingFactor(
             stamp_ns=each.stamp_ns,
             robot=self.robot,
@@ -87,7 +85,7 @@ class MessageWriter:
         return Outgoing(ch.PARTICLES, self.robot, message)
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
-        """The innovations of a window's measurements, or of those since the last such message."""
+        """The innovations of a window, or since the last such message."""
         message = m.Innovation(
             stamp_ns=stamp_ns,
             robot=self.robot,
@@ -126,7 +124,7 @@ class MessageWriter:
         return translate.frame_name(self.robot, self.incarnation)
 
     def own_pose(self, stamp_ns: int, sequence: int, pose: PoseGaussian) -> Outgoing:
-        """A running pose by own measurements alone, in the frame of the stream's start."""
+        """A running pose by own measurements, in the stream's start frame."""
         message = translate.pose_message(
             stamp_ns,
             self.robot,
@@ -142,7 +140,7 @@ class MessageWriter:
     def team_pose(
         self, stamp_ns: int, sequence: int, prior: m.Prior, pose: PoseGaussian
     ) -> Outgoing:
-        """A running pose given the team's map, in the frame of the prior."""
+        """A running pose given the team's map, in the prior's frame."""
         message = translate.pose_message(
             stamp_ns,
             self.robot,

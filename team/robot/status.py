@@ -17,9 +17,9 @@ def status_of(
     *,
     waits_for_driver: bool,
 ) -> m.Status:
-    """The status of a robot that has consumed so many odometry intervals and measurements.
+    """Make a robot's status from its counts of intervals and measurements.
 
-    withheld: number of its messages that no receiver would have accepted.
+    withheld: number of messages that no receiver would have accepted.
     """
     config, poses, submaps, nis = mapper.config, mapper.poses, mapper.submaps, mapper.innovation
     figures = {

@@ -12,11 +12,10 @@ NEAR_LIVES = 16
 class Inbox:
     """Hold measurements until their turn: Zenoh guarantees no order across keys.
 
-    Duplicates and measurements of earlier incarnations are dropped. A later incarnation begins when
-    its measurement 0 arrives.
+    Duplicates and earlier incarnations are dropped. A later incarnation begins with its measurement
+    0.
 
-    ahead: measurements of the incarnation that wait for their turn, by number. later: those of
-    later incarnations.
+    ahead: waiting measurements of the incarnation, by number. later: those of later incarnations.
     """
 
     def __init__(self) -> None:
@@ -56,10 +55,10 @@ class Inbox:
             self.ahead[measurement.number] = measurement
 
     def refusal(self, measurement: m.Measurement) -> str | None:
-        """Why a measurement cannot belong to this stream; None if it can.
+        """Why a measurement cannot belong to this stream.
 
-        Counters are no absurd ones. Incarnations follow one another and begin with their only
-        initial pose, the earliest stamp.
+        Counters are bounded. Incarnations follow one another and begin with their only initial
+        pose, the earliest stamp.
         """
         number, incarnation = measurement.number, measurement.incarnation
         if incarnation > MOST_LIVES or number > MOST_COUNT:
@@ -151,11 +150,9 @@ class Inbox:
         )
 
     def missing(self, end: m.StreamEnd | None) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to request from the source: a gap, or everything
-        up to the end.
+        """Incarnation, first and last measurement to request: a gap, or everything up to the end.
 
-        The source has nothing after the end, or of incarnations other than the present and the
-        last.
+        The source has nothing after the end, nor of incarnations but the present and the last.
         """
         gap = self.gap
         if end is None:
@@ -183,7 +180,7 @@ class Inbox:
 
 
 class EndOfStream:
-    """The end of one robot's stream. A world ends it by `End`, a driver by its `StreamHead`."""
+    """The end of one robot's stream, by a world's `End` or a driver's `StreamHead`."""
 
     def __init__(self, robot: str, inbox: Inbox) -> None:
         self._robot = robot
@@ -199,7 +196,7 @@ class EndOfStream:
     def is_reached(self) -> bool:
         """Whether every measurement up to the last one has been consumed.
 
-        A live team that is to end ends the stream where it is, if its driver is not present.
+        An ending live team ends the stream of an absent driver where it is.
         """
         if self._last is None:
             if self.driver_is_there or not self.is_ordered:
@@ -208,7 +205,7 @@ class EndOfStream:
         return self._inbox.complete(self._last)
 
     def last_of(self, incarnation: int) -> int | None:
-        """The measurements of an incarnation that has ended; None while it has not."""
+        """The number of measurements of an incarnation that has ended."""
         last = self._last
         return last.measurements if last is not None and last.incarnation == incarnation else None
 
@@ -232,15 +229,14 @@ class EndOfStream:
         )
 
     def announced_by(self, end: m.End) -> tuple[int, int]:
-        """Incarnation and measurements at which an announced end ends this robot's stream.
-
-        One that does not name the robot says that its stream has none.
+        """Incarnation and measurements at which an announced end ends this stream; a robot that it
+        does not name has none.
         """
         ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self._robot]
         return ends[0] if ends else (self._inbox.incarnation, 0)
 
     def refusal(self, message: m.End | m.StreamHead) -> str | None:
-        """Why an announced end can not be true of the stream, in words."""
+        """Why an announced end cannot be true of the stream."""
         if isinstance(message, m.End):
             of_source = self.at_source in _ends_of(message, self._robot)
             return None if of_source else self._inbox.contradicts(message, self._robot)
@@ -261,7 +257,7 @@ class EndOfStream:
                 self.is_ordered = True
 
     def take(self, end: m.End) -> None:
-        """Take a world's end; one that does not name this robot ends its stream where it is."""
+        """Take a world's end; one without this robot ends its stream here."""
         self._world_end = end = merge_ends(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
         if self.at_source is not None:  # no other word counts any more
@@ -271,9 +267,9 @@ class EndOfStream:
         self._last = mine[0] if mine else self._at(0)
 
     def take_head(self, head: m.StreamHead) -> m.StreamHead:
-        """Take the newest head of the driver.
+        """Take the driver's newest head.
 
-        The stream ends when the head says so, unless a later incarnation begins after that.
+        It may end the stream, unless a later incarnation begins.
         """
         self._head = head = later_head(head, self._head)
         if self.at_source is not None:

@@ -1,12 +1,11 @@
-"""The robot's submaps: each is held once, as the payload of the message that carries it.
+"""The robot's submaps, each held once, as its message's payload.
 
-A centre that is started again may ask for all of them (`SubmapsRequest`), so they are kept as
-compact as they were sent; the robot's own pose in the team's map decodes the few that it needs.
+A restarted centre may request all of them (`SubmapsRequest`), so they stay compact; the pose in the
+team's map decodes the few that it needs.
 
 Under `rendezvous` closed submaps are buffered until the robot encounters a teammate (Xu, 5.1;
-Downs, 4.3). Only the observing robot of the two notices the encounter: it announces it, and both
-release their buffered submaps. This changes when a submap is sent, never its content: the final map
-is that of a continuous exchange.
+Downs, 4.3). Only the observer notices the encounter: it announces it, and both release their
+buffers. This changes when a submap is sent, never its content.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +28,7 @@ _SUBMAP = msgspec.msgpack.Decoder(m.Submap)
 
 @dataclass
 class _Stream:
-    """The payloads for fusion of one incarnation: submaps and their factors, by sequence."""
+    """The payloads of one incarnation: submaps and their factors, by sequence."""
 
     start: bytes | None = None
     submaps: dict[int, bytes] = field(default_factory=dict)
@@ -51,9 +50,8 @@ class _Stream:
 class Submaps(Sequence[LocalMap]):
     """The messages for fusion of one robot, and its incarnation's submaps as a sequence of maps.
 
-    The sequence has the submaps' landmarks with identities; an item is decoded when it is read.
-    buffers: whether submaps wait for an encounter. sent: number of submaps of the incarnation that
-    were sent, also by an earlier process.
+    Items have the landmarks with identities, and are decoded when read. buffers: whether submaps
+    wait for an encounter. sent: submaps of the incarnation that were sent, also earlier.
     """
 
     def __init__(self, robot: str, exchange: Exchange) -> None:
@@ -70,7 +68,7 @@ class Submaps(Sequence[LocalMap]):
         self._incarnation, self.sent = start.incarnation, 0
 
     def restore(self, message: m.Message) -> None:
-        """Store a message that an earlier process has sent; the newest incarnation has begun."""
+        """Store a message of an earlier process in the newest incarnation."""
         if isinstance(message, m.InitialPose | m.Submap | m.SightingFactor):
             stream = self._streams.setdefault(message.incarnation, _Stream())
             payload = encoded(message)
@@ -111,7 +109,7 @@ class Submaps(Sequence[LocalMap]):
         return self._newest.submap(len(self) - 1) if len(self) else None
 
     def release(self, seen: tuple[str, ...], now_ns: int) -> list[Outgoing]:
-        """Release the buffered messages behind an announcement, at an encounter or at the end.
+        """Release the buffered messages behind an announcement, at an encounter or the end.
 
         seen: the teammates that are to release theirs, too. Nothing where no message would be new.
         """
@@ -141,7 +139,7 @@ class Submaps(Sequence[LocalMap]):
         return [*self._answer(requested)] if requested.robot == self._robot else []
 
     def _answer(self, request: m.SubmapsRequest) -> Iterator[bytes]:
-        """The initial pose of each incarnation, then its factors and submaps by sequence."""
+        """Each incarnation's initial pose, then factors and submaps by sequence."""
         every = request.incarnation == 0
         for incarnation in sorted(self._streams) if every else [request.incarnation]:
             stream = self._streams.get(incarnation, _Stream())

@@ -15,7 +15,7 @@ UNEXPECTED_DOF = 60
 
 
 def unexpected(nis: Innovation, estimator: Estimator) -> tuple[str, ...]:
-    """Warns that measurements lie far from their predictions, and says what to configure then."""
+    """Warn of measurements far from their predictions, and name the settings."""
     ratio = nis.per_dof
     if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
         return ()
@@ -37,7 +37,7 @@ def slipped(slip: Slipped) -> str:
 
 
 def driver_away(last: int) -> str:
-    """Warns that a live robot waits for measurements; `last`: the counter of the last one."""
+    """Warn that a live robot waits for measurements after number `last`."""
     return (
         f"its driver is away after measurement {last}: start it again, or end the team by "
         "`teamslam end`"

@@ -1,7 +1,7 @@
 """FastSLAM with known data association: particles over paths, an EKF for each landmark of each.
 
-p(path, landmarks | z) = p(path | z) Π p(landmark | path, z): the first factor is the weighted
-particles, the second the landmarks' 2 × 2 Gaussians. Montemerlo 2003; Thrun et al. 2005, ch. 13.
+p(path, landmarks | z) = p(path | z) Π p(landmark | path, z). Montemerlo 2003; Thrun et al. 2005,
+ch. 13.
 """
 
 from dataclasses import dataclass, replace
@@ -47,11 +47,9 @@ Arrays = tuple[
 class Particles:
     """M weighted poses, each with its own estimate of the L landmarks seen so far.
 
-    poses:       (x [m], y [m], theta [rad]) in the frame of the window's start.
-    log_weights: normalised, Σ exp = 1.
-    ids:         the landmarks in order of first sight; means and covariances follow it.
-    means:       landmark positions [m].
-    covariances: (xx, xy, yy) of each landmark given the particle's path [m²].
+    poses: (x [m], y [m], theta [rad]) in the frame of the window's start. log_weights: normalised,
+    Σ exp = 1. ids: in order of first sight. means: [m]; covariances: (xx, xy, yy) given the
+    particle's path [m²].
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -69,9 +67,8 @@ class Particles:
 class StepInfo(msgspec.Struct, frozen=True, gc=False):
     """Statistics of one step.
 
-    effective_sample_size: 1/Σ w² after the step, in [1, M].
-    parents: the particle that each particle was copied from before the step, or None.
-    log_evidence: log p(z | earlier z) by the particles; 0 without a re-observation.
+    effective_sample_size: 1/Σ w² after the step, in [1, M]. parents: the origin of each particle if
+    resampled. log_evidence: log p(z | earlier z); 0 without a re-observation.
     """
 
     effective_sample_size: float
@@ -94,7 +91,7 @@ def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
 def resampled(
     particles: Particles, generator: "np.random.Generator"
 ) -> tuple[Particles, Int64[np.ndarray, " M"]]:
-    """Equal weights again, each particle a copy of its parent; draws one uniform number."""
+    """Resample to equal weights; draws one uniform number."""
     parents = systematic_parents(particles.log_weights, generator.random())
     copies = Particles(
         poses=particles.poses[parents],
@@ -118,14 +115,12 @@ def propagated_and_updated(
     generator: "np.random.Generator",
     own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
-    """One step: resamples if the particles are thin, moves, then takes the measurements.
+    """Resample if the particles are thin, move, then take the measurements.
 
-    Resampling comes first, when the effective sample size of the last step is below
-    `resample_below`·M, so that the particles of a window's last step keep their weights. ranges [m]
-    and bearings [rad] are corrected by the calibration, own are the measurements' own covariances
-    (`teamslam.team.estimation.scans`); an id may occur twice. Draws one uniform number if it
-    resamples, and M × 3 normal ones. Raises NotACovarianceError if the motion's covariance is not
-    positive semi-definite.
+    Resampling, when the last effective sample size is below `resample_below`·M, comes first: the
+    particles of a window's last step keep their weights. ranges [m] and bearings [rad] are
+    calibrated, own their covariances (`teamslam.team.estimation.scans`); an id may occur twice.
+    Draws one uniform number if it resamples, and M × 3 normal ones. Raises NotACovarianceError.
     """
     parents = None
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
@@ -164,9 +159,7 @@ def filter_step(
 def propagated(
     particles: Particles, increment: Increment, generator: "np.random.Generator"
 ) -> Particles:
-    """Moves the particles without measurements: pose ∘ mean ∘ Exp(xi); weights and landmarks
-    stay.
-    """
+    """Move the particles: pose ∘ mean ∘ Exp(xi); weights and landmarks stay."""
     nothing = np.empty(0)
     ids = np.empty(0, np.uint32)
     moved, _ = filter_step(

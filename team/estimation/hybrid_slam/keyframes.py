@@ -26,15 +26,13 @@ large as the motion itself."""
 
 
 class Keyframe(msgspec.Struct, frozen=True, gc=False):
-    """The motion since the last keyframe and the measurements at its end (accepted and calibrated).
+    """The sensor's motion since the last keyframe and the measurements at its end (accepted and
+    calibrated).
 
-    own: the noises that the measurements claim (`teamslam.team.estimation.scans`); without rows:
-    none do. Poses and motions are those of the sensor, wherever on the base it is mounted.
-    looks: the scans without identities since the last keyframe, as they came. rest: the motion
-    since the last of them; None: there is none.
-    is_node: the pose at stamp_ns, a time of the team's grid, is a pose node of the submap.
-    forward: the motion's shift by an error of the scale of speed, and its duration
-    (`core.Odometry`).
+    own: claimed noises (`teamslam.team.estimation.scans`), without rows if none. looks: the scans
+    without identities since the last keyframe. rest: the motion since the last of them. is_node:
+    the pose at stamp_ns is a pose node of the submap. forward: the motion's shift by an error of
+    the scale of speed, and its duration (`core.Odometry`).
     """
 
     stamp_ns: int
@@ -71,14 +69,13 @@ class Keyframe(msgspec.Struct, frozen=True, gc=False):
 
 
 class Segmenter:
-    """Integrates odometry between keyframes; an interval is split where an observation falls into
-    it.
+    """Integrates odometry between keyframes; an observation splits an interval.
 
     With keyframe_s = 0 every observation message is a keyframe. Otherwise the scans within
-    keyframe_s are reduced to one range and bearing per landmark (the median, each scan first moved
-    by the odometry to the end of the interval that closes the keyframe). With a grid each of its
-    times is a keyframe without measurements. Scans without identities are kept as they are: which
-    of their detections are of one landmark is known at the window's end.
+    keyframe_s are reduced to one range and bearing per landmark: the median, each scan first moved
+    by the odometry to the end of the interval that closes the keyframe. Each grid time is a
+    keyframe without measurements. Scans without identities are kept: their association is known at
+    the window's end.
     """
 
     def __init__(
@@ -120,9 +117,7 @@ class Segmenter:
         bearings: Float[np.ndarray, " n"],
         own: Own | None = None,
     ) -> Rejection | None:
-        """Keep a scan until the odometry covers its time; returns the reason if it is rejected
-        instead.
-        """
+        """Keep a scan until the odometry covers its time, or return the reason to reject it."""
         if self.now_ns is not None and stamp_ns < self.now_ns:
             return Rejection.OLDER
         mask, r, b = scanned(self._sensor, ranges, bearings)
@@ -140,11 +135,10 @@ class Segmenter:
         return None
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> list[Keyframe]:
-        """Integrate one odometry interval; returns the keyframes in it, in order.
+        """Integrate one odometry interval; return its keyframes in order.
 
-        Where its motion could not be measured, the last speeds are assumed, with standard
-        deviations as large as the motion, at least UNMEASURED, and below a full rotation in
-        heading.
+        An unmeasured motion has the last speeds, with standard deviations as large as the motion,
+        at least UNMEASURED, and below a full rotation in heading.
         """
         stamp_ns, duration_ns = interval.end_ns, interval.duration_ns
         grid, keyframes = self._grid, []
@@ -176,9 +170,7 @@ class Segmenter:
         return keyframes
 
     def _look(self, scan: KeyframeScan, at_ns: int) -> list[Keyframe]:
-        """Keep a scan without identities with the motion since the one before; returns its
-        keyframe, if it is one.
-        """
+        """Keep a scan without identities; return its keyframe, if it is one."""
         motion = Increment(*self._odometry.pass_unnamed_scan())
         scan = replace(scan, at_ns=at_ns, motion=motion)
         if self._keyframe_ns:
@@ -187,15 +179,13 @@ class Segmenter:
         return [replace(self._keyframe_at(at_ns, *NOTHING), looks=(scan,))]
 
     def _keep(self, scan: KeyframeScan) -> None:
-        """Keep a scan of the keyframe, here."""
         self._keyframe.append(scan)
         self._odometry.mark_scan()
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
-        """Close the window here: returns its last keyframe, if one is open, and the motion after
-        it.
+        """Close the window here: return its last open keyframe, and the motion after it.
 
-        `rest_forward` is the `Keyframe.forward` of that motion.
+        `rest_forward` is that motion's `Keyframe.forward`.
         """
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
         rest, self.rest_forward, _ = self._odometry.end_keyframe()
@@ -204,10 +194,10 @@ class Segmenter:
         return keyframes, Increment(*rest)
 
     def leave(self) -> int:
-        """End the window: drop the scans that are stamped behind it; returns their number.
+        """End the window: drop the scans stamped behind it; return their number.
 
-        Their counters lie in the window's interval of measurements, so no later window may use
-        them: a robot that is started again behind this window would not have them.
+        Their counters lie in this window's interval of measurements: a robot restarted behind it
+        would lack them.
         """
         left, self._waiting = len(self._waiting), []
         return left
@@ -218,9 +208,7 @@ class Segmenter:
         return len(self._waiting)
 
     def _nodes(self, until_ns: int, over: OdometryInterval, grid: PoseGrid) -> list[Keyframe]:
-        """The grid times up to until_ns as keyframes; inter-robot measurements up to there reach
-        their node.
-        """
+        """The grid times up to until_ns as keyframes; inter-robot measurements reach their node."""
         keyframes = []
         while (next_ns := grid.next_ns) <= until_ns:
             self._go_on_to(next_ns, over)
@@ -229,7 +217,7 @@ class Segmenter:
         return keyframes
 
     def _go_on_to(self, stamp_ns: int, over: OdometryInterval) -> int:
-        """Integrate up to a stamp; a stamp before the interval's start is taken as its start."""
+        """Integrate up to a stamp, at least the interval's start."""
         duration_ns = stamp_ns - self._here_ns
         if duration_ns <= 0:
             return self._here_ns
@@ -273,7 +261,7 @@ class Segmenter:
 
 
 def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most: int) -> Keyframe:
-    """The keyframe without the new landmarks beyond a submap's limit; the nearest ones stay."""
+    """Drop the farthest new landmarks beyond a submap's limit."""
     ids, ranges = keyframe.ids, keyframe.ranges
     if len(known) + len(ids) <= most:
         return keyframe
@@ -285,7 +273,7 @@ def nearest_landmarks(keyframe: Keyframe, known: UInt32[np.ndarray, " L"], most:
 
 
 def _unmeasured(duration_s: float, forward: float, yaw_rate: float) -> tuple[float, float, float]:
-    """Variances per second of an unmeasured motion, such that errors of the speeds sum up."""
+    """Variances per second of an unmeasured motion; errors of the speeds sum up."""
     way = max(abs(forward), UNMEASURED[0]) * duration_s
     turn = min(max(abs(yaw_rate), UNMEASURED[1]) * duration_s, math.pi)
     return way * way / duration_s, 0.01 * way * way / duration_s, turn * turn / duration_s

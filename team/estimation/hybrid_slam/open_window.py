@@ -1,11 +1,8 @@
 """The open window of a robot; a step without a solution does not end the run.
 
-A measurement is accepted while the window is open if it agrees with the other ones of its landmark
-so far under the odometry, or is the only one. At its end all are compared with all others by a
-smoother over the window.
-
-Once the particles of a window have had no solution, none of its measurements are used: its submap
-is the motion by odometry alone.
+While the window is open a measurement is accepted if it agrees with the earlier ones of its
+landmark under the odometry. At its end a smoother over the window compares all with all. Without a
+solution the submap is the odometry's motion alone.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,9 +42,9 @@ Solved = TypeVar("Solved")
 
 
 class OpenWindow:
-    """The particles since the window's start, and the keyframes beside them.
+    """The particles since the window's start, and the keyframes.
 
-    A window's random numbers are keyed by (seed, robot, incarnation, sequence).
+    Random numbers are keyed by (seed, robot, incarnation, sequence).
     """
 
     def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
@@ -92,9 +89,9 @@ class OpenWindow:
         return self._core.rejected + self.settled.gated
 
     def advance(self, keyframe: Keyframe) -> None:
-        """Move and weigh the particles with the measurements that agree with others so far.
+        """Move and weigh the particles with the measurements accepted so far.
 
-        Where a keyframe contradicts one that was used before, the window is computed again.
+        A keyframe that contradicts an earlier one computes the window again.
         """
         if self._solvable and self._core.window.landmarks + len(keyframe.ids) > self._most:
             keyframe = nearest_landmarks(keyframe, self.particles.landmarks, self._most)
@@ -102,11 +99,11 @@ class OpenWindow:
         self._try(self._admit, keyframe)
 
     def confirm(self) -> None:
-        """Compute the window again if it has other measurements now that all of it is compared.
+        """Compute the window again if comparing all of it changes its measurements: by outliers, or
+        detections without identities.
 
-        It has where outliers are found or there are detections without identities. Where that
-        depletes the particles, the window is computed with more of them (where landmarks have
-        identities and errors are white: decision 20).
+        Depleted particles are computed with more of them (with identities and white errors:
+        decision 20).
         """
         self._try(self._settle)
 
@@ -117,7 +114,7 @@ class OpenWindow:
             self._try(self._core.move, rest.mean, rest.covariance, forward)
 
     def solve(self, step: Callable[[Window], Solved]) -> Solved | None:
-        """Make the Gaussian of the window by `step`; None where the window has none."""
+        """Make the Gaussian of the window by `step`."""
         if not self._solvable:
             return None
         try:
@@ -162,7 +159,6 @@ class OpenWindow:
 
     @property
     def _is_depleted(self) -> bool:
-        """Whether more particles would help."""
         sensor = self._config.sensor
         white = sensor.range_white == sensor.bearing_white == 1.0
         return white and self._core.least_effective < DEPLETED
@@ -173,7 +169,7 @@ class OpenWindow:
             self._core.take(*keyframe.arguments)
 
     def _try(self, step: Callable[..., None], *arguments: object) -> None:
-        """Apply a step to the particles, unless one has failed before."""
+        """Apply a step, unless one has failed before."""
         if self._solvable:
             try:
                 with CoreErrors():

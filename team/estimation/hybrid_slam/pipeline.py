@@ -7,9 +7,9 @@
     moments are matched                           window.gaussian
     a submap goes out                             _close
 
-A window begins at zero where the last one ended, so a submap depends on its own measurements, the
-configuration and (seed, robot, incarnation, sequence) alone. Joining submaps is the back end's:
-`teamslam.team.estimation.map_joining`.
+A window begins at zero where the last one ended: a submap depends on its own measurements, the
+configuration and (seed, robot, incarnation, sequence) alone. `teamslam.team.estimation.map_joining`
+joins submaps.
 """
 
 from dataclasses import replace
@@ -38,15 +38,15 @@ LONGEST_NS = 2**62
 
 
 def _nanoseconds(seconds: float) -> int:
-    """A configured duration [ns]; one that no two stamps are apart is as good as any longer one."""
+    """A configured duration [ns], bounded by the span of stamps."""
     return min(round(seconds * 1e9), LONGEST_NS)
 
 
 class HybridSlam:
-    """One incarnation of a robot's stream, from its beginning or from its last submap.
+    """One incarnation of a robot's stream, from its beginning or last submap.
 
-    sequence: of the open window. last_measurement: the newest measurement that belongs to it, even
-    if it was rejected; the caller sets it. last_keyframe_ns: team time of its last keyframe.
+    sequence: of the open window. last_measurement: its newest measurement, even a rejected one; set
+    by the caller. last_keyframe_ns: team time of its last keyframe.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:
@@ -67,7 +67,7 @@ class HybridSlam:
         self._begin_window(0, 0)
 
     def resume(self, sequence: int, last_measurement: int, end_ns: int) -> None:
-        """Continue after an earlier submap: the next window begins where that one ended."""
+        """Continue after an earlier submap."""
         self._start_ns = end_ns
         self._segmenter.begin(end_ns)
         self._begin_window(sequence + 1, last_measurement + 1)
@@ -89,7 +89,7 @@ class HybridSlam:
         return self._grid.observe(stamp_ns, measurement, looks)
 
     def fix(self, stamp_ns: int, measurement: int, position: CarriedPoint) -> Rejection | None:
-        """Take a fix of the antenna's position; returns the reason if it is rejected."""
+        """Take a fix of the antenna, or return the reason to reject it."""
         if self._grid is None:
             return Rejection.NO_NODES
         if self._is_late(stamp_ns):
@@ -121,9 +121,7 @@ class HybridSlam:
         return None
 
     def finish(self) -> tuple[ClosedWindow | None, int]:
-        """End the stream; returns the last submap, and the number of scans that no odometry
-        covered.
-        """
+        """End the stream; return the last submap, and the number of uncovered scans."""
         uncovered, end_ns = self._segmenter.uncovered, self._segmenter.now_ns
         if self._start_ns is None or end_ns is None or end_ns <= self._start_ns:
             return None, uncovered
@@ -132,9 +130,9 @@ class HybridSlam:
     # The window closes.
 
     def _is_full(self, lasting_ns: int) -> bool:
-        """Whether the window is long enough to close; the window of a standing robot stays open.
+        """Whether the window is long enough to close; a standing robot's stays open.
 
-        A window with half as many landmarks as a submap may hold closes at once.
+        Half a submap's largest number of landmarks closes it at once.
         """
         if 2 * self.window.core.landmarks >= self._config.bounds.submap_landmarks:
             return True
@@ -143,9 +141,7 @@ class HybridSlam:
         return lasting_ns >= self._window_ns and not stands
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
-        """Close the open window; where it has no solution, its submap is the odometry's motion
-        alone.
-        """
+        """Close the open window; without a solution its submap is the odometry's motion."""
         last, rest = self._segmenter.cut(end_ns)
         for keyframe in last:
             self._open.advance(keyframe)
@@ -198,7 +194,7 @@ class HybridSlam:
         return self._open.particles
 
     def running(self) -> RunningWindow | None:
-        """The Gaussian of the open window at its last keyframe, if there is one."""
+        """Gaussian of the open window at its last keyframe."""
         if self.last_keyframe_ns is None:
             return None
         found = self._open.solve(windows.running)
@@ -208,10 +204,9 @@ class HybridSlam:
         return found
 
     def _moved_alone(self) -> LocalMap:
-        """The Gaussian of the open window's odometry alone."""
         return windows.motion_alone(self._open.motion)
 
     @property
     def innovation(self) -> Innovation:
-        """The innovations of all windows of this incarnation that this process has computed."""
+        """Innovations of the incarnation's windows in this process."""
         return self._innovation.plus(self.window.innovation)

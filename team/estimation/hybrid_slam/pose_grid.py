@@ -1,13 +1,10 @@
-"""The team's time grid, at which every robot has a pose node, and the inter-robot measurements at
-them.
+"""The team's time grid, at which every robot has a pose node, and inter-robot measurements.
 
-A robot does not know when it is observed, so all robots place nodes at the same times, the
-multiples of node_s. An inter-robot measurement belongs to the nearest grid time, if that lies in
-the open window and within sighting_s. The observer's odometry carries it to that node; several
-measurements of one teammate at one node are reduced to one. At each node only the fix nearest in
-time is used; the odometry carries the antenna to the node. The antenna of a fix that is delayed
-by d is where it was d earlier, seen from the robot at the fix's stamp: T⁻¹ a with the motion T over
-d.
+A robot does not know when it is observed, so all robots place nodes at the multiples of node_s. An
+inter-robot measurement belongs to the nearest grid time in the open window within sighting_s, to
+which the observer's odometry carries it; several of one teammate at one node are reduced to one, of
+fixes the nearest in time is used. The antenna of a fix delayed by d is T⁻¹ a seen from the robot at
+the fix's stamp, with the motion T over d.
 """
 
 from bisect import insort
@@ -41,9 +38,9 @@ TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray,
 
 @dataclass(frozen=True, eq=False)
 class NodeSighting:
-    """One teammate observed from one pose node: range [m], bearing [rad] and their covariance.
+    """One teammate observed from one pose node: range [m], bearing [rad], covariance.
 
-    measurements: the counters of the sensor's messages that went into it, ascending.
+    measurements: counters of the sensor's messages, ascending.
     """
 
     stamp_ns: int
@@ -69,7 +66,7 @@ class _Look:
 class PoseGrid:
     """The grid times of the open window and its inter-robot measurements.
 
-    next_ns: team time of the next node or inter-robot measurement; NEVER_NS where there is none.
+    next_ns: team time of the next of both, else NEVER_NS.
     """
 
     def __init__(
@@ -95,7 +92,7 @@ class PoseGrid:
         self._at_node: dict[tuple[int, str], list[tuple[int, CarriedPoint]]] = {}
 
     def begin(self, stamp_ns: int) -> None:
-        """Begin a window; its nodes are the grid times within window_s from here."""
+        """Begin a window; its nodes are the grid times within window_s."""
         self._begin_ns = stamp_ns
         self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
         self._last_ns = stamp_ns + self._window_ns
@@ -103,14 +100,14 @@ class PoseGrid:
         self._find_next()
 
     def go_on(self, stamp_ns: int) -> None:
-        """Extend a window that stays open to the next grid time after its planned end."""
+        """Extend a window to the next grid time after its planned end."""
         if stamp_ns >= self._begin_ns + self._window_ns:
             self._last_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
             self._find_next()
 
     def observe(self, stamp_ns: int, counter: int, looks: TeammateScan) -> Rejection | None:
-        """Keep inter-robot measurements until odometry covers their time; returns the reason if
-        all are rejected.
+        """Keep inter-robot measurements until odometry covers their time; return the reason if all
+        are rejected.
         """
         teammates, ranges, bearings = looks
         node_ns = self._node_near(stamp_ns)
@@ -131,7 +128,7 @@ class PoseGrid:
         return None if mask.any() else Rejection.SENSOR_LIMITS
 
     def fix(self, stamp_ns: int, counter: int, position: CarriedPoint) -> Rejection | None:
-        """Keep a fix until odometry covers its time; returns the reason if it is rejected."""
+        """Keep a fix until odometry covers its time, or return the reason to reject it."""
         node_ns = self._node_near(stamp_ns)
         if node_ns is None:
             return Rejection.NO_NODE
@@ -151,8 +148,8 @@ class PoseGrid:
         self.next_ns = min(look_ns, self._node_ns if self._node_ns <= self._last_ns else NEVER_NS)
 
     def reach(self, odometry: core.Odometry, over: OdometryInterval) -> bool:
-        """Note that the observer is at `next_ns`, in the interval `over` of its odometry; True if
-        that is a pose node (which comes before measurements).
+        """Note that the observer is at `next_ns`, in the interval `over`; return whether that is a
+        pose node (which comes before measurements).
         """
         is_node = self.next_ns == self._node_ns <= self._last_ns
         if not is_node:
@@ -175,16 +172,14 @@ class PoseGrid:
         return True
 
     def _delayed_antenna(self, over: OdometryInterval) -> CarriedPoint:
-        """Place the antenna, at the time of a delayed fix, in the robot's frame at its stamp."""
+        """Place the antenna of a delayed fix in the robot's frame."""
         lasting_ns = abs(self._delay_ns)
         moved = over.gone_on(over.end_ns, lasting_ns).part(self._motion, lasting_ns, 0)
         carry = carry_on if self._delay_ns > 0 else carry_back
         return carry(self._antenna, moved)
 
     def sightings(self) -> tuple[NodeSighting, ...]:
-        """The window's inter-robot measurements and fixes, by node and teammate, without those
-        that reached no node.
-        """
+        """The window's inter-robot measurements and fixes that reached a node."""
         fixes = tuple(_fix_at(*self._fixes[node_ns]) for node_ns in sorted(self._fixes))
         return fixes + tuple(
             NodeSighting(
@@ -212,8 +207,8 @@ def _stamp_of(look: _Look) -> int:
 
 
 def _fix_at(look: _Look, antenna: CarriedPoint) -> NodeSighting:
-    """Make the measurement of a node's fix. The heading is unknown, so the antenna's total variance
-    is added in every direction.
+    """Make a node's fix. The heading is unknown: the antenna's total variance enters in every
+    direction.
     """
     assert look.fix is not None
     spread = look.fix.covariance + np.trace(antenna.covariance) * np.eye(2)

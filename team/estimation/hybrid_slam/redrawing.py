@@ -1,15 +1,13 @@
 """A window's paths drawn anew when it closes, from the smoothed window, and weighed.
 
-Each resampling leaves the particles fewer lines of descent: after forty keyframes all of them may
-share one path through the first thirty, and their scatter says nothing of its error. Once it is
-decided which measurement is of which landmark, the window is a smoothing problem. M paths x are
-drawn from the Gaussian q of its solution, and weigh
+Each resampling leaves the particles fewer lines of descent: after forty keyframes all may share one
+path through the first thirty, whose error their scatter does not show. Once associated, the window
+is a smoothing problem. M paths x are drawn from the Gaussian q of its solution, and weigh
 
     w ∝ p(x) Π_l ∫ p(z_l | x, l) dl / q(x),
 
-with the integral over each landmark l by Laplace's method along the path. This is importance
-sampling whose proposal is the Laplace approximation (Geweke 1989, Econometrica 57(6)): the weights
-correct what is not Gaussian, and the paths have no ancestors in common.
+with the integral over each landmark l by Laplace's method: importance sampling from the Laplace
+approximation (Geweke 1989, Econometrica 57(6)), whose paths have no common ancestors.
 """
 
 from collections.abc import Sequence
@@ -39,9 +37,9 @@ uncertainty, as of particles (`open_window.DEPLETED`).
 def redraw_paths(window: Window, keyframes: Sequence[Keyframe], random: core.Random) -> None:
     """Draw the window's paths anew, if few lines of descent are left and the new ones are more.
 
-    A sample counts by its effective size 1/Σ w², the particles with w summed over those that have
-    one pose at the first keyframe. Draws 3 K M normal numbers, where it draws.
-    keyframes: of which the window has taken all measurements.
+    A sample counts by its effective size 1/Σ w², the particles by w summed over those of one pose
+    at the first keyframe. Draws 3 K M normal numbers, where it draws. keyframes: all measurements
+    of which the window has taken.
     """
     weights = core.exp(window.particles.log_weights)
     if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
@@ -66,14 +64,14 @@ def redraw_paths(window: Window, keyframes: Sequence[Keyframe], random: core.Ran
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
-    """Effective number of the particles' ancestors at the window's first keyframe."""
+    """Effective number of ancestors at the first keyframe."""
     _, ancestor = np.unique(window.paths[0], axis=0, return_inverse=True)
     shares: Float[np.ndarray, " n"] = np.bincount(ancestor.ravel(), weights)
     return 1.0 / float(dense.product(shares, shares))
 
 
 def _slots(window: Window) -> Int64[np.ndarray, " N"]:
-    """The place of each measurement's landmark among the particles' landmarks."""
+    """Place of each measurement's landmark among the particles'."""
     known = window.particles.ids
     order = np.argsort(known)
     found: Int64[np.ndarray, " N"] = order[np.searchsorted(known[order], window.ids)]
@@ -101,7 +99,7 @@ def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
 def _drawn(
     now: SmoothedWindow, scans: Scans, count: int, random: core.Random
 ) -> tuple[Paths, Float[np.ndarray, " M"]]:
-    """Paths from the smoothed window's Gaussian, and log p(path) − log q(path) but for a
+    """Draw paths from the smoothed window's Gaussian, with log p(path) − log q(path) up to a
     constant.
     """
     k = len(now.poses)
@@ -123,8 +121,8 @@ def _drawn(
 def _composed(poses: Float[np.ndarray, "K 3"], xi: Float[np.ndarray, "K M 3"]) -> Paths:
     """Paths with the errors ξ (forward, left, turn) of their poses, composed of their motions.
 
-    The error of motion k at its end is ξ_k − Ad(motion⁻¹) ξ_{k−1}, a map of determinant 1. It is
-    small where those of far poses are not, which would bend a path of poses moved one by one.
+    The error of motion k, ξ_k − Ad(motion⁻¹) ξ_{k−1} (determinant 1), is small even for far poses,
+    whose own errors would bend the path.
     """
     paths = np.empty_like(xi)
     pose, last, at = np.zeros(3), np.zeros(xi.shape[1:]), np.zeros(xi.shape[1:])
@@ -139,7 +137,6 @@ def _composed(poses: Float[np.ndarray, "K 3"], xi: Float[np.ndarray, "K M 3"]) -
 def _moved(
     poses: Float[np.ndarray, "M 3"], by: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 3"]:
-    """Each pose ∘ (forward, left, turn)."""
     return np.column_stack((_placed(poses, by[:, :2]), poses[:, 2] + by[:, 2]))
 
 
@@ -155,9 +152,8 @@ def _placed(
 def _landmarks(
     window: Window, paths: Paths, measured: tuple[Scans, Int64[np.ndarray, " N"]]
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
-    """The landmarks given each path, all errors white, as the particles have them.
-
-    They are solved from the mean of their measurements along the path.
+    """Solve the landmarks given each path, from the mean of their measurements, all
+    errors white.
     """
     (scans, slots), particles = measured, window.particles
     points = np.broadcast_to(scans.points[:, None], (len(slots), paths.shape[1], 2))
@@ -184,11 +180,9 @@ def _likelihood(
     covariances: Float[np.ndarray, "M L 3"],
     measured: tuple[Scans, Int64[np.ndarray, " N"]],
 ) -> Float[np.ndarray, " M"]:
-    """Log p(measurements | path) but for a constant, landmarks integrated out by Laplace's
-    method.
+    """Log p(measurements | path) up to a constant, landmarks integrated out by Laplace's method.
 
-    The noise of a measurement that is a point is Gaussian in the plane, that of others in range and
-    bearing.
+    The noise of a point is Gaussian in the plane, that of others in range and bearing.
     """
     scans, slots = measured
     at = paths[scans.keyframes]
@@ -222,7 +216,6 @@ def _seen(
 
 
 def _wrapped(angles: Float[np.ndarray, "K M"]) -> Float[np.ndarray, "K M"]:
-    """Each angle in (−π, π]."""
     return angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
 
 
@@ -237,6 +230,6 @@ def _squared(
 
 
 def _row_sums(values: Float[np.ndarray, "M k"]) -> Float[np.ndarray, " M"]:
-    """The sum of each row, in the order of its index."""
+    """Sum rows in index order."""
     sums: Float[np.ndarray, " M"] = dense.product(values, np.ones(values.shape[1]))
     return sums

@@ -1,4 +1,4 @@
-"""Reduces several scans of a moment to one range and bearing for each landmark."""
+"""Reduce several scans to one range and bearing per landmark."""
 
 from collections.abc import Sequence
 
@@ -16,8 +16,8 @@ from teamslam.team.shapes import Float, UInt32
 class KeyframeScan(msgspec.Struct, frozen=True, gc=False):
     """One scan at at_ns (its stamp, or the start of the odometry that covers it).
 
-    back: the robot's pose relative to the keyframe's end; None: it is the keyframe itself, or that
-    end is still to come. motion: since the scan or keyframe before.
+    back: the robot's pose relative to the keyframe's end, if that is known and another. motion:
+    since the scan or keyframe before.
     """
 
     stamp_ns: int
@@ -40,11 +40,8 @@ Measured = tuple[UInt32[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.nda
 
 
 def reduced(placed: Sequence[tuple[KeyframeScan, Pose]]) -> Measured:
-    """Reduce scans to one measurement per landmark, by ascending id; each scan with its pose
-    relative to the keyframe's end.
-
-    It is the median of range and bearing, moved by the odometry to the keyframe's end; its claimed
-    noise is the mean of theirs.
+    """Reduce scans, each with its pose relative to the keyframe's end, to one measurement per
+    landmark, by ascending id: the median range and bearing at that end, and the mean claimed noise.
     """
     scans = [(look.ids, look.ranges, look.bearings, look.own) for look, _ in placed]
     return core.reduce_scans(scans, np.array([back for _, back in placed]).reshape(-1, 3))
@@ -53,7 +50,7 @@ def reduced(placed: Sequence[tuple[KeyframeScan, Pose]]) -> Measured:
 def variances(
     ranges: Float[np.ndarray, " n"], own: Own, sensor: Sensor
 ) -> Float[np.ndarray, "n 3"]:
-    """(rr, rb, bb) of each measurement: as it claims, or the sensor's at its range."""
+    """(rr, rb, bb) of each measurement: claimed, or the sensor's at its range."""
     of_sensor = np.column_stack(
         (
             core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges),

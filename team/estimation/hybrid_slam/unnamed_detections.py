@@ -1,8 +1,7 @@
 """Association of a window's detections without identities, when the window closes.
 
-While the window is open, its pose follows the odometry and the landmarks with identities alone. At
-its close the detections are associated once, for all particles, and the particles run over the
-window again with the identities found.
+Until then the pose follows the odometry and the landmarks with identities. Detections are
+associated once, for all particles, which run over the window again.
 """
 
 from collections.abc import Sequence
@@ -33,10 +32,8 @@ from teamslam.team.shapes import Bool, Int64
 class AssociatedKeyframes:
     """A window's keyframes with their associated detections.
 
-    unnamed: the landmarks without identities, and the scans that saw them.
-    gated: number of detections that are left out.
-    slips: slips of the odometry.
-    became: the outcome of each detection.
+    unnamed: the landmarks without identities, and the scans that saw them. gated: number of
+    detections left out. slips: of the odometry. became: the outcome of each detection.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -49,7 +46,7 @@ class AssociatedKeyframes:
 class Event(NamedTuple):
     """An instant of a window: a scan without identities, or the end of a keyframe.
 
-    keyframe: index of the keyframe in the window. motion: since the event before.
+    keyframe: its index. motion: since the event before.
     """
 
     at_ns: int
@@ -62,10 +59,10 @@ class Event(NamedTuple):
 def associate_keyframes(
     keyframes: Sequence[Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
 ) -> AssociatedKeyframes:
-    """Associate the window's detections. Raises LinAlgError where the window has no solution.
+    """Associate the window's detections. Raises LinAlgError where it has no solution.
 
-    keyframes: with their measurements of landmarks with identities, and the scans without. most:
-    largest number of landmarks of a submap; those with the most detections stay.
+    keyframes: with measurements of named landmarks, and the scans without. most: largest number of
+    landmarks of a submap; those with the most detections stay.
     """
     events = events_of(keyframes)
     scans = scans_of(events, sensor)
@@ -91,9 +88,8 @@ def associate_keyframes(
 
 
 def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
-    """List the scans of a window and the ends of its keyframes, in order of time.
-
-    A keyframe that is itself a scan without identities, and nothing else, is one event.
+    """List the scans and keyframe ends of a window by time; a keyframe that is only one scan is one
+    event.
     """
     events = []
     for k, each in enumerate(keyframes):
@@ -105,7 +101,6 @@ def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
 
 
 def _is_none(motion: Increment) -> bool:
-    """Whether a motion is exactly none."""
     return not motion.mean.any() and not motion.covariance.any()
 
 
@@ -129,7 +124,6 @@ def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
 
 
 def _measurements_of(event: Event) -> Measured:
-    """Return the measurements of an event."""
     source = event.named if event.look is None else event.look
     assert source is not None
     return source.ids, source.ranges, source.bearings, source.own
@@ -138,7 +132,7 @@ def _measurements_of(event: Event) -> Measured:
 def _list_outcomes(
     events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
 ) -> Became:
-    """List the outcomes, by the stamps of the scans and the detections' places in them."""
+    """List the outcomes by scan stamp and place in the scan."""
     looks = [event.look for event in events if event.look is not None]
     return Became(
         stamps=np.array([each.stamp_ns for each in looks], np.int64),
@@ -155,9 +149,8 @@ def _number_keyframes(
     numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
 ) -> tuple[Keyframe, ...]:
-    """Add the scans' detections to their keyframes, under these landmark numbers (0: left out).
-
-    Each keyframe gets one measurement per landmark; a motion that slipped gets a larger covariance.
+    """Add the scans' detections to their keyframes under landmark numbers (0: left out), one
+    measurement per landmark; a motion that slipped gets a larger covariance.
     """
     looks: dict[int, list[KeyframeScan]] = {}
     first = 0
@@ -180,7 +173,7 @@ def _number_keyframes(
 
 
 def _select_numbered(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
-    """Select the detections of a scan that have a number, and give them this number."""
+    """Select and number the detections of a scan that have a number."""
     has_number = numbers > 0
     return replace(
         look,
@@ -192,9 +185,7 @@ def _select_numbered(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> Ke
 
 
 def _reduce_scans(looks: Sequence[KeyframeScan]) -> Measured:
-    """Reduce the detections of a keyframe's scans to its end; those of a scan that is the keyframe
-    are unchanged.
-    """
+    """Reduce a keyframe's scans to its end; a scan that is the keyframe stays."""
     if len(looks) == 1 and looks[0].back is None:
         (look,) = looks
         return look.ids, look.ranges, look.bearings, look.own
@@ -202,7 +193,6 @@ def _reduce_scans(looks: Sequence[KeyframeScan]) -> Measured:
 
 
 def _add_measurements(keyframe: Keyframe, seen: Measured) -> Keyframe:
-    """Add further measurements to a keyframe."""
     ids, ranges, bearings, own = seen
     parts: list[tuple[int, Own]] = [(len(keyframe.ids), keyframe.own), (len(ids), own)]
     return replace(

@@ -1,9 +1,8 @@
 """One window of Hybrid-SLAM: particles that start at zero, and the one Gaussian they become.
 
-The front end runs FastSLAM in the frame of the window's start. Its particles at any time are one
-submap by moment matching, after each landmark of each particle is solved again over the window's
-measurements along that particle's path: an EKF is linearised at the first, noisiest measurement,
-and that bias is common to many submaps. Brooks and Bailey 2009, HybridSLAM.
+The front end runs FastSLAM in the frame of the window's start. Moment matching makes a submap after
+each landmark of each particle is solved again along its path: an EKF is linearised at the first,
+noisiest measurement, a bias common to many submaps. Brooks and Bailey 2009, HybridSLAM.
 """
 
 from collections.abc import Sequence
@@ -27,12 +26,10 @@ STILL = np.zeros(4)
 
 
 class Innovation(NamedTuple):
-    """The innovations of measurements: Σ νᵀ S⁻¹ ν (NIS), χ² of `dof` degrees of freedom, two for
-    each measurement that was predicted.
+    """Σ νᵀ S⁻¹ ν (NIS) of predicted measurements, χ² of `dof` degrees of freedom, two for each.
 
-    Predictions are compared with later measurements, so this consistency check needs no ground
-    truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
-    Innovations of different keyframes are independent where the models are right, so both add up.
+    A consistency check without ground truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
+    Both add up over keyframes, whose innovations are independent where the models are right.
     """
 
     squared: float
@@ -44,9 +41,7 @@ class Innovation(NamedTuple):
 
     @property
     def per_dof(self) -> float | None:
-        """About 1 where the models are right, larger where the noise is larger; None without
-        measurements.
-        """
+        """About 1 where the models are right, larger for larger noise."""
         return self.squared / self.dof if self.dof else None
 
 
@@ -54,12 +49,10 @@ NOTHING = Innovation(0.0, 0)
 
 
 class Window(msgspec.Struct, gc=False):
-    """Particles since the window's start, their paths, and the measurements that they have used.
+    """Particles since the window's start, their paths, and the measurements used.
 
-    `advance` changes it.
-
-    The core holds them; the properties are copies, K keyframes, N measurements and M particles.
-    Poses are the sensor's, in the frame of the window's start of the sensor.
+    The core holds them, `advance` changes them; the properties are copies, K keyframes, N
+    measurements and M particles. Poses are the sensor's, in the frame of its start.
     """
 
     front_end: FrontEnd
@@ -78,10 +71,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def biases(self) -> tuple[Bias, ...]:
-        """The biases by which the window has derivatives.
-
-        That by `forward_scale` is left out where all of the window's motion is calibrated.
-        """
+        """The biases with derivatives; without `forward_scale` where all motion is calibrated."""
         biases = self.front_end.biases
         if "forward_scale" in biases and not self.core.has_shifts:
             return tuple(each for each in biases if each != "forward_scale")
@@ -94,7 +84,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def paths(self) -> Float[np.ndarray, "K M 3"]:
-        """The pose of each particle's line of descent at each of the keyframes."""
+        """Pose of each particle's line of descent at each keyframe."""
         return self.core.paths()
 
     @property
@@ -146,14 +136,12 @@ def advance(
     *,
     own: Own | None = None,
 ) -> None:
-    """Take a keyframe: the motion since the last one, then its measurements (there may be none).
+    """Take a keyframe: the motion since the last one, then its measurements.
 
-    The measurements are accepted and corrected already (`models.scanned`). The innovation does not
-    count them where their predictive covariance is singular.
-    forward: the motion's shift by an error of the scale of speed, and its duration
-    (`core.Odometry`).
-    own: the noises that the measurements claim (`teamslam.team.estimation.scans`).
-    Raises NotACovarianceError, and leaves the window as it was.
+    These are accepted and corrected (`models.scanned`). The innovation omits those of singular
+    predictive covariance. forward: the motion's shift by an error of the scale of speed, and its
+    duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.scans`). Raises
+    NotACovarianceError, and leaves the window as it was.
     """
     seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own
     with CoreErrors():
@@ -163,12 +151,11 @@ def advance(
 def gaussian(window: Window) -> LocalMap:
     """Make one Gaussian of the window so far: (end pose, pose nodes, landmarks by ascending id).
 
-    Each landmark of each particle is solved again over the window's measurements, given the path.
-    With w and (poses, landmarks) of each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where
-    Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on
-    SE(2), plus POSE_JITTER. Poses and landmarks are those of the base, in the frame of its start.
-    Its derivatives by the biases, as precise as in a message, are those of the window's smoother.
-    Raises NotACovarianceError if P is not finite or not positive definite.
+    Each landmark of each particle is solved again given the path. With w and (poses, landmarks) of
+    each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ =
+    μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on SE(2), plus POSE_JITTER. Poses
+    and landmarks are those of the base, in the frame of its start. Derivatives by the biases, as
+    precise as in a message, are those of the window's smoother. Raises NotACovarianceError.
     """
     ids, mean, covariance, fault = window.core.close()
     _raise_fault(fault, "the submap of a window")
@@ -191,8 +178,8 @@ def _raise_fault(fault: int, what: str) -> None:
 class RunningWindow(NamedTuple):
     """The Gaussian (end pose, landmarks) of an open window, which is not fused.
 
-    It is `gaussian` without pose nodes and, where all of the sensor's errors are white, with the
-    landmarks that the particles hold. window: None where it is the odometry's motion alone.
+    It is `gaussian` without pose nodes and, where all errors are white, with the particles' own
+    landmarks. window: None for the odometry's motion alone.
     """
 
     map: core.WholeMap
@@ -206,7 +193,7 @@ class RunningWindow(NamedTuple):
     def corrected(
         self, covariance_factor: float, biases: Sequence[tuple[Bias, float, float]]
     ) -> core.WholeMap:
-        """Correct the map as `SubmapCorrection` does a submap, by name, value and sigma of biases.
+        """Correct the map as `SubmapCorrection` does a submap.
 
         Raises NotACovarianceError where the window's smoother has no solution.
         """
@@ -223,19 +210,14 @@ class RunningWindow(NamedTuple):
 
 
 def running(window: Window) -> RunningWindow:
-    """Make the Gaussian of the window so far, for a pose within it.
-
-    Raises NotACovarianceError as `gaussian`.
-    """
+    """Make the Gaussian of the window so far, for a pose within it. Raises NotACovarianceError."""
     found, fault = window.core.run()
     _raise_fault(fault, "the submap of a window")
     return RunningWindow(found, window)
 
 
 def of_base(window: Window) -> Window:
-    """The window's particles and paths as those of the base, in the frame of the base's start
-    pose.
-    """
+    """Convert particles and paths to the base, in the frame of its start pose."""
     return msgspec.structs.replace(window, core=window.core.of_base())
 
 

@@ -1,8 +1,7 @@
 """The path within a closed window, given the pose at its end.
 
-A submap contains the pose at its window's end. The particles' knowledge of the earlier poses is
-represented here as a linear Gaussian given that end, so that a map that moves the two ends of a
-window moves the path between them, and the path has a covariance.
+The earlier poses are a linear Gaussian given the end, which a submap contains: a map that moves the
+two ends moves the path between them.
 """
 
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ class WindowPath:
     """The K keyframes of a window, in the frame of its start.
 
     x_k = mean_k + gain_k (end − end_mean); poses are (x [m], y [m], theta [rad]). covariances: of
-    what is left of x_k given the end.
+    x_k given the end.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
@@ -34,10 +33,10 @@ class WindowPath:
 
 
 def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
-    """The path of a closed window's particles, regressed on their end.
+    """Regress the path of a closed window's particles on their end.
 
-    With the particles' covariances P over (x_k, end), about the submap's means (`on_group`), gain =
-    P_ke P_ee⁻¹ and what is left is P_kk − gain P_ek; P_ee has POSE_JITTER as the submap's end has.
+    With the covariances P over (x_k, end), about the submap's means (`on_group`), gain = P_ke
+    P_ee⁻¹ and the remainder P_kk − gain P_ek; P_ee has the submap's POSE_JITTER.
     """
     weights = core.exp(window.particles.log_weights)
     poses = np.concatenate((window.paths, window.particles.poses[None]))
@@ -61,7 +60,7 @@ def window_path(window: Window, keyframes_ns: Sequence[int]) -> WindowPath:
 
 @dataclass(frozen=True)
 class Ends:
-    """The start and end pose of a window in the map, with their joint 6 × 6 covariance."""
+    """Start and end pose of a window in the map, with joint 6 × 6 covariance."""
 
     start: Pose
     end: Pose
@@ -71,10 +70,10 @@ class Ends:
 def placed(
     path: WindowPath, ends: Ends, covariance_factor: float = 1.0
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """The keyframes' poses and covariances in the map's frame, in (x, y, theta).
+    """Keyframe poses and covariances in the map's frame, in (x, y, theta).
 
-    x = start ∘ (mean + gain (start⁻¹ ∘ end − end_mean)), by first order in both ends and in what is
-    left; that is taken times covariance_factor, as the map takes the submap's covariance.
+    x = start ∘ (mean + gain (start⁻¹ ∘ end − end_mean)), to first order in both ends and in the
+    remainder, whose covariance is taken times covariance_factor.
     """
     heading = ends.start[2]
     s, c = core.sin_and_cos(heading)
