@@ -1,1 +1,1 @@
-"""Studies: experiments and the batch reference; the product runs without."""
+"""Experiments and the batch reference, without which the product runs."""

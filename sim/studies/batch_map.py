@@ -17,7 +17,7 @@ def solved_map(
     initial_poses: Mapping[str, InitialPose],
     robust_c: float | None,
 ) -> BatchMap:
-    """Solve for all poses and landmarks; see `teamslam.team.library.batch_map`."""
+    """Solve for all poses and landmarks, as `teamslam.team.library.batch_map`."""
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
     robots = sorted(keyframes)
     steps = [

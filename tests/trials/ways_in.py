@@ -4,8 +4,8 @@
 
 zip      the data set as it is
 csv      a folder of tables
-mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported rmw, bridge  the
-bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by an
+mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported
+rmw, bridge  the bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by an
          independent process, at so many times real time, to a `teamslam driver` per robot and a
          live team of processes
 log      the log of such a live team, imported

@@ -1,11 +1,11 @@
-"""Measurement factors of the batch MAP under the profile's noise: persistent errors are states.
+"""Measurement factors of the batch MAP with persistent errors as states.
 
 A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
     r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1), white,
-with the sensor's white shares w. e is a first-order Gauss-Markov process of unit variance for each
-robot and landmark, e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ). The three biases of a robot
-have the centre's priors. A measurement's own covariance is white and all of its noise.
+with white shares w and, for each robot and landmark, a first-order Gauss-Markov process e of unit
+variance: e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ). The biases have the centre's priors.
+A measurement's own covariance is all of its noise, and white.
 """
 
 import math
@@ -33,10 +33,7 @@ PINNED_SIGMA = 1e-6
 
 
 class Look(NamedTuple):
-    """Landmark measurement `number` of a scan, and its error state.
-
-    before: error state gap_s earlier.
-    """
+    """Landmark measurement `number` of a scan with its error state; before: gap_s earlier."""
 
     key: int
     chain: int
@@ -202,7 +199,6 @@ def _base_key(chain: Chain, number: int, pose: int) -> int:
 
 
 def _bases(chains: Sequence[Chain]) -> list[tuple[int, int]]:
-    """(chain, pose) of bases with inter-robot measurements."""
     times = {sighting.stamp_ns for chain in chains for sighting in chain.sightings}
     return [
         (c, i)

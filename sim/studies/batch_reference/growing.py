@@ -1,9 +1,9 @@
-"""Incremental batch MAP over all raw measurements of a team, solved by GTSAM.
+"""Incremental batch MAP over all raw measurements of a team, by GTSAM.
 
-Minimises Σ rᵀP⁻¹r of the initial poses and the odometry + Σ ρ(rᵀR⁻¹r) of the measurements over one
-pose per robot and keyframe and all landmarks (Dellaert & Kaess 2006, Square root SAM). ρ is the
-identity, or Cauchy's c² log(1 + χ²/c²). R is the sensor's at the predicted range, not
-differentiated: each new estimate has a new graph. Poses are perturbed on the right.
+Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements over a pose per
+robot and keyframe and all landmarks (Dellaert & Kaess 2006). ρ is the identity, or Cauchy's c²
+log(1 + χ²/c²). R is at the predicted range, not differentiated, so each new estimate has a new
+graph. Poses are perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,9 +42,9 @@ class UnsolvableError(ValueError):
 class GrowingBatch:
     """Estimate of all poses and landmarks, in the map frame.
 
-    starts: initial poses with covariance in (x, y, θ); None: exact. Step k ends at pose len(starts)
-    + k. poses: (x [m], y [m], θ [rad]), initial poses first. robust_c: Cauchy's scale on √χ² of a
-    measurement; None: least squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. Step k ends at pose
+    len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first. robust_c: Cauchy's scale
+    on √χ² of a measurement; None: least squares.
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]
@@ -148,7 +148,7 @@ def initial_state(
 
 
 def add_steps(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
-    """Append steps: dead-reckon new poses, place new landmarks by their first measurement.
+    """Append steps: dead-reckon poses, place new landmarks by their first measurement.
 
     Raises ValueError for a robot without an initial pose.
     """
@@ -229,10 +229,7 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the robot's newest pose, in (x, y, θ).
-
-    Raises ValueError for an unknown robot.
-    """
+    """Mean and marginal covariance of the robot's newest pose in (x, y, θ); raises ValueError."""
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))
 

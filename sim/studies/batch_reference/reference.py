@@ -2,9 +2,9 @@
 
 One pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘
 Exp(ξ) with the tangent covariance of `increment_of`; each accepted range and bearing with the
-sensor's noise or its own, under a Cauchy loss if the centre has `batch_robust_c`.
-Levenberg-Marquardt starts from the joined solution with the paths filled in three ways. Noise
-`white`: independent errors, inter-robot measurements unused; `profile`: see `errors`.
+sensor's noise or its own, under a Cauchy loss with the centre's `batch_robust_c`.
+Levenberg-Marquardt starts from the joined solution, paths filled in three ways. Noise `white`:
+independent errors, inter-robot measurements unused; `profile`: see `errors`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -63,7 +63,7 @@ NO_BIASES = (None, None, None)
 class BatchReference:
     """Optimum of the batch.
 
-    cost = Σ‖r‖², initial_cost: of the best initial values. gradient_norm: of the cost;
+    cost = Σ‖r‖²; initial_cost: of the best initial values. gradient_norm: of the cost;
     newton_decrement: √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases:
     (bearing [rad], range offset [m], range scale) by robot. team: the run's own final map.
     """
@@ -125,7 +125,7 @@ def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
 
 
 def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchReference:
-    """Compute the batch MAP of a log of a whole run under the rule `join` or `batch`.
+    """Compute the batch MAP of a whole run's log under the rule `join` or `batch`.
 
     Raises BatchReferenceError without GTSAM, scenario, joined map or convergence.
     """
@@ -186,7 +186,7 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
 def _solve(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
-    """Best optimum over all initial values, and its figures; raises BatchReferenceError."""
+    """Best optimum over all initial values, with figures; raises BatchReferenceError."""
     optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
@@ -222,9 +222,9 @@ def _optimise(gtsam: Any, graph: Any, initial: Any) -> Any:
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
-    """Gauss-Newton with halving of steps that do not lower the cost.
+    """Gauss-Newton, halving steps that do not lower the cost.
 
-    With Python factors it is five times faster than GTSAM's Levenberg-Marquardt.
+    Five times faster than GTSAM's Levenberg-Marquardt with Python factors.
     """
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):

@@ -17,10 +17,7 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """map_from_robot = mean ∘ Exp(ξ), ξ ~ N(0, covariance) in (forward, left, turn).
-
-    In these coordinates the pose stays near a Gaussian although its position is banana-shaped.
-    """
+    """map_from_robot = mean ∘ Exp(ξ), ξ ~ N(0, covariance) in (forward, left, turn)."""
 
     pose: Increment
 
@@ -43,7 +40,7 @@ def filter_step(
 
 
 def pose_gaussian(state: DeadReckoning) -> PoseGaussian:
-    """In the coordinates (x, y, theta), to first order: P = G C Gᵀ with G = blkdiag(R(θ), 1)."""
+    """Gaussian in (x, y, theta), to first order: P = G C Gᵀ with G = blkdiag(R(θ), 1)."""
     G = tangent(state.pose.mean[2])
     P = dense.product(dense.product(G, state.pose.covariance), G.T)
     return PoseGaussian(state.pose.mean, 0.5 * (P + P.T))

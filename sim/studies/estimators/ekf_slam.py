@@ -1,7 +1,7 @@
 """EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
 
-Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1; Downs' thesis, section 2.6. Over a
-long run the covariance becomes too small (Julier and Uhlmann 2001).
+Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1. Over a long run the covariance
+becomes too small (Julier and Uhlmann 2001).
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ def filter_step(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> EkfSlam:
-    """Move, update by all measurements of known landmarks at once, then place the new ones.
+    """Move, update by all known landmarks at once, then place the new ones.
 
     ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it.
     Raises NotACovarianceError.

@@ -1,8 +1,8 @@
 """EKF-SLAM step: motion, measurements of known landmarks, new landmarks.
 
-The state is (x, y, theta, x₁, y₁, …); `mean` and `P` have room for the new landmarks and are
-written in place. A sensor is (σ_range², σ_range_per_m², σ_bearing²). All sums have a fixed order,
-so the bits are the same on every processor.
+State: (x, y, theta, x₁, y₁, …); `mean` and `P` have room for new landmarks and change in place. A
+sensor is (σ_range², σ_range_per_m², σ_bearing²). Sums have a fixed order: the bits are the same on
+every processor.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def step(
     measurements: Float[np.ndarray, "k 2"],
     sensor: Triple,
 ) -> bool:
-    """Perform one step on the pose and the first `known` landmarks; False: invalid mean and P.
+    """Step the pose and the first `known` landmarks; False: mean and P are invalid.
 
     slots: landmark of each measurement in the state; first: first sight of it. Fails if the
     innovation covariance is not positive definite.
@@ -86,8 +86,8 @@ def _place(
 ) -> None:
     """Place a new landmark in the entries `at` and at + 1 of the state.
 
-    g = (x, y) + r (cos, sin)(theta + b): with G_p = ∂g/∂pose its rows are P_l· = G_p P_p· and P_ll
-    = G_p P_pp G_pᵀ + G_z R G_zᵀ.
+    g = (x, y) + r (cos, sin)(theta + b), G_p = ∂g/∂pose: P_l· = G_p P_p·, P_ll = G_p P_pp G_pᵀ +
+    G_z R G_zᵀ.
     """
     noise = (sensor[0], sensor[1], 1.0, sensor[2], 1.0)
     (mean[at : at + 2],), (own,) = core.place(mean[:3], measurement[None], noise, NO_CLAIM)
@@ -104,8 +104,8 @@ def _place(
 class _Sights:
     """Measurement matrix H: two rows (range, bearing) for each landmark at `places` of the state.
 
-    With distance d and unit vector (ex, ey) to the landmark, e⊥ = (−ey, ex), and δ the landmark's
-    entries of v less the position's: H v = (e·δ, e⊥·δ/d − v_theta).
+    H v = (e·δ, e⊥·δ/d − v_theta) with distance d, unit vector e = (ex, ey) to the landmark, e⊥ =
+    (−ey, ex), and δ the landmark's entries of v less the position's.
     """
 
     def __init__(self, mean: Float[np.ndarray, " n"], places: Int64[np.ndarray, " t"]) -> None:
@@ -129,10 +129,10 @@ def _condition(
     measurements: Float[np.ndarray, "t 2"],
     sensor: Triple,
 ) -> bool:
-    """Update by measurements of the landmarks at `places`, all linearised at the state before them.
+    """Update by measurements of the landmarks at `places`, linearised at the state before.
 
-    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), and P by `_joseph`. False if S is not
-    positive definite.
+    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), P by `_joseph`. False if S is not positive
+    definite.
     """
     m = 2 * len(places)
     if m == 0:
@@ -164,8 +164,8 @@ def _joseph(
 ) -> None:
     """P ← A P Aᵀ + K R Kᵀ with A = I − K H and Kᵀ = `gains`, in place.
 
-    Each row b of A P becomes b Aᵀ + (K R Kᵀ)_j = b − (b Hᵀ − K_j R) Kᵀ; H is five entries wide. The
-    lower triangle is copied, so P stays exactly symmetric.
+    Each row b of A P becomes b − (b Hᵀ − K_j R) Kᵀ; H is five entries wide. The lower triangle is
+    copied, so P stays symmetric.
     """
     for k in range(len(HP)):
         P -= gains[k][:, None] * HP[k]

@@ -1,7 +1,7 @@
 """FastSLAM 1.0 with maximum-likelihood data association in each particle.
 
 Montemerlo and Thrun 2003: a detection belongs to the likeliest landmark, or to a new one if none
-reaches the likelihood at the gate's edge. The map is the heaviest particle's.
+is likelier than the gate's edge. The map is the heaviest particle's.
 """
 
 from dataclasses import dataclass, replace

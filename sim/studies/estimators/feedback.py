@@ -43,10 +43,7 @@ def absorb_fused_map(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """Replace the marginal of the landmarks by the fused map; update the rest by `carry_along`.
-
-    Unknown landmarks are added.
-    """
+    """Replace the landmarks' marginal by the fused map, new ones added; `carry_along` the rest."""
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
     mean, joint = carry_along(
         whole.mean,

@@ -1,9 +1,8 @@
 """Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
 W. Xu, sections 4.2 and 4.3. The reset discards correlations and all pose uncertainty but the last
-step's, so covariances are far too small; `window` avoids this. Two corrections: a landmark's
-initial covariance follows from the measurement (thesis: 30 m), and weights start anew with each
-step.
+step's, so covariances are far too small. Two corrections: a landmark's initial covariance follows
+from the measurement (thesis: 30 m), and weights restart with each step.
 """
 
 from dataclasses import dataclass
@@ -52,9 +51,9 @@ def filter_step(
     particles: int,
     generator: np.random.Generator,
 ) -> ThesisState:
-    """Sample poses about the mean, update and weigh (FastSLAM 1.0), and reset to eq. 4.5-4.6.
+    """Sample poses about the mean, update and weigh (FastSLAM 1.0), reset to eq. 4.5-4.6.
 
-    Unmeasured landmarks stay exactly equal. ranges [m] and bearings [rad] are calibrated.
+    Unmeasured landmarks keep their bits. ranges [m] and bearings [rad] are calibrated.
     """
     after, _ = fastslam.filter_step(
         particles=reset(state, ids, particles),

@@ -1,9 +1,9 @@
 """Hybrid-SLAM as in the appendix of W. Xu's thesis, where its program differs from its text.
 
 Poses and landmarks become their weighted mean after each step, but weights carry over
-(`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without resampling. Each particle
-keeps its own landmark covariances; those of eq. 4.6 are unused. A new landmark begins with 15 m and
-17.8°, rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
+(`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without resampling. Particles keep
+their own landmark covariances; eq. 4.6 is unused. A new landmark begins with 15 m and 17.8°,
+rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
 """
 
 import math

@@ -28,14 +28,14 @@ def innovation(
     bearings: Float[np.ndarray, " n"],
     own: Own | None = None,
 ) -> Innovation:
-    """ν = z − ẑ of one keyframe's measurements in the metric of their joint predictive covariance.
+    """ν = z − ẑ of one keyframe's measurements, with their joint predictive covariance.
 
-    The particles of the keyframe before predict the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of measurements of
-    landmarks that they know; ẑ and S are its moments, bearings on the circle:
+    The particles before the keyframe predict measurements of known landmarks as the mixture Σ wᵢ
+    N(ẑᵢ, Sᵢ); ẑ and S are its moments, bearings on the circle:
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
         S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
-    First sights are left out. ranges [m] and bearings [rad] are accepted and calibrated; own: their
-    noises. R is white. Raises NotACovarianceError if S is not positive definite.
+    First sights are left out. ranges [m] and bearings [rad] are accepted and calibrated; own:
+    their noises. R is white. Raises NotACovarianceError if S is not positive definite.
     """
     noises = unclaimed(len(ids)) if own is None else own
     with CoreErrors():

@@ -1,7 +1,7 @@
 """Multi-robot FastSLAM: a particle is a path of every robot and one map.
 
-p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for any
-number of robots at known start poses. Over-confidence comes sooner than with one robot.
+p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for
+any number of robots at known start poses. Overconfident sooner than with one robot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,8 +24,8 @@ class JointFastSlam:
     """M particles (x¹, …, xᴿ, m, w).
 
     poses: (x [m], y [m], theta [rad]) by robot and particle, in the map frame. Others as in
-    `fastslam.Particles`. resample_below: relative effective sample size below which a step begins
-    with a resampling; 1: always, as in algorithm 1.
+    `fastslam.Particles`. resample_below: relative effective sample size below which a step first
+    resamples; 1: always, as in algorithm 1.
     """
 
     robots: tuple[str, ...]
@@ -60,8 +60,8 @@ def filter_step(
 ) -> JointFastSlam:
     """Resample if the particles are thin, then process the robots' turns in order.
 
-    Each turn multiplies the weights by p(zʳ | …). A step may be one robot's turn. Draws one uniform
-    number if it resamples and M × 3 normal ones per turn. Raises ValueError for an unknown robot.
+    Each turn multiplies the weights by p(zʳ | …). Draws one uniform number if it resamples and M ×
+    3 normal ones per turn. Raises ValueError for an unknown robot.
     """
     thin = state.resample_below * len(state.log_weights)
     if fastslam.effective_sample_size(state.log_weights) < thin:

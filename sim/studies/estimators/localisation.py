@@ -1,7 +1,7 @@
-"""Monte Carlo localisation: a cloud of weighted poses on an exactly known map.
+"""Monte Carlo localisation: weighted poses on an exactly known map; the start may be unknown.
 
 p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1 (eq. 3.23 to
-3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2. The start may be unknown.
+3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2.
 """
 
 import math
@@ -73,8 +73,8 @@ def filter_step(
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
-    ranges [m] and bearings [rad] are calibrated; unmapped landmarks are left out. Draws one uniform
-    number if it resamples and M × 3 normal ones.
+    ranges [m] and bearings [rad] are calibrated; unmapped landmarks are left out. Draws one
+    uniform number if it resamples and M × 3 normal ones.
     """
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
@@ -101,7 +101,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Innovation of the measurements that `filter_step` would use; for one mode only."""
+    """Innovation of the measurements that `filter_step` would use; valid for one mode."""
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())
     on_map = replace(

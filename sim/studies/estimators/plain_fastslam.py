@@ -24,8 +24,8 @@ from teamslam.team.shapes import Float, UInt32
 class PlainFastSlam:
     """Weighted particles in the map frame, with their proposal and resampling.
 
-    resample_below: relative effective sample size below which a step resamples (Xu: 0.5); 1: always
-    (Ma & Ma, Montemerlo).
+    resample_below: relative effective sample size below which a step resamples (Xu: 0.5); 1:
+    always (Ma & Ma, Montemerlo).
     """
 
     particles: Particles
@@ -73,7 +73,7 @@ def pose_gaussian(state: PlainFastSlam) -> PoseGaussian:
 
 
 def landmark_gaussian(state: PlainFastSlam) -> LandmarkGaussian:
-    """The mixture Σ wᵢ N(μᵢ, blkdiag(Σ₁, …, Σ_L)) as one Gaussian (Xu, eq. 4.5-4.6)."""
+    """Σ wᵢ N(μᵢ, blkdiag(Σ₁, …, Σ_L)) as one Gaussian (Xu, eq. 4.5-4.6)."""
     return landmark_moments(state.particles)
 
 

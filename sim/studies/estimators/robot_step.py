@@ -18,7 +18,7 @@ POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 
 
 class RobotStep(NamedTuple):
-    """Motion of a robot since its last turn, then measurements at the end of it.
+    """Motion of a robot since its last turn, and the measurements at its end.
 
     ranges [m] and bearings [rad] are calibrated; own: their covariances, or no rows.
     """
@@ -54,7 +54,7 @@ def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
 
 
 def variances(sensor: Sensor) -> tuple[float, float, float]:
-    """Return (σ_range² [m²], σ_range_per_m², σ_bearing² [rad²])."""
+    """(σ_range² [m²], σ_range_per_m², σ_bearing² [rad²])."""
     return (
         core.squared(sensor.range_sigma),
         core.squared(sensor.range_sigma_per_m),

@@ -10,7 +10,7 @@ Array = Float[np.ndarray, "..."]
 
 
 def see(poses: Array, landmarks: Array) -> tuple[Array, Array, Array]:
-    """Distance d and unit vector (ex, ey) from each pose to its landmark, d ≥ NEAREST_M."""
+    """Distance d ≥ NEAREST_M and unit vector (ex, ey) from each pose to its landmark."""
     dx, dy = landmarks[..., 0] - poses[..., 0], landmarks[..., 1] - poses[..., 1]
     distance = np.sqrt(dx * dx + dy * dy)
     near = distance < NEAREST_M

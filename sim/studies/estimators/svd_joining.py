@@ -1,8 +1,8 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
-Submaps are joined by argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) (eq. 4.1) with P the identity: a radian
-counts as a metre (sections 3.2 and 4.3). Robots that measure each other exchange maps, rotate one
-into the other's frame by SVD and join the landmarks alone (section 4.3, appendix II).
+argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) over submaps (eq. 4.1), P the identity: a radian counts as a
+metre (sections 3.2 and 4.3). Robots that measure each other exchange maps, rotate one into the
+other's frame by SVD and join the landmarks alone (section 4.3, appendix II).
 """
 
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ def reweight(local: LocalMap, weighting: Weighting) -> LocalMap:
     """Replace a submap's covariance for the join.
 
     "identity": I. "spherical": a position and every landmark get half the trace of their block
-    times I, a heading keeps its variance, correlations are dropped. "full": unchanged.
+    times I, a heading keeps its variance, no correlations. "full": unchanged.
     """
     if weighting == "full":
         return local
@@ -131,7 +131,7 @@ def mutual_sighting(
     range_to_a: float,
     bearing_to_a: float,
 ) -> PointPairs:
-    """Positions of two robots that measure each other in both maps (Downs, chapter 3)."""
+    """Positions of two robots that measure each other, in both maps (Downs, chapter 3)."""
     return PointPairs(
         np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
         np.stack((located(pose_b, range_to_a, bearing_to_a), pose_b[:2])),
@@ -141,14 +141,14 @@ def mutual_sighting(
 def exchange_maps(
     a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS
 ) -> ExchangedMap:
-    """Join two maps in the frame of a, by their common landmarks and the robots' positions.
+    """Join two maps in the frame of a, by common landmarks and the robots' positions.
 
     argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): each common xᵢ is the
-    middle of its two points, and ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised by singular values
-    (`procrustes`). With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the
-    landmarks have σ̂² D + E Σ_T Eᵀ: D = 1, E = 0 for those of a alone, 1 and G for those of b
-    alone, 1/2 and G/2 for the common ones; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances
-    are discarded. Raises TooFewPointsError for n < 2.
+    middle of its two points, and ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised by `procrustes`. With n common
+    points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have σ̂² D + E Σ_T
+    Eᵀ: D = 1, E = 0 for those of a alone, 1 and G of b alone, 1/2 and G/2 for the common ones; σ̂²
+    = cost/(2n − 3). As in Downs, the maps' covariances are discarded. Raises TooFewPointsError for
+    n < 2.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -181,7 +181,7 @@ def exchange_maps(
 def _move(
     a_from_b: Pose, points: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m 3"]]:
-    """R b + t and its derivative by (t, θ): [I, R b turned by 90°]."""
+    """R b + t and its derivative by (t, θ): [I, R b rotated by 90°]."""
     s, c = core.sin_and_cos(a_from_b[2])
     turned = dense.product(points, np.array([[c, s], [-s, c]]))
     G = np.zeros((2 * len(points), 3))

@@ -9,5 +9,5 @@ function of this package with JSON parameters and a JSON result. A team's run is
 `Outcome.missing` lists figures that need a data set.
 3. Add an entry to `catalogue.py`.
 
-A result is stored in the output folder under its task and the digest of the imported sources.
+Results are stored in the output folder by task and digest of the imported sources.
 """

@@ -1,4 +1,4 @@
-"""Compare maps with 30 % outliers with maps without them, of equally many inliers.
+"""Compare maps with 30 % outliers with maps of the same inliers alone.
 
 An outlier has a uniform range and bearing, or the identity of another landmark.
 """

@@ -1,6 +1,6 @@
 """Unknown initial poses: all robots but the first must be placed in the team's map.
 
-A merge is wrong if the first pose of a robot that joined lies outside its own 99.9 % ellipsoid.
+A merge is wrong if a joined robot's first pose lies outside its own 99.9 % ellipsoid.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options

@@ -1,6 +1,6 @@
 """Real data: every given UTIAS set, five robots, one fixed profile.
 
-`shape` is the error that no rigid motion explains; its NEES per landmark is 2 for a correct
+`shape`: the error that no rigid motion explains; its NEES per landmark is 2 for a correct
 covariance.
 """
 

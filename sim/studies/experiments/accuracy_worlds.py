@@ -26,7 +26,7 @@ from teamslam.team.pairs import PAIRS
 
 
 class World(NamedTuple):
-    """World: its scenario, its most seeds, and the goals of the default pair.
+    """Scenario, maximum seeds, and the goals of the default pair.
 
     rules: every valid pair runs. batch: with the batch MAP.
     """

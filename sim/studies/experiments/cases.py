@@ -1,6 +1,6 @@
 """Compute cases in parallel and store their results, with joblib's workers and memory.
 
-A case that fails or dies loses only itself.
+A failed case does not affect others.
 """
 
 import threading

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """Experiment: command, module, summary.
+    """Command, module, summary.
 
     module: has `tasks` and `outcome`, or `module:object`. seeds: by default, with --quick, and at
     most in `all`.

@@ -1,6 +1,6 @@
 """Compute a run's errors over team time: online poses, and the first landmark of robot 1.
 
-The landmark is that of the newest fused map, or else of the robot's own.
+The landmark is the newest fused map's, or else the robot's own.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,6 @@
 """Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
 
-Each has the printed figures, his protocol (`downs_joined`) and ours (`utias`), with the profile's
-models.
+Printed figures, his protocol (`downs_joined`) and ours (`utias`), with the profile's models.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,7 +63,7 @@ class Compared(NamedTuple):
 
 
 class PrintedTable(NamedTuple):
-    """Table of the thesis. printed: by the set's number, a figure for each column.
+    """Table of the thesis. printed: figures of each column by set number.
 
     sample: run whose map on the first set is drawn, as in figure 5.1.
     """
@@ -273,7 +272,7 @@ def _paired(
 
 
 def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
-    """Paired two-sided t-test of figures before and after; p None below two pairs."""
+    """Paired two-sided t-test; p None below two pairs."""
     both = np.array([pair for pairs in pairs_of_sets for pair in pairs]).reshape(-1, 2)
     return {
         "pairs": len(both),

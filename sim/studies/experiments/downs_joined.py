@@ -1,8 +1,8 @@
 """Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
-Measurements are sampled to one second, with a submap per step, of which only the mean is used. Each
-robot's submaps are joined with the identity as covariance, and the maps aligned by singular values
-(`svd-join-spherical`). A submap here is a window of the hybrid estimator; his is a step of an EKF
+Measurements are sampled to one second, with a submap per step, of which only the mean is used.
+Each robot's submaps are joined with the identity, and the maps aligned by singular values
+(`svd-join-spherical`). A submap is a window of the hybrid estimator; his is a step of an EKF
 without earlier landmarks.
 """
 

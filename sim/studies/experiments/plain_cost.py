@@ -1,9 +1,8 @@
-"""Independent implementation of the joined map's cost, without code of the team's map joining.
+"""Independent implementation of the joined map's cost.
 
     Σ ‖L_k⁻¹ (R(θ_s)ᵀ(p − p_s) …, θ_e − θ_s …; minus the submap's mean)‖², L_k L_kᵀ = f P_k
     + Σ ‖L⁻¹ (range, bearing of a teammate; minus the measurement)‖² + Σ ‖prior‖²
-with complex numbers, solved by Levenberg-Marquardt steps (damping as in Nielsen 1999) through
-SuperLU.
+with complex numbers, by Levenberg-Marquardt (damping as in Nielsen 1999) through SuperLU.
 """
 
 from collections import defaultdict
@@ -153,8 +152,7 @@ class _Sum:
 class _Submaps(NamedTuple):
     """K submaps of equal size.
 
-    at: state indices of each one's start, poses and landmarks; points: the first ones of the latter
-    two.
+    at: state indices of each start, poses and landmarks; points: the first ones of the latter two.
     """
 
     whitening: Float[np.ndarray, "K n n"]
@@ -184,7 +182,7 @@ class _Submaps(NamedTuple):
 
 
 class _Sightings(NamedTuple):
-    """K inter-robot measurements. at: coordinates of the observer's pose and the teammate's."""
+    """K inter-robot measurements. at: coordinates of the two poses, observer first."""
 
     whitening: Float[np.ndarray, "K 2 2"]
     means: Float[np.ndarray, "K 2"]

@@ -1,8 +1,8 @@
 """Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
 
-The tests use the final map's own cost (`plain_cost`): whether a solution from the truth has less
-cost, whether it ends in another place that is about as likely, and by how much the cost rises with
-the truth fixed (likelihood ratio, χ² of the fixed coordinates).
+By the final map's own cost (`plain_cost`): whether a solution from the truth has less cost, or
+ends in another place about as likely, and the rise of the cost with the truth fixed (likelihood
+ratio, χ² of the fixed coordinates).
 """
 
 from collections.abc import Iterable, Mapping

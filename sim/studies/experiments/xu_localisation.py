@@ -1,7 +1,7 @@
 """Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
-Its figures 3.2 to 3.5 are those of Fox et al. 2000. Here they are on the thesis' world: the three
-steps of the filter after a stretch without measurements, and a start anywhere.
+Its figures 3.2 to 3.5 are those of Fox et al. 2000. Here, on the thesis' world: the three steps of
+the filter after a stretch without measurements, and an unknown start.
 """
 
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ ERRORS = ErrorFigure(
 
 
 def tasks(options: Options) -> list[Task]:
-    """The three steps, a start anywhere, the errors."""
+    """The three steps, an unknown start, the errors."""
     return [
         *(_stages_task(options, seed) for seed in options.seeds),
         *(_anywhere_task(options, seed) for seed in options.seeds),
@@ -81,7 +81,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Pictures of the steps, the start anywhere, the errors."""
+    """Pictures of the steps, the unknown start, the errors."""
     stages = results.of_all([_stages_task(options, seed) for seed in options.seeds])
     anywhere = results.of_all([_anywhere_task(options, seed) for seed in options.seeds])
     errors = ERRORS.outcome(options, results)

@@ -31,8 +31,8 @@ class Filter(NamedTuple):
     """Recursive estimator over its own state.
 
     looks: accepts landmarks; claims: with covariances; maps: has a map; joint: with covariances
-    between landmarks. absorbed: state with the given landmarks. particles: of a state, for viewers.
-    innovation: of a step's measurements, predicted by the state before.
+    between landmarks. absorbed: state with the given landmarks. particles: of a state, for
+    viewers. innovation: of a step's measurements, predicted by the state before.
     """
 
     initial_state: InitialState

@@ -10,10 +10,7 @@ from teamslam.team.wire.bus import Outgoing
 
 
 def in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Messages under a feedback rule, where a robot waits for each round's recorded map.
-
-    Without a recorded map the robot continued without a centre.
-    """
+    """Recompute messages; the robot waits for each round's recorded map, or continues without."""
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
     node = new()
     incarnations = log.incarnations(robot)

@@ -30,7 +30,7 @@ from teamslam.team.wire import messages as m
 
 
 class ExchangingMapper(Mapper):
-    """Hybrid-SLAM that sends its own map in exchanges, or for viewers if the rule fuses no maps.
+    """Hybrid-SLAM that sends its own map in exchanges, or only to viewers.
 
     joint: with a joint covariance.
     """
@@ -107,10 +107,7 @@ class StreamMapper(ExchangingMapper):
         return self._known is None
 
     def know(self, message: m.KnownMap) -> None:
-        """Store the known map; of two the newer one by its stamp.
-
-        Landmarks beyond the bounds are dropped.
-        """
+        """Store the known map; the newer stamp wins, landmarks beyond the bounds are dropped."""
         if self._known_ns is not None and message.stamp_ns <= self._known_ns:
             return
         self._known_ns = message.stamp_ns

@@ -1,7 +1,6 @@
 """Node of a comparison robot: its centre fuses whole maps or raw measurements.
 
-Under a rule with feedback (`kalman`, `kalman-per-axis`, `covariance-intersection`) the robot waits
-for the fused map of each exchange and absorbs it.
+Under a rule with feedback the robot waits for the fused map of each exchange and absorbs it.
 """
 
 from typing import Any

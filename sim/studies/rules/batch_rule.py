@@ -30,8 +30,8 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 class BatchCentre(MeasurementCentre):
     """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
 
-    The newest poses are published with the map, whole paths with the final map. Persistent sensor
-    errors and biases are treated as white noise, with a warning.
+    Newest poses come with each map, whole paths with the final one. Persistent sensor errors and
+    biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch

@@ -1,7 +1,7 @@
 """Rules that fuse whole maps which the robots absorb, in lockstep.
 
-The fused map replaces the robots' own landmarks, so under `kalman` and `kalman-per-axis`
-measurements are counted repeatedly, and the covariance has no meaning.
+The fused map replaces the robots' landmarks, so under `kalman` and `kalman-per-axis` measurements
+are counted repeatedly, and the covariance has no meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -41,7 +41,7 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 
 
 def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
-    """The thesis' fusion: each coordinate by itself, correlations dropped (Xu, eq. 5.1-5.4).
+    """The thesis' fusion: each coordinate by itself, without correlations (Xu, eq. 5.1-5.4).
 
     TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and S =
     S^A S^B/(S^A + S^B).
@@ -52,7 +52,7 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 def covariance_intersection(
     maps: Sequence[LandmarkGaussian], criterion: Literal["trace", "det"] = "det"
 ) -> LandmarkGaussian:
-    """Fusion that is consistent for any correlation between the maps (Julier & Uhlmann 1997).
+    """Fusion that is consistent for any correlation of the maps (Julier & Uhlmann 1997).
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
     of the least trace or determinant of C. The others follow by regression in their own map.
@@ -83,7 +83,7 @@ def fuse_maps(
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """Fuse the robots' maps; return the result and the rejected maps, with reasons.
 
-    Maps are rejected beyond the bounds, or if the rule has no result with them.
+    Maps beyond the bounds, or without a result of the rule, are rejected.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []

@@ -93,7 +93,7 @@ class NewestMapsCentre(ComparisonCentre):
 
 
 class LatestCentre(NewestMapsCentre):
-    """Latest whole map of every robot as one, nothing fed back (`kalman` of independent maps).
+    """Latest whole map of every robot as one, without feedback (`kalman` of independent maps).
 
     A robot with an unknown initial pose is left out.
     """

@@ -1,8 +1,7 @@
 """Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
-Every robot's submaps make one map by least squares (section 4.1), moved into the others' frame by
-SVD over the common landmarks, and joined (section 4.3). The first robot's initial pose fixes the
-frame.
+Each robot's least-squares map (section 4.1) is moved into the others' frame by SVD over the common
+landmarks, and joined (section 4.3). The first robot's initial pose fixes the frame.
 """
 
 import math
@@ -132,8 +131,8 @@ class SvdFold(SubmapFold):
     ) -> _Joined:
         """Extend the map of a stream's chain from its longest stored part.
 
-        Running maps continue from the last solution; the final one is solved until it converges,
-        including a search for other minima.
+        Running maps continue from the last solution; the final one is solved to convergence, with
+        a search for other minima.
         """
         begin = svd_joining.initial_state(
             {stream[0]: np.zeros(3) if initial_pose is None else initial_pose}, self._weighting

@@ -95,7 +95,7 @@ class _Stream:
 class TeamKeyframes:
     """Keyframes of the team by (stamp, robot), as far as every robot's stream is known.
 
-    A stream that restarts at an unknown pose ends there; inter-robot measurements are not used.
+    A stream ends where it restarts at an unknown pose; inter-robot measurements are not used.
     """
 
     def __init__(self, robots: Sequence[str]) -> None:

@@ -25,8 +25,7 @@ LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -
 
 
 def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0):
-    """Robots on known paths whose ranges are wrong in proportion: contributions, starts, true
-    scale errors.
+    """Robots on known paths with scale errors: contributions, starts, the true errors.
 
     own, common, marker: sigmas of the scale of each robot, of all, and of each landmark's marker;
     way: of each submap's end pose [m].
