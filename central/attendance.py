@@ -388,7 +388,6 @@ class TeamAttendance:
         return progress.stamp_ns
 
     def _is_away(self, robot: Attendance) -> bool:
-        """Whether a robot of a live team has not begun or has no driver."""
         if not self.is_live:
             return False
         head = robot.head

@@ -79,7 +79,6 @@ def cuts_of(fold: Fold) -> list[CarriedOff]:
 
 
 def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
-    """Return the motion between the ends of two parts, and its χ²."""
     island = fold.islands[fold.home[earlier]]
     nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
     mean, covariance = joint_marginal(island, nodes)

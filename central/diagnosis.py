@@ -1,9 +1,9 @@
 """The causes of a map's misfit, the best one first, with remedies.
 
-A pure function of the fold and the withdrawn robots' submaps. Landmarks with two places and robots
-that were carried off are hypotheses that are solved (`map_joining.hypotheses`). Shared errors of a
-robot's submaps are states of the map. A mirrored robot's submaps fit the map by a reflection. The
-covariance scale is judged last, beside all accepted causes.
+A pure function of the fold and the withdrawn robots' submaps. Landmarks with two places and jumps
+are hypotheses (`map_joining.hypotheses`), shared errors of a robot's submaps states of the map. A
+mirrored robot's submaps fit the map by a reflection. The covariance scale is judged beside all
+accepted causes.
 """
 
 import math
@@ -173,10 +173,9 @@ def _shared_errors(
     """Find errors that differ from the robot's configuration beyond doubt.
 
     Their standard deviation is the larger of the stated one, times the root of a covariance scale
-    above 1, and that from the scatter of the submaps: errors that change slowly look like a shared
-    one, but scatter about it. Of that scatter an error must exceed more than chance does once in a
-    thousand (Student's t). A large error's standard deviation grows by the error of its
-    sensitivities.
+    above 1, and that from the scatter of the submaps, which slowly changing errors show. Of the
+    scatter an error must exceed more than chance does once in a thousand (Student's t). A large
+    error's standard deviation grows by the error of its sensitivities.
     """
     for found in biases:
         (robot, _), bias, value, stated = found

@@ -79,7 +79,6 @@ def fix_warnings(fold: Fold) -> Iterator[str]:
 
 
 def _residual(island: Island, fix: Encounter, weight: float, around: tuple[int, int]) -> _Residual:
-    """Residual of a fix, with the velocity between pose nodes around."""
     seen = fix.sighting
     before, after = (_pose(island, island.graph.poses[seen.stream, each]) for each in around)
     body = inverse(_pose(island, fix.teammate))
@@ -98,7 +97,6 @@ def _pose(island: Island, node: int) -> Float[np.ndarray, "3"]:
 
 
 def _explained(stream: Stream, residuals: Sequence[_Residual]) -> Iterator[str]:
-    """Word the antenna's displacement and the delay that are beyond chance."""
     J = np.zeros((2 * len(residuals), 3))
     J[0::2, 0] = J[1::2, 1] = 1.0
     J[:, 2] = [-value for each in residuals for value in each.v.tolist()]

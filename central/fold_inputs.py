@@ -1,10 +1,8 @@
 """The inputs of a fold by ticks of team time: submaps, initial poses and verdicts.
 
 They only grow, except for verdicts, and depend on no fold: a fold without some robots reads the
-same inputs.
-
-A contribution is several times as large as its message; it is decoded on demand and cached while
-some fold has it.
+same inputs. A contribution is several times as large as its message, so it is decoded on demand and
+cached while some fold has it.
 """
 
 import math
@@ -220,7 +218,6 @@ class FoldInputs:
         return tick
 
     def _add_known(self, submap: Submap, start: InitialPoseFactor) -> int:
-        """Add a submap of the configuration with its start; return its tick."""
         self.add_start(start)
         return self._members.add(submap, digest_of(encoded(submap)), ())
 
@@ -302,7 +299,6 @@ class FoldInputs:
     def _sightings(
         self, order: Sequence[Key], without: Collection[str]
     ) -> tuple[list[InterRobotFactor], list[str]]:
-        """Return the inter-robot measurements from some submaps, and in words those refused."""
         sightings, refused = [], []
         for sighting in (each for key in order for each in self._members.sightings(key)):
             if sighting.teammate in without:

@@ -215,7 +215,6 @@ def _lost(shown: Shown) -> Iterator[str]:
 
 
 def _repeated(shown: Shown) -> Iterator[str]:
-    """Describe where the map repeats itself, with two indistinguishable causes."""
     for each in shown.repeated:
         x, y = each.place
         dx, dy, turn = each.displacement
@@ -300,7 +299,6 @@ def gets_landmarks_alone(
 
 
 def _landmarks_alone(fold: Fold, shown: Sequence[int]) -> LandmarkGaussian:
-    """Joint Gaussian of the main island's named landmarks nearest to the origin."""
     chosen = sorted(id_ for id_ in shown if id_ < UNNAMED)
     if len(chosen) > LANDMARKS_ALONE:
         points = landmark_view.points_of(fold.main, chosen)

@@ -121,7 +121,6 @@ class MapPublisher:
     # Version vectors.
 
     def _members(self, until_ns: float) -> Mapping[Stream, int]:
-        """Last submap of each stream up to a time, without the robots left out."""
         left_out = self._left_out
         lasts = (
             (stream, bisect_right(chain, until_ns, key=_end_ns) - 1)

@@ -2,10 +2,9 @@
 
 Two figures are 1 where every covariance is right. The joint cost per degree of freedom is sharp
 (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but bounded by a robust loss.
-The covariance scale, the median of the submaps' unweighted χ² relative to its expectation
-(docs/decisions/22), is unbounded, insensitive to a minority of outliers, and also shows too large
-covariances. A scale out of bounds is one that chance alone reaches less than once in a thousand.
-`teamslam.central.diagnosis` reports it.
+The covariance scale (docs/decisions/22) is unbounded, insensitive to a minority of outliers, and
+also shows too large covariances; out of bounds is one that chance alone reaches less than once in a
+thousand. `teamslam.central.diagnosis` reports it.
 """
 
 import math
@@ -107,7 +106,6 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
 
 
 def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
-    """Compute the covariance scale of the team (empty name) and each robot."""
     rows = columns_of(submaps)
     places: dict[str, list[int]] = {}
     for place, each in enumerate(submaps):

@@ -200,7 +200,6 @@ class CentralNode:
             self.warnings.append(f"refused: {reason}")
 
     def _credit_of(self, member: m.Submap | m.SightingFactor, count: int) -> list[Outgoing]:
-        """Acknowledge this many submaps of a member's stream."""
         progress = m.Progress(
             stamp_ns=self.attendance.now_ns,
             node="central",

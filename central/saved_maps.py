@@ -125,7 +125,6 @@ def save_map(
 
 
 def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
-    """Encode the class evidence of landmarks without identity, if any."""
     if not any(each.observation.unnamed.classes.size for each in fold.main.graph.observed):
         return b""
     view = view_island(fold.main, fold.landmarks)
@@ -180,7 +179,6 @@ def _evidence(
 def _counts(
     island: Island, chosen: Sequence[int], before: Mapping[str, m.SavedMap]
 ) -> Sequence[int]:
-    """Count the submaps of each landmark, those of earlier days included."""
     count = np.zeros(len(island.graph.fixed), np.int64)
     for submap in island.graph.submaps:
         saved = before.get(submap.contribution.robot)

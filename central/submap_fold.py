@@ -298,8 +298,8 @@ class SubmapFold:
         shown: Sequence[int],
         recorded: RecordedFields | None,
     ) -> list[Outgoing]:
-        """Make the priors that have news, or the recorded ones, of each robot's latest stream: from
-        the team's fold, or the robot's own while robots contradict each other.
+        """Make the priors that have news, or the recorded ones: from the team's fold, or the
+        robot's own while robots contradict each other.
         """
         out = []
         streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)
@@ -326,7 +326,6 @@ class SubmapFold:
         return out
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
-        """List the latest stream of each robot in the map, withdrawn or a newcomer."""
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}
         latest: dict[str, int] = {}
         joined = {(x.robot, x.incarnation) for x in fused.members}

@@ -8,15 +8,14 @@ tick has arrived, so the fold is final.
                                    │ without the robot    └────fold─────┤
                                    └── Conviction <── agreement(fold) <─┘
 
-The inputs depend on no fold. A tick pushes a checkpoint; a late submap, a verdict or a withdrawal
-rolls back, and the ticks are folded again. A change of the conviction, the robots that contradict
-the rest beyond chance (`teamslam.central.withdrawal`), folds all ticks again without these.
-Agreement is tested after the first tick of each broadcast's time and after the full solution, so a
-withdrawal depends on the set alone.
+A tick pushes a checkpoint; a late submap, a verdict or a withdrawal rolls back, and the ticks are
+folded again. A change of the conviction, the robots that contradict the rest beyond chance
+(`teamslam.central.withdrawal`), folds all ticks again without these. Agreement is tested after the
+first tick of each broadcast's time and after the full solution, so a withdrawal depends on the set
+alone.
 
-Running maps leave out (suspend) a robot with few submaps; it is withdrawn once it has enough, or by
-the full solution. Until then all its submaps are tested whenever the set has grown by GROWTH. A
-provisional map is tested by itself.
+Running maps leave out (suspend) a robot with few submaps, until it has enough to be withdrawn; all
+its submaps are tested whenever the set has grown by GROWTH. A provisional map is tested by itself.
 
 Old submaps are condensed before each tick (`condensing`), and restored by a tick that contradicts
 them (`relinearising`) and by the full solution. Without landmark names the full solution folds the
@@ -234,7 +233,6 @@ class TickFold:
         return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
-        """Fold a tick and test it; return whether the conviction changed."""
         before = self.checkpoints.tick
         fold = self._fold_tick(self.fold, tick)
         self.checkpoints.push(tick, fold)

@@ -1,16 +1,15 @@
 """Find the robot that contradicts the rest beyond chance, so that the team goes on without it.
 
 A robot's disagreement is the largest of three figures, near or below 1 where its covariances are
-right, each counted beyond chance: its share of the joint cost per degree of freedom; the unweighted
-χ²/dof that most of its submaps exceed, the newest if it has few; and that which most of the newest
-inter-robot measurements by or of it exceed. The robust loss discounts a minority, which is no
-reason to lose the robot. The last figure finds a robot whose odometry reports no motion: its
-submaps fit the map, but the others measure it elsewhere.
+right: its share of the joint cost per degree of freedom; the unweighted χ²/dof that most of its
+submaps exceed, the newest if it has few; and that which most of the newest inter-robot measurements
+by or of it exceed. A minority, which the robust loss discounts, is no reason to lose the robot. The
+last figure finds a robot whose odometry reports no motion: its submaps fit the map.
 
 One wrong robot makes others disagree; one with overconfident covariances, or that fixes the frame,
 others only. So each is left out in turn, and withdrawn only if the rest agree without it, and
 without no other. Two robots that contradict each other, and no third, are reported and both stay,
-unless one of them contradicts itself when alone.
+unless one contradicts itself when alone.
 """
 
 import math

@@ -57,7 +57,6 @@ class Ledger:
             self._on_disposition(number, disposition)
 
     def _reject(self, numbers: Iterable[int], reason: Rejection, used: str) -> None:
-        """Recount measurements that were not used after all."""
         for number in numbers:
             self.counts[used] -= 1
             self.counts[reason.disposition] += 1

@@ -136,7 +136,6 @@ class RobotShell:
         return lost
 
     def _look_for_driver(self) -> None:
-        """Find out whether the driver is present, before other messages."""
         driver = ch.source_node(self.node.robot)
         there = m.Liveliness(stamp_ns=0, node=driver, alive=self.bus.is_alive(driver))
         self.node.handle(there, 0)
@@ -160,7 +159,6 @@ class RobotShell:
         self.shell.wait_for_recorder(lambda: recorded.get(own[0], 0) < own[1], take)
 
     def _be_the_only_one(self) -> None:
-        """Wait until no other process runs this robot."""
         node = ch.robot_node(self.node.robot)
         deadline = time.monotonic() + self._patience_s
         while self.bus.is_alive(node):
@@ -204,7 +202,6 @@ class RobotShell:
         return True
 
     def _catch_up(self) -> None:
-        """Request everything that the source published since the last submap."""
         while True:
             first = self.node.next_measurement
             replies = self._missing.ask(
@@ -320,7 +317,6 @@ class RobotShell:
 
 
 def _beginning(sample: Sample, robot: str) -> int | None:
-    """The incarnation of the robot's stream that a sample begins."""
     if sample.key != ch.START.key(robot):
         return None
     try:

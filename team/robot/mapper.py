@@ -339,7 +339,6 @@ class Mapper:
                 self._observe(measurement)
 
     def _reopen_window(self) -> None:
-        """Open the window behind the last submap anew, without measurements."""
         last = self.submaps.last
         self._slam = HybridSlam(self.config, self.writer.incarnation)
         if last is None:

@@ -365,7 +365,6 @@ class RobotNode:
         return sound
 
     def _release(self, seen: tuple[str, ...]) -> None:
-        """Release the submaps buffered for an encounter with the teammates `seen`."""
         released = self.mapper.submaps.release(seen, self.mapper.now_ns)
         if released:
             self.out += released
@@ -383,7 +382,6 @@ class RobotNode:
     # An incarnation begins and ends.
 
     def _leave_incarnation(self) -> None:
-        """Close the current incarnation: a later one begins."""
         if not self.account.consumed:
             return
         if self.done:  # the driver had ended, and has come back: its last word is not the last

@@ -220,7 +220,6 @@ class EndOfStream:
         return None if self.waits_for_driver else self._inbox.missing(self._known())
 
     def _known(self) -> m.StreamEnd | None:
-        """The stream's last announced counter, whether it has ended or not."""
         head = self._head
         if self._last is not None or head is None:
             return self._last
@@ -291,7 +290,6 @@ def _ends_of(end: m.End, robot: str) -> set[tuple[int, int]]:
 
 
 def _end_at(head: m.StreamHead) -> m.End:
-    """The end of one robot's stream as a world would announce it."""
     last = m.StreamEnd(
         robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
     )

@@ -170,7 +170,7 @@ class Segmenter:
         return keyframes
 
     def _look(self, scan: KeyframeScan, at_ns: int) -> list[Keyframe]:
-        """Keep a scan without identities; return its keyframe, if it is one."""
+        """Keep a scan without identities; return its keyframe, if any."""
         motion = Increment(*self._odometry.pass_unnamed_scan())
         scan = replace(scan, at_ns=at_ns, motion=motion)
         if self._keyframe_ns:
@@ -208,7 +208,7 @@ class Segmenter:
         return len(self._waiting)
 
     def _nodes(self, until_ns: int, over: OdometryInterval, grid: PoseGrid) -> list[Keyframe]:
-        """The grid times up to until_ns as keyframes; inter-robot measurements reach their node."""
+        """The grid times up to until_ns as keyframes."""
         keyframes = []
         while (next_ns := grid.next_ns) <= until_ns:
             self._go_on_to(next_ns, over)
@@ -217,7 +217,6 @@ class Segmenter:
         return keyframes
 
     def _go_on_to(self, stamp_ns: int, over: OdometryInterval) -> int:
-        """Integrate up to a stamp, at least the interval's start."""
         duration_ns = stamp_ns - self._here_ns
         if duration_ns <= 0:
             return self._here_ns

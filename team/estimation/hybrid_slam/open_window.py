@@ -131,7 +131,6 @@ class OpenWindow:
             self._take_all(self._accepted())
 
     def _accepted(self) -> list[Keyframe]:
-        """The keyframes, reduced to their accepted measurements."""
         accepted = [self._core.accepted(k) for k in range(len(self._keyframes))]
         pairs = zip(self._keyframes, accepted, strict=True)
         return [each if taken is None else each.only(taken) for each, taken in pairs]
@@ -169,7 +168,6 @@ class OpenWindow:
             self._core.take(*keyframe.arguments)
 
     def _try(self, step: Callable[..., None], *arguments: object) -> None:
-        """Apply a step, unless one has failed before."""
         if self._solvable:
             try:
                 with CoreErrors():

@@ -138,7 +138,6 @@ class PoseGrid:
         return None
 
     def _node_near(self, stamp_ns: int) -> int | None:
-        """Return the window's grid time within sighting_s, if there is one."""
         node_ns = (2 * stamp_ns + self._grid_ns) // (2 * self._grid_ns) * self._grid_ns
         is_near = abs(stamp_ns - node_ns) <= self._near_ns
         return node_ns if is_near and self._begin_ns < node_ns <= self._last_ns else None

@@ -38,8 +38,8 @@ def redraw_paths(window: Window, keyframes: Sequence[Keyframe], random: core.Ran
     """Draw the window's paths anew, if few lines of descent are left and the new ones are more.
 
     A sample counts by its effective size 1/Σ w², the particles by w summed over those of one pose
-    at the first keyframe. Draws 3 K M normal numbers, where it draws. keyframes: all measurements
-    of which the window has taken.
+    at the first keyframe. Draws 3 K M normal numbers, if any. keyframes: whose measurements the
+    window has used.
     """
     weights = core.exp(window.particles.log_weights)
     if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
@@ -83,7 +83,6 @@ def _rows(values: Float[np.ndarray, "M L k"]) -> Float[np.ndarray, "M _"]:
 
 
 def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
-    """The window's motions, and its measurements as points."""
     ranges, bearings = window.measurements.T
     points, covariances = points_of(ranges, bearings, variances(ranges, window.own, window.sensor))
     return Scans(
@@ -143,7 +142,6 @@ def _moved(
 def _placed(
     poses: Float[np.ndarray, "*n 3"], points: Float[np.ndarray, "*n 2"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Each point of a pose's frame."""
     s, c = core.sin_and_cos(poses[..., 2])
     x, y = points[..., 0], points[..., 1]
     return np.stack((poses[..., 0] + c * x - s * y, poses[..., 1] + s * x + c * y), axis=-1)
@@ -222,7 +220,6 @@ def _wrapped(angles: Float[np.ndarray, "K M"]) -> Float[np.ndarray, "K M"]:
 def _squared(
     error: Float[np.ndarray, "n M k"], covariances: Float[np.ndarray, "n k k"]
 ) -> Float[np.ndarray, " M"]:
-    """Σ eᵀ C⁻¹ e over the n errors of each of M."""
     weighted = dense.product(error, dense.inverse(covariances)) * error
     n, count, k = error.shape
     total = dense.product(np.ones(n), weighted.reshape(n, -1))

@@ -132,7 +132,6 @@ def _measurements_of(event: Event) -> Measured:
 def _list_outcomes(
     events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
 ) -> Became:
-    """List the outcomes by scan stamp and place in the scan."""
     looks = [event.look for event in events if event.look is not None]
     return Became(
         stamps=np.array([each.stamp_ns for each in looks], np.int64),
@@ -173,7 +172,6 @@ def _number_keyframes(
 
 
 def _select_numbered(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
-    """Select and number the detections of a scan that have a number."""
     has_number = numbers > 0
     return replace(
         look,

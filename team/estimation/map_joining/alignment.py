@@ -43,7 +43,7 @@ def procrustes(
 ) -> Float[np.ndarray, "3"]:
     """a_from_b = argmin Σ wᵢ ‖aᵢ − (R bᵢ + t)‖² over rotations R and translations t.
 
-    R turns by the direction of (Σ wᵢ (bᵢ − b̄)·(aᵢ − ā), Σ wᵢ (bᵢ − b̄) × (aᵢ − ā)); t = ā − R b̄.
+    R turns by the direction of (Σ wᵢ (bᵢ − b̄)·(aᵢ − ā), Σ wᵢ (bᵢ − b̄) × (aᵢ − ā)).
     """
     share = weights / weights.sum()
     mean_a, mean_b = dense.product(share, in_a), dense.product(share, in_b)
@@ -63,10 +63,9 @@ def align(
     """Estimate the most likely a_from_b of two independent Gaussian maps of the same n ≥ 2
     landmarks.
 
-    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate. The
-    motion is solved about the centroids, so that conditioning does not depend on the distance to
-    either origin. Points at one place leave the heading at 0 and `heading_sigma` infinite. Raises
-    NotACovarianceError.
+    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate, about
+    the centroids: conditioning does not depend on the origins. Points at one place leave the
+    heading at 0 and `heading_sigma` infinite. Raises NotACovarianceError.
     """
     n = len(in_a)
     variances = np.diag(covariance_a) + np.diag(covariance_b)

@@ -1,11 +1,11 @@
 """Fold a tick, cut streams at its seams, and undo a closure that later submaps contradict.
 
-After a cut (`continuity`) the tick is folded again with the later part as an island of its own.
+After a cut (`continuity`) the tick is folded again with the later part as an island.
 
-For some ticks after a closure or a merge, the matched share of the landmarks near its places that
-both sides observed is computed again. Below the bound of the settings, these ticks are folded again
-without the closure. The fold before a closure is part of the fold, so the outcome depends on the
-set of submaps alone.
+For some ticks after a closure or a merge, the matched share of the landmarks that both sides
+observed near it is computed again. Below the bound of the settings, these ticks are folded again
+without the closure. The fold has the one before each closure, so the outcome depends on the set of
+submaps alone.
 """
 
 from dataclasses import replace

@@ -1,12 +1,11 @@
 """The bounded fold: old submaps become one quadratic, selected by sequence number only.
 
 The last `lag` submaps of each stream of the main island stay factors. Older ones become one
-quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`), at the
-current state and robust weights. The cost of a tick depends on the number of landmarks and robots,
-not on the duration of the run.
+quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). The
+cost of a tick depends on the number of landmarks and robots, not on the duration of the run.
 
-No submap is condensed before the fold has `begin` submaps, before its own robust scale is final, or
-in an unmerged island, whose frame will still be transformed.
+No submap is condensed before the fold has `begin` submaps, before its robust scale is final, or in
+an unmerged island, whose frame will still be transformed.
 """
 
 from collections import defaultdict
@@ -63,9 +62,8 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island.
 
     Submaps whose poses cannot be eliminated stay raw. A team with unnamed landmarks, which stay
-    nodes, condenses only once it has as many submaps as landmarks. Association keeps observations
-    of condensed submaps (`memory`), all of them while a closure can be undone; landmarks that few
-    submaps confirm are dropped.
+    nodes, condenses once it has as many submaps as landmarks. Association keeps observations of
+    condensed submaps (`memory`); landmarks that few submaps confirm are dropped.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:

@@ -1,17 +1,16 @@
 """The Gaussian back end of one robot: its own map, and its pose in the team's map.
 
 The own map joins the submaps one by one into one Gaussian (Brooks & Bailey 2008, "HybridSLAM";
-Williams 2001): map and submap are independent, and the identity of two landmarks is an observation
-without noise. Earlier submaps are not linearised again, so the map is overconfident after many
-joins.
+Williams 2001): the identity of two landmarks is an observation without noise. Earlier submaps are
+not linearised again, so the map is overconfident after many joins.
 
 The pose in the team's map is the broadcast prior (joint marginal of the robot's last joined end
-pose and landmarks) times the robot's later submaps, solved at once as the centre does (decision
-21). The product is exact once the centre's estimates have corrected the errors that all submaps of
-a robot share.
+pose and landmarks) times the later submaps, solved at once as the centre does (decision 21). The
+product is exact once the centre's estimates have corrected the shared errors of the robot's
+submaps.
 
 A landmark observation that everything else contradicts (a misread barcode) is left out of this
-solution only. The result is for display and control; no message that is fused contains it.
+solution, which no fused message contains.
 """
 
 import math
@@ -186,9 +185,9 @@ class Posed(NamedTuple):
 def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     """Join the submaps that follow the map's pose, in order, by least squares.
 
-    If a landmark lies beyond the gate, the landmarks are discounted as the gate narrows and those
-    beyond it left out. Where that is most of a submap, or the rest is still contradictory, the
-    fault is in a whole factor: Cauchy's loss on whole submaps and on the map finds it. Raises
+    With a landmark beyond the gate, the landmarks are discounted as the gate narrows and those
+    beyond it left out. Where that is most of a submap, or the rest is still contradictory, a whole
+    factor is at fault: Cauchy's loss on whole submaps and on the map finds it. Raises
     NotACovarianceError, NotDeterminedError.
     """
     submaps = [each.without_nodes for each in pending]

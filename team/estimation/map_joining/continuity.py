@@ -152,7 +152,6 @@ def _compare_sides(
 def _mark_possible(
     island: Island, nodes: Indices, one: Indices, two: Indices
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "a b"]]:
-    """Return the nodes' positions, and which may be one landmark."""
     mean, covariance = joint_marginal(island, nodes.tolist())
     points = mean.reshape(-1, 2)
     joint = Joint(points, covariance, np.zeros((len(nodes), len(nodes)), np.bool_))

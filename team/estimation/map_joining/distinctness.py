@@ -2,16 +2,16 @@
 that look there, or in a repeated part of the map; and lost streams.
 
 A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time without
-a contradiction: from there on only odometry connects its submaps with the rest. The shape of the
-copy remains. For each boundary between submaps beyond which a stream observes hardly any landmark
-of the rest, the landmarks first observed beyond it are aligned with all others by a rigid motion
-(`voting`). With n of them, N others in an area A, and points that match within r, the expected
-number of motions that match m or more by chance is
+a contradiction: only odometry connects its later submaps with the rest. For each boundary between
+submaps beyond which a stream observes hardly any landmark of the rest, the landmarks first observed
+beyond it are aligned with all others by a rigid motion (`voting`). With n of them, N others in an
+area A, and points that match within r, the expected number of motions that match m or more by
+chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
-since each pair on a pair defines one motion. Whether the building repeats itself the set does not
-determine.
+since each pair on a pair defines one motion. The building may also repeat itself: the set does not
+tell.
 """
 
 import math
@@ -56,9 +56,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
     ascending; none that an operator has judged.
 
     A landmark of n < MOST submaps is missed where each landmark of MOST or more beside it has been
-    observed by MOST n, and at least half of its submaps have one beside it. The number of false
-    landmarks that two submaps agree on grows with the number of submaps; the share of submaps that
-    find them does not.
+    observed by MOST n, and at least half of its submaps have one beside it. The share of submaps
+    that find a false landmark does not grow with their number.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)

@@ -117,7 +117,6 @@ def _track_island(fold: Fold, key: Stream, arrived: Sequence[Contribution]) -> F
 
 
 def _apply_merges(fold: Fold, key: Stream, view: IslandView) -> Fold:
-    """Merge the nodes of merged landmarks, and iterate once."""
     if not view.ties:
         return fold
     landmarks, becomes = merge_sets(fold.landmarks, view.ties)

@@ -2,13 +2,13 @@
 rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
-prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g, and g (2 − g/χ²) beyond, whose slope,
-the weight, is (g/χ²)². The gate of a new factor is wide and narrows with each iteration, so that a
-true loop closure is not taken for an outlier before the chain has adapted to it. The prior of a
-robot's own bias is Student's t of one degree of freedom, with loss 2 log(1 + χ²).
+prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g, and g (2 − g/χ²) beyond, with weight
+(g/χ²)². A new factor's gate is wide and narrows with each iteration: the chain must adapt to a true
+loop closure. The prior of a robot's own bias is Student's t of one degree of freedom, with loss 2
+log(1 + χ²).
 
-Each landmark of a submap also has a gate and a weight, which enters as additional variance of that
-landmark alone. `core.Estimate` computes all of these.
+Each landmark of a submap also has a gate and a weight, as additional variance of that landmark
+(`core.Estimate`).
 """
 
 import math
@@ -348,8 +348,8 @@ def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
     """Take one step: return the island, the next damping, and the full step's largest change.
 
     The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
-    of it; else a more damped one. Where no damping helps the state stays and the next damping is
-    STUCK, from which the next step begins undamped.
+    of it; else a more damped one. Where none helps the state stays and the next damping is STUCK,
+    from which a step begins undamped.
     """
     with island.determined():
         state, damping, change = island.estimate.take_step(
@@ -381,7 +381,6 @@ def solve_island(island: Island) -> tuple[Island, int, float]:
 
 
 def _has_outliers(island: Island) -> bool:
-    """Whether a factor or landmark is beyond its gate; priors have none."""
     at = island.estimate
     weights = at.weights, at.landmark_weights, at.sighting_weights
     return any((each < 1.0).any() for each in weights)

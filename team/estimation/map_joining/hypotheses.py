@@ -1,16 +1,15 @@
 """Diagnosis: the causes of a misfit, each with its evidence, the best one first.
 
-A hypothesis adds unknowns θ to the graph of the team's map: a landmark has a second place, a robot
-jumps between two submaps. Its evidence is the cost that they remove,
+A hypothesis adds unknowns θ to the graph: a landmark has a second place, a robot jumps between two
+submaps. Its evidence is the cost that they remove,
 
     e = min_x cost(x) − min_{x, θ} cost(x, θ),
 
-χ² with dim θ degrees of freedom where nothing is wrong; both minima have the robust loss.
-Hypotheses are proposed by a scan of single submaps, then solved at the final robust scales. The
-best one by evidence per degree of freedom stays in the graph while the others are tested again: its
-effects are not reported twice.
+χ² with dim θ degrees of freedom where nothing is wrong; both minima have the robust loss. A scan of
+single submaps proposes hypotheses, which are solved at the final robust scales. The best one by
+evidence per degree of freedom stays in the graph while the others are tested again.
 
-Real data have errors beyond the model, so the evidence is divided by the covariance scale of the
+Since real data have errors beyond the model, the evidence is divided by the covariance scale of the
 other submaps (an F test but for the scatter of the scale), and an effect must be larger than a
 single submap resolves.
 """
@@ -171,7 +170,6 @@ def _chi2_about(
 
 
 def _chi2_of(away: Float[np.ndarray, "*k n 2"], spread: Float[np.ndarray, "n 3"]) -> Costs:
-    """χ² of differences, at most FAR."""
     x, y = away[..., 0], away[..., 1]
     xx, xy, yy = spread.T
     chi2: Costs = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
@@ -191,7 +189,6 @@ def median(values: Float[np.ndarray, "..."]) -> Values:
 
 
 def _running_medians(values: Values) -> Values:
-    """Medians of the first 1, 2, … n values."""
     ordered: list[float] = []
     medians = []
     for k, value in enumerate(values.tolist()):
@@ -327,7 +324,6 @@ def _begin_ns(island: Island, place: int) -> int:
 
 
 def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    """Whether another named landmark is at the second place."""
     graph, state = base.island.graph, base.island.state
     gate = base.scale * LANDMARK_GATE
     return any(
@@ -388,9 +384,9 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
-    """Solve the hypotheses of a jump before or after a submap that disagrees with the rest.
+    """Solve the hypotheses of a jump beside a submap that disagrees with the rest.
 
-    A jump removes no more cost than the graph without the submap, which is solved first.
+    A jump removes no more cost than leaving out the submap, which is solved first.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -460,8 +456,8 @@ def _motion_beyond(
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     """Propose that one number of two landmarks spoils submaps that observed both.
 
-    Their path is bent and the landmark lies between the two: most of them have the same landmark
-    worst. The second place has two numbers in each.
+    Most of them have the same landmark worst, between the two, and a bent path. The second place
+    has two numbers in each.
     """
     island, graph = base.island, base.island.graph
     chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
@@ -541,9 +537,9 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
 def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
     """Drop repetitions, and the apparent effects of another fault.
 
-    A jump beside one number of two landmarks is the bent path. A robot at several places was not
-    carried off unless a submap before or after each agrees with the map: its measurements were wild
-    for a while, as is a second place that it alone observes.
+    One number of two landmarks bends paths, which is no jump. A robot at several places was not
+    carried off unless a submap before or after each agrees with the map: its measurements were
+    wild, as is a second place that it alone observes.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
     wild = {

@@ -5,10 +5,9 @@ all robots, and over the inter-robot measurements between their pose nodes. The 
 function of the order and the ticks' boundaries. A stream with an unknown initial pose is an island
 until shared landmarks and inter-robot measurements tie it to the main island.
 
-A tick of a fold with one island and named landmarks adds nodes and factors and iterates. Other
-steps have a condition: tests of saved maps (`Fold.has_maps`), association, cuts and audits
-(`Fold.has_unnamed`), condensed submaps (`Fold.condensed_count`), merging (several islands), and the
-search for another minimum (a suspicious cost).
+Beyond adding nodes and factors and iterating, a tick may test saved maps (`Fold.has_maps`),
+associate, cut and audit (`Fold.has_unnamed`), treat condensed submaps (`Fold.condensed_count`),
+merge islands, and search for another minimum (a suspicious cost).
 """
 
 import math
@@ -418,7 +417,6 @@ def _separate_moved(
 
 
 def _test_saved_places(fold: Fold) -> Fold:
-    """Test the landmarks of saved maps anew, in a full solution, those apart first."""
     islands = dict(fold.islands)
     for key, island in fold.islands.items():
         with suppress(*UNSOLVABLE):

@@ -2,8 +2,7 @@
 
 A sensor that derives distance from an object's size measures each landmark too far by a constant
 share of the range, the same for all robots (`CommonBiasSigmas.marker`). The states are added after
-association: before, the parts of one landmark would have separate errors, which weaken the evidence
-that they are one or two.
+association, whose evidence separate errors of a landmark's parts would weaken.
 """
 
 from collections.abc import Mapping

@@ -111,7 +111,6 @@ NOTHING = Memory()
 
 
 def _unique(pairs: Int64[np.ndarray, "P 2"], distinct: Bool[np.ndarray, " P"]) -> Memory:
-    """Keep each pair once, distinct if any copy is."""
     if not len(pairs):
         return NOTHING
     pairs = np.sort(pairs, axis=1)

@@ -167,7 +167,6 @@ def _list_passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
 
 
 def _select_lowest(found: Sequence[Minimum]) -> Search:
-    """Select the lowest minimum; the first is from the start used without a search."""
     best = _settle_minimum(min(found, key=lambda each: each.cost))
     others = [each for each in found if each.change < SETTLED_M and is_another_minimum(each, best)]
     second = min(others, key=lambda each: each.cost, default=None)
@@ -224,7 +223,6 @@ def _difference(one: Island, other: Island) -> Values:
 
 
 def _quadratic(island: Island, x: Values) -> float:
-    """xᵀAx with the information A of the island at its state."""
     values, _ = island.estimate.normal_equations
     return island.graph.pattern.quadratic(values, x)
 

@@ -1,11 +1,11 @@
 """Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
 A tick without a solution as a whole is added one by one in canonical order, without the members
-that make the normal equations unsolvable. The outcome depends on the set alone (law 2).
+that make the normal equations unsolvable (law 2).
 
-Of a refused submap the motion alone is tried, the marginal of its end pose, which keeps the place
-of the robot's later submaps. Where that fails too, the robot's chain ends. An unsolvable initial
-pose becomes unknown; an inter-robot measurement is left out.
+Of a refused submap the motion alone is tried, the marginal of its end pose. Where that fails too,
+the robot's chain ends. An unsolvable initial pose becomes unknown; an inter-robot measurement is
+left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -200,7 +200,6 @@ class _Selection:
 def _select_greatest(
     items: Sequence[T], works: Callable[[Sequence[T]], bool]
 ) -> tuple[list[T], list[T]]:
-    """Add items while `works`, by halves; return the accepted and the rejected."""
     accepted: list[T] = []
     bad: list[T] = []
 

@@ -1,10 +1,9 @@
 """Landmarks come to rest, and become nodes again where a submap observes them.
 
-A landmark that no raw submap contains is, given the condensed factor's other nodes, a Gaussian that
-submaps of other places cannot change (`Resting`). It is eliminated like an old pose, so the cost of
-a tick depends on the landmarks near the robots only. The inverse is exact: with e = x − means −
-gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹ e, and the other resting landmarks are conditioned on
-it.
+A landmark that no raw submap contains is, given the condensed factor's other nodes, a Gaussian
+(`Resting`), eliminated like an old pose: the cost of a tick depends on the landmarks near the
+robots only. The inverse is exact: with e = x − means − gain d ~ N(0, C), the quadratic gains eᵀ C⁻¹
+e, and the other resting landmarks are conditioned on it.
 """
 
 from collections.abc import Collection
@@ -67,7 +66,7 @@ def find_idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) ->
     """List the nodes of landmarks that come to rest, ascending: in no submap that stays nor in
     another island (`apart`).
 
-    The first ones come to rest only `first` at once.
+    None while no landmark rests yet and fewer than `first` could.
     """
     seen = np.zeros(len(graph.fixed), np.bool_)
     for f in np.flatnonzero(stays):

@@ -372,7 +372,6 @@ def _largest_agreement(
 
 
 def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, "n 2 2"]:
-    """Covariance of each landmark relative to the middle of i and j."""
     n = len(P) // 2
     grid = P.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
     own = grid[np.arange(n), np.arange(n)]
@@ -383,7 +382,6 @@ def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, 
 
 
 def _turned(P: Float[np.ndarray, "n 2 2"], s: float, c: float) -> Float[np.ndarray, "n 2 2"]:
-    """R P Rᵀ with the rotation of sine s and cosine c."""
     xx, xy, yy = P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]
     across = 2.0 * c * s * xy
     x, y = c * c * xx - across + s * s * yy, s * s * xx + across + c * c * yy

@@ -330,7 +330,6 @@ EMPTY_GRAPH = Graph(
 
 
 def _starts(lengths: Sequence[int]) -> Indices:
-    """Offsets of consecutive pieces, and the end."""
     return np.cumsum(np.array([0, *lengths], dtype=np.int64))
 
 
@@ -438,7 +437,6 @@ def _add_errors(
     bias_sigma: Mapping[Bias, float],
     common: Mapping[CommonError, float],
 ) -> list[Prior]:
-    """Add the nodes of errors that a submap lacks; return their priors."""
     priors = []
     for bias in own:
         if (stream, bias) not in growth.biases:
