@@ -45,13 +45,11 @@ CASES = {
 
 
 def begun(scenario: Scenario, seconds: float) -> Scenario:
-    """The first seconds of a data set."""
     world = msgspec.structs.replace(scenario.world, duration_s=seconds)
     return msgspec.structs.replace(scenario, world=world)
 
 
 def measured(name: str, path: Path) -> None:
-    """Write a case's scenario and measurements."""
     scenario = CASES[name]()
     path.write_bytes(pickle.dumps((scenario, bits.streams_of(scenario))))
 
@@ -67,7 +65,6 @@ def digests(path: Path) -> dict[str, str]:
 
 
 def compared(name: str, classes: int) -> list[str]:
-    """List the channels that differ between the classes, one a line."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "case"
         measured(name, path)

@@ -26,7 +26,6 @@ class Meeting:
 
 
 def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
-    """The radio of a scenario, in memory."""
     radio = scenario.radio
     delay_ns = round(radio.delay_s * 1e9)
     return Air(
@@ -39,8 +38,6 @@ def air_of(scenario: Scenario, streams: WorldStreams, seed: int = 0) -> "Air":
 
 
 def meetings(windows: Sequence[Meeting]) -> Reach:
-    """Reach within these meetings only."""
-
     def reach(one: str, other: str, now_ns: int) -> bool:
         return any(
             {one, other} <= each.nodes and each.begin_ns <= now_ns < each.end_ns for each in windows

@@ -39,7 +39,6 @@ Row = Mapping[str, str]
 
 
 def world(name: str, seed: int = 1, **changes: object) -> Scenario:
-    """A built-in scenario with this seed and these fields of its world."""
     scenario = with_options(load(name), seed=seed)
     return msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, **changes)
@@ -85,7 +84,6 @@ def is_here(name: str) -> bool:
 
 
 def computed(name: str) -> Row:
-    """Compute a case's hashes in memory."""
     scenario = CASES[name]()
     samples = list(run_team(scenario, streams_of(scenario)))
     fused = final_map(samples)
@@ -97,7 +95,6 @@ def computed(name: str) -> Row:
 
 
 def _own_estimates(samples: list[Sample]) -> Iterator[bytes]:
-    """Numbers of each robot's last own pose and own map."""
     last = {s.key: s for s in samples if s.key.endswith(("/own/pose", "/own/map"))}
     for key in sorted(last):
         _, _, message = opened(last[key])
@@ -123,7 +120,6 @@ def table() -> dict[str, dict[str, str]]:
 
 
 def differences(names: list[str]) -> Iterator[tuple[str, Row, str]]:
-    """Cases that differ from the table, with the differences."""
     committed = table()
     for name in names:
         now = computed(name)

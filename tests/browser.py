@@ -68,7 +68,7 @@ class Page:
         there = f"location.href === {json.dumps(url)} && document.readyState === 'complete'"
         end = time.monotonic() + START_S
         while time.monotonic() < end:
-            with suppress(RuntimeError):  # asked while one page goes and the next comes
+            with suppress(RuntimeError):  # evaluated between two pages
                 if self.ask(there):
                     return
             time.sleep(0.02)
@@ -139,7 +139,6 @@ def browsing(program: str) -> Iterator[Page]:
 
 
 def _port(profile: Path, process: subprocess.Popen[bytes]) -> int:
-    """Port of the browser, from the file that it writes."""
     file = profile / "DevToolsActivePort"
     end = time.monotonic() + START_S
     while not (file.exists() and file.read_text().strip()):

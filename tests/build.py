@@ -25,7 +25,6 @@ ORDINARY: dict[str, Any] = {
 
 
 def _built(kind: Callable[..., M], **fields: object) -> M:
-    """Build a message; its node is the robot's unless given."""
     names: tuple[str, ...] = getattr(kind, "__struct_fields__")  # noqa: B009 - msgspec's
     required = names[: len(names) - len(getattr(kind, "__struct_defaults__"))]  # noqa: B009
     values = {name: ORDINARY[name] for name in required if name in ORDINARY} | fields

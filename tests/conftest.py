@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"  # before NumPy is imported, here and in every child process
+    os.environ[variable] = "1"  # before NumPy is imported, in child processes too
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -15,11 +15,11 @@ from xdist.workermanage import WorkerController
 
 import tests.shapes
 
-# The same examples in every run: what fails once fails again. HYPOTHESIS_SEARCH=1 finds new ones.
+# The same examples in every run; HYPOTHESIS_SEARCH=1 draws new ones.
 settings.register_profile(
     "repeatable",
     derandomize="HYPOTHESIS_SEARCH" not in os.environ,
-    deadline=None,  # a test is right or wrong, however loaded the machine is
+    deadline=None,  # no deadline on a loaded machine
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("repeatable")
@@ -33,7 +33,7 @@ install_import_hook(tests.shapes.modules_with_shapes(), f"{tests.shapes.__name__
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     tests.shapes.begin_test()
-    from teamslam.team.wire.logs import LIMITS  # behind the import hook
+    from teamslam.team.wire.logs import LIMITS  # after the import hook
 
     LIMITS.forget()
     if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(SYSTEM):

@@ -72,12 +72,10 @@ class PeerTeam:
         self._latest: dict[str, tuple[ch.Channel, Sample]] = {}
 
     def seat(self, config: RobotConfig) -> None:
-        """Add a robot with an empty set."""
         node = self._make(self.scenario, config)
         self.seats[config.id] = _Seat(node, Boundary(node.name))
 
     def seat_centre(self, restored: Iterable[Member] = ()) -> None:
-        """Add a centre, as a peer with its set from disk."""
         names = [each.id for each in self.scenario.robots]
         seat = _Seat(PeerCentre(self.scenario.central, names), Boundary(CENTRE))
         seat.node.keep(restored)
@@ -86,7 +84,6 @@ class PeerTeam:
         self._catch_up(CENTRE, seat)
 
     def leave(self, name: str) -> list[Member]:
-        """Remove a robot or the centre; return its stored set."""
         seat = self.seats.pop(name)
         for other in self.seats.values():
             other.reached.discard(name)
@@ -154,7 +151,6 @@ class PeerTeam:
         self._catch_up(config.id, seat)
 
     def hear(self, name: str, sample: Sample) -> None:
-        """Deliver an operator's message to one robot alone."""
         seat = self.seats[name]
         self._say(name, seat.boundary.take(seat.node, sample))
 

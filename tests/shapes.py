@@ -60,7 +60,7 @@ def checked(function: F) -> Callable[..., object]:
     def counted(*args: object, **kwargs: object) -> object:
         nonlocal check
         _calls[name] += 1
-        if _calls[name] > 2 * CALLS:  # one within a function, which is not let through
+        if _calls[name] > 2 * CALLS:  # a nested function, which is not exempted
             return None
         if _calls[name] == 2 * CALLS:
             _let_through(*name)

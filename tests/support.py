@@ -108,7 +108,7 @@ class Link:
             if not self._whole:
                 raise ConnectionError
             far = socket.create_connection(self._to)
-        except OSError:  # cut, or nobody listens now: the next one may come through
+        except OSError:  # cut or refused; the next one may pass
             near.close()
             return
         self._open += [near, far]
@@ -171,7 +171,6 @@ def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
 
 
 def peers_examples(digest: bytes) -> Iterator[m.Message]:
-    """One of every message between peers."""
     holding = build.holding(robot="alpha", sequences=(0, 4, 6, 6), digest=digest, newest_ns=9)
     statements = m.Statements(robot="alpha", count=2, digest=digest)
     yield build.set_summary(
@@ -202,7 +201,6 @@ def peers_examples(digest: bytes) -> Iterator[m.Message]:
 
 
 def examples() -> Iterator[m.Message]:
-    """One message of every class, every array filled."""
     two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
@@ -561,7 +559,6 @@ K = TypeVar("K", bound=m.Message)
 
 
 def example(kind: type[K], **fields: object) -> K:
-    """Example of a class with these fields replaced."""
     found = next(each for each in examples() if isinstance(each, kind))
     return msgspec.structs.replace(found, **fields)
 

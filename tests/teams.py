@@ -117,7 +117,6 @@ def world_of(*streams: RobotStream) -> WorldStreams:
 
 
 def published(each: RobotStream) -> list[m.Measurement]:
-    """Messages of the world for one stream."""
     world = WorldNode(world_of(each), frozenset(), build.configuration(node="world", incarnation=0))
     out: list[Outgoing] = []
     while not world.ended:
@@ -168,7 +167,6 @@ class Submaps(Mapping[str, list[m.Submap]]):
         return len(self._streams)
 
     def every(self) -> list[m.Submap]:
-        """All submaps, robot by robot."""
         return [submap for submaps in self.values() for submap in submaps]
 
 
@@ -235,7 +233,6 @@ class Team:
             self.queues[("central", ch.ALIVE.key(node))].pop()
 
     def resume(self, robot: RobotConfig) -> None:
-        """Restart the robot, with the submaps of the centre."""
         name, node = ch.robot_node(robot.id), robot_node(robot, self.exchange)
         self.nodes[name] = self.robots[robot.id] = node
         request = encoded(build.submaps_request(robot=robot.id))
@@ -251,7 +248,6 @@ class Team:
         self.send(name, node.begin())
 
     def step(self) -> bool:
-        """Make one delivery or one step of the world; return False at rest."""
         ready = [key for key, queue in self.queues.items() if queue]
         if not ready or self.rng.random() < 0.2:
             out = self.world.publish(0.0)

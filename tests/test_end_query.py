@@ -17,8 +17,6 @@ OF_R1, OF_R2 = (ch.TEAM_FINAL.key(robot) for robot in ("r1", "r2"))
 
 @pytest.fixture
 def bus():
-    """A bus that replies everyone's end and garbage to any request."""
-
     def kept(key: str, payload: bytes) -> bytes:
         return encoded(build.kept(stamp_ns=3, key=key, payload=payload, wall_ns=4, counter=5))
 

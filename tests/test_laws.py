@@ -172,7 +172,6 @@ EXPECTED = {}
 
 
 def expected_final(streams=PAIR):
-    """Final map of an undisturbed team."""
     if not EXPECTED:
         calm = team_of(streams, random.Random(0))
         calm.run()
@@ -362,7 +361,7 @@ def test_a_shell_does_reach_them():
     }
 
 
-# Whoever waits, waits for something that comes.
+# No deadlock.
 
 
 def unequal(rng):

@@ -27,7 +27,6 @@ LANDMARKS = np.array([[2.0, 4.0], [6.0, -3.0], [9.0, 4.0], [13.0, 1.0], [4.0, 1.
 
 
 def driven(start, keyframes, rng):
-    """The true end pose, and the measurements on the way."""
     pose, taken = start, []
     for _ in range(keyframes):
         increment = teamslam.increment_of(MOTION, 1.0, 1.0, 0.05)

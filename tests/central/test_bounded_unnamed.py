@@ -70,14 +70,12 @@ def _small():
 
 @pytest.fixture(scope="module")
 def ticks(world, _small):
-    """The running fold of the whole world, and the full one."""
     messages, _ = world
     return folded(messages), folded(messages, bounded=False)
 
 
 @pytest.fixture(scope="module")
 def all_said(cluttered, _small):
-    """The running fold of the other robot's submaps."""
     messages, _ = cluttered
     return folded(messages)
 

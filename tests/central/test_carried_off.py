@@ -61,7 +61,6 @@ def mirrored() -> list[m.Submap]:
 
 
 def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
-    """The fold of the team's submaps with these in place of r3's."""
     ticks = TickFold(scenario().central)
     for start in messages(team_run(), m.InitialPose):
         ticks.add_start(translate.start_of(start))
@@ -72,7 +71,6 @@ def folded(own: list[m.Submap], backwards: bool = False) -> TickFold:
 
 
 def jumps(ticks: TickFold) -> list[m.Diagnosis]:
-    """Robots that the final map's diagnosis reports as carried off."""
     fold = ticks.solve()
     biases = bias_estimates(fold)
     left_out = ticks.submaps_of_withdrawn()

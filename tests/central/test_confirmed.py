@@ -27,7 +27,6 @@ def misread(submap: m.Submap) -> m.Submap:
 
 
 def rule(spoilt: set[tuple[str, int]], **options: object) -> MapPublisher:
-    """Join the submaps of both robots, some misread."""
     config = CentralConfig(tick_s=3.0, broadcast_s=3.0, **options)
     found = MapPublisher(SubmapFold(config, b"settings"))
     for each in STREAMS.values():

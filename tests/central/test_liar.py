@@ -104,7 +104,6 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
 
 
 def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
-    """Errors [m] of the other robots' poses in the team's frame."""
     true: dict[tuple[str, int], np.ndarray] = {}
     for each in messages(samples, m.Truth):
         poses = floats(each.poses, "poses").reshape(-1, 3)

@@ -38,7 +38,6 @@ class Live:
         return self
 
     def robot(self, name, *, state="ended"):
-        """A robot that has consumed its whole stream."""
         measured = published(STREAMS[name])
         self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
         node = RobotNode(config(name))
@@ -57,7 +56,7 @@ def test_a_driver_that_comes_back_is_waited_for_again():
     team = Live("r1", "r2").robot("r1").tell(begun("r1", 2)).robot("r2")
     assert team.final is None
     team.tell(head("r1", 1, "left", 2), ORDER)
-    assert team.final is None  # its process has not said that it is done with that
+    assert team.final is None  # the process has not confirmed this yet
 
 
 def test_an_operator_ends_a_team_some_of_which_never_came():

@@ -33,7 +33,6 @@ SECOND_NS = 1_000_000_000
 
 @cache
 def short_day(*, localise=False, wrong=False, length_s=60):
-    """First minute of a second day of robots without a start."""
     scenario = with_options(load("thesis-b"), seed=1001, localise=localise)
     whole = streams_of(scenario)
     first_ns = min(first for first, _ in whole.spans_ns.values())

@@ -168,7 +168,6 @@ def test_a_refused_submap_changes_no_bit_and_says_why():
 
 
 def sequences(found, robot):
-    """Submaps kept for a robot that restarts."""
     return [each.sequence for each in found.store.messages_of(robot) if isinstance(each, m.Submap)]
 
 

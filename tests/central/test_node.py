@@ -47,8 +47,6 @@ def done(name, submaps=4, incarnation=1):
 
 
 class Centre:
-    """A centre and its publications."""
-
     def __init__(self, config=CONFIG, robots=("r1", "r2")):
         self.node = make_centre(config, robots)
         self.said = self.node.begin()
@@ -69,7 +67,6 @@ class Centre:
 
 
 def joined(*, robots=("r1", "r2"), config=CONFIG):
-    """A centre with robots alive and started."""
     centre = Centre(config)
     centre.hears(*(STARTS[r] for r in robots), *(alive(r) for r in robots))
     return centre
@@ -286,8 +283,6 @@ def done_attendance(robot: str, submaps: int) -> m.Done:
 
 
 class Looking:
-    """An attendance, and the number of submaps of each robot."""
-
     def __init__(self, robots: list[str]) -> None:
         self.attendance = TeamAttendance.of(robots, self.dealt, self.count)
         self.here = dict.fromkeys(robots, 0)

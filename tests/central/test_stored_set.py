@@ -16,7 +16,6 @@ SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in ran
 
 @contextmanager
 def a_life(path: Path) -> Iterator[StoredSet]:
-    """A centre's set from start to end."""
     kept = StoredSet(path)
     yield kept
     kept.close()
@@ -27,7 +26,6 @@ def heard(found: list[Sample]) -> list[tuple[str, bytes]]:
 
 
 def kept_in(path: Path) -> list[tuple[str, bytes]]:
-    """Members that a restarted process reads."""
     with a_life(path) as kept:
         return heard(kept.samples())
 

@@ -31,7 +31,6 @@ UTM = (399_000.0, 5_756_000.0)
 
 @cache
 def drive(seed, unknown=("*",)):
-    """Scenario, world and samples of a team without a survey."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=200)
     scenario = msgspec.structs.replace(scenario, seed=seed, world=world)
@@ -64,14 +63,12 @@ def fold_drive(seed, surveyed, *, unknown=("*",), maps=()) -> tuple[m.FusedMap, 
 
 
 def day(seed, numbers, *, unknown=("*",), wrong=None, origin=(0.0, 0.0)):
-    """The final map with surveyed landmarks, and the world."""
     surveyed = surveyed_landmarks(seed, numbers, wrong, origin)
     return fold_drive(seed, surveyed, unknown=unknown)[0], drive(seed)[1]
 
 
 @cache
 def live_day():
-    """Samples of a team whose centre has a survey from the beginning."""
     scenario, streams, _ = drive(1)
     central = msgspec.structs.replace(scenario.central, surveyed=surveyed_landmarks(1, (3, 15)))
     return list(run_team(msgspec.structs.replace(scenario, central=central), streams))

@@ -39,7 +39,6 @@ def measured(robot: str, *, started: bool, apart: bool) -> list[m.Measurement]:
 
 
 def renamed(measurement: m.Measurement, offset: int) -> m.Measurement:
-    """Shift the landmark ids."""
     if not isinstance(measurement, m.Observations):
         return measurement
     return msgspec.structs.replace(measurement, ids=from_ids(ids(measurement.ids, "ids") + offset))
@@ -68,7 +67,6 @@ class Team:
             self.to_centre(token)
 
     def measure(self, name: str) -> None:
-        """Give a robot its next measurement."""
         if self.coming[name]:
             measurement = self.coming[name].popleft()
             if isinstance(measurement, m.InitialPose):
@@ -76,7 +74,6 @@ class Team:
             self.take(self.robots[name].handle(measurement, 0))
 
     def deliver(self, name: str) -> None:
-        """Deliver the robot's next message to the centre, and the answers to the robots."""
         if self.sent[name]:
             self.to_centre(self.sent[name].popleft())
 

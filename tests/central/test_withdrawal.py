@@ -273,7 +273,7 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
         assert delivered(by_time, {k: ends[k] for k in few})[1] == expected
     last = {max(k for k, end in ends.items() if end <= 35.0): 35.0}
     assert delivered(by_time, last)[1] == expected
-    # r2's submaps come long after the watermark: what was folded without them is folded again.
+    # r2's submaps come long after the watermark: the fold without them is repeated.
     late = [each for each in by_time if each.robot == "r2"]
     early = [each for each in by_time if each.robot != "r2"]
     assert delivered([*early, *late], {len(early) - 1: 40.0})[1] == expected

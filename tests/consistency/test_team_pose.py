@@ -92,8 +92,8 @@ def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         world = team(seed + 1000, submaps=6)
-        known = int(rng.integers(1, 6))  # the windows of r0 in the newest broadcast that it has
-        of_others = int(rng.integers(0, known + 1))  # its teammate's come later still
+        known = int(rng.integers(1, 6))  # windows of r0 in its newest broadcast
+        of_others = int(rng.integers(0, known + 1))  # its teammate's come later
         pending = [
             each.local for each in world.submaps if each.robot == "r0" and each.sequence >= known
         ]

@@ -188,7 +188,6 @@ EXAMPLES = {
 
 
 def entries_of(stub: str) -> dict[str, list[str] | None]:
-    """List the stub's entries with their argument names; None for a property."""
     found: dict[str, list[str] | None] = {}
     for node in ast.parse(stub).body:
         members = node.body if isinstance(node, ast.ClassDef) and not node.bases else [node]
@@ -217,7 +216,6 @@ def made(name: str) -> object:
 
 @cache
 def one_graph() -> core.SubmapGraph:
-    """The graph of all estimates."""
     return made("SubmapGraph")
 
 
@@ -261,7 +259,6 @@ def one_of(choices: Sequence[object], rng: np.random.Generator) -> object:
 
 
 def mutated_array(value: np.ndarray, kind: int, rng: np.random.Generator) -> object:
-    """Change the shape, layout, type or one number of an array."""
     axis = int(rng.integers(value.ndim))
     if kind == 1 and value.shape[axis]:
         return np.delete(value, 0, axis)
@@ -281,7 +278,6 @@ def mutated_array(value: np.ndarray, kind: int, rng: np.random.Generator) -> obj
 
 
 def mutated(value: object, rng: np.random.Generator) -> object:
-    """Replace a value, or one of its elements, by a hostile one."""
     kind = int(rng.integers(8))
     if kind == 0:
         return one_of([None, 0.5, "x", (), MEAN, [[1.0]], core.Random(bytes(16))], rng)

@@ -26,7 +26,6 @@ S = 10**9
 
 @pytest.fixture
 def alone(tmp_path):
-    """A driver without a network."""
     robots = []
 
     def make(**options):
@@ -178,7 +177,7 @@ def test_a_short_gap_is_bridged_by_a_motion_of_which_little_is_known(alone):
     )
     assert (first.incarnation, last.incarnation) == (1, 1)
     with pytest.warns(DriverWarning, match=r"no odometry from 1\.800 to 4\.800 s: the robot is"):
-        robot.odometry(4.8, 0.5, 0.0)  # longer than one call covers, and still no stream anew
+        robot.odometry(4.8, 0.5, 0.0)  # longer than one call covers, without a new stream
     *_, again = messages(robot)
     assert (again.incarnation, again.stamp_ns, again.duration_ns) == (1, 4 * S + 800_000_000, 3 * S)
 
@@ -216,7 +215,7 @@ def test_a_program_that_is_killed_may_hand_over_all_once_more(tmp_path, alone, p
     killed = alone(latency_s=0.2)
     drive(killed, range(died_at), poses=poses)
     killed._link.close()
-    killed._journal.close()  # as the kernel does: there is no last word in the file
+    killed._journal.close()  # as the kernel does: the file has no last record
     killed._closed = True
     again = alone(latency_s=0.2)
     drive(again, range(12), poses=poses)
@@ -248,8 +247,6 @@ def test_a_difference_of_poses_covers_the_time_in_which_a_driver_was_away(alone)
 
 
 class Listener:
-    """A robot's process that receives measurements and reports its progress."""
-
     def __init__(self, endpoint):
         self.bus = ZenohBus("lab", endpoint)
         for channel in ch.SENSORS:
@@ -291,13 +288,13 @@ def test_a_robot_gets_all_from_a_driver_that_was_killed_and_the_driver_waits_for
         first = Driver("r1", team="lab", connect=endpoint, file=file)
         drive(first, range(20))
         wait_until(lambda: first._node.status().figures["published"] > 15)
-        first._link._leaving.set()  # no last word: it is killed
+        first._link._leaving.set()  # killed without a last record
         first._link._thread.join()
         first._journal.close()
         robot = Listener(endpoint)
         again = Driver("r1", team="lab", connect=endpoint, file=file)
         drive(again, range(30))
-        assert again.end(patience_s=0.05) is False  # nobody has it yet
+        assert again.end(patience_s=0.05) is False  # not delivered yet
         assert again._closed
         wait_until(lambda: robot.look() or any(h.state == "ended" for h in robot.heads))
         last = Driver("r1", team="lab", connect=endpoint, file=file)  # it delivers
@@ -440,7 +437,7 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
         driver = Driver("r1", team="lab", connect=endpoint, file=tmp_path / "r1.stream")
         drive(driver, range(30))
         wait_until(lambda: driver._node.status().figures["published"] > 20)
-        robot = Listener(endpoint)  # too late for what was published
+        robot = Listener(endpoint)  # too late for the published measurements
         wait_until(lambda: robot.look() or robot.heads)
         robot.ask(0)
         robot.say()
@@ -448,14 +445,14 @@ def test_it_answers_for_what_was_missed_and_ends_when_the_robot_has_it(tmp_path)
 
         def complete():
             robot.look()
-            robot.say()  # that it is done, once it has all and has heard that this is the end
+            robot.say()  # `Done`, once it has everything and the end
             whole = len(robot.got) == driver._journal.count(1)
             return whole and robot.heads[-1].state == "ended"
 
         with driver._lock:
             driver._journal.mark("ended")
         wait_until(complete)
-        assert driver.end(patience_s=60.0)  # as long as a busy machine takes
+        assert driver.end(patience_s=60.0)  # enough for a busy machine
         assert {n for _, n in robot.got} == set(range(1 + 39 + 14))
         with pytest.raises(DriverError, match="is closed"):
             driver.odometry(9.0, 0.0, 0.0)
@@ -472,7 +469,7 @@ def test_a_router_that_is_not_there_is_named_and_a_driver_that_goes_on_does_not_
     first = Driver("r1", **options, patience_s=0.0)
     first.odometry(1.0, 0.0, 0.0)
     first.close()
-    again = Driver("r1", **options)  # killed and started again where there is no network
+    again = Driver("r1", **options)  # killed and restarted without a network
     again.odometry(1.1, 0.5, 0.0)
     wait_until(lambda: caplog.text.count("no router answers at tcp/127.0.0.1:1") == 2)
     again.close()

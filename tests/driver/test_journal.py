@@ -103,7 +103,7 @@ def test_a_file_that_a_crash_left_empty_or_half_written_is_begun_anew(tmp_path, 
 def test_a_clock_that_was_set_makes_no_undelivered_stream_an_old_one(tmp_path, monkeypatch, step_s):
     path = tmp_path / "r1.stream"
     now = time.time
-    with monkeypatch.context() as wrong:  # until the network told the time
+    with monkeypatch.context() as wrong:  # until the network set the clock
         wrong.setattr(time, "time", lambda: now() - step_s)
         filled(path).close()
     before_s = now() - step_s
@@ -157,5 +157,5 @@ def test_nobody_has_consumed_more_than_the_driver_has_numbered(tmp_path):
     ):
         assert f"has {here} of incarnation 1" in str(node.refusal(far))
     assert node.refusal(msgspec.structs.replace(whole, incarnation=2**62)) is not None
-    node.listening = True  # another file may have what this one has not
+    node.listening = True  # another file may have the missing ones
     assert node.refusal(msgspec.structs.replace(whole, incarnation=2)) is None

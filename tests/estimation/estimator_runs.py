@@ -11,8 +11,6 @@ from teamslam.team.estimation.models import Increment, corrected, increment_of
 
 
 class Keyframe(NamedTuple):
-    """One step's motion and the measurements at its end."""
-
     increment: Increment
     ids: np.ndarray
     ranges: np.ndarray
@@ -41,7 +39,6 @@ def keyframes_of(config, stream):
 
 
 def run(state, step, keyframes, config, *generator):
-    """Run an estimator's `filter_step` over the keyframes."""
     for increment, *measurements in keyframes:
         state = step(state, increment, config.sensor, *measurements, *generator)
     return state

@@ -127,7 +127,6 @@ def closed_windows(robot: RobotConfig, stream: RobotStream) -> Iterator[ClosedWi
 
 
 def window_nees(closed: ClosedWindow, world: WorldStreams) -> tuple[float, int]:
-    """NEES of a submap against the truth in its own frame, and its degrees of freedom."""
     stream = world.streams[0]
     start, end = (
         stream.truth[int(np.searchsorted(stream.truth_ns, at))]
@@ -140,7 +139,6 @@ def window_nees(closed: ClosedWindow, world: WorldStreams) -> tuple[float, int]:
 
 
 def mean_nees(case: Case, seeds: int, mutant: str | None = None) -> tuple[float, float, float]:
-    """Mean NEES per degree of freedom over seeds, and its interval."""
     total, dof = 0.0, 0
     for seed in range(seeds):
         world = simulate(case.world, [case.robot], seed)

@@ -61,11 +61,11 @@ def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
     kind = rng.integers(4)
     if kind == 0:
         correlation = np.eye(n)
-    elif kind == 1:  # all of one piece, but for a little
+    elif kind == 1:  # fully correlated, but for a little
         v = rng.choice([-1.0, 1.0], n)[:, None]
         left = 10.0 ** rng.uniform(-16.0, -1.0)
         correlation = (1.0 - left) * (v @ v.T) + left * np.eye(n)
-    else:  # of fewer dimensions than it has, but for a little
+    else:  # rank-deficient, but for a little
         A = rng.normal(size=(n, max(1, n - int(rng.integers(0, 3)))))
         raw = A @ A.T + 10.0 ** rng.uniform(-15.0, 0.0) * np.eye(n)
         d = np.sqrt(np.diag(raw))
@@ -129,7 +129,7 @@ class Team:
         nodes = np.unique(rng.integers(1, 6, int(rng.integers(0, 3)))) * 2 * S + k * 10 * S
         n = 3 + 3 * len(nodes) + 2 * len(ids)
         mean = numbers(rng, n)
-        if rng.random() < 0.3:  # a standing robot that sees everything at one place
+        if rng.random() < 0.3:  # a standing robot that sees all landmarks at one place
             mean[:] = 0.0
         poses = 3 * (1 + len(nodes))
         mean[2:poses:3] = np.clip(mean[2:poses:3], -3.1, 3.1)
@@ -168,7 +168,6 @@ class Team:
             self._add(self._verdict())
 
     def _verdict(self) -> m.Verdict:
-        """A verdict on two landmarks, which may not exist."""
         rng = self._rng
         first, second = (
             m.LocalLandmark(
@@ -309,7 +308,7 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
                 ranges=from_floats(np.abs(numbers(rng, len(names)))),
                 bearings=from_floats(rng.uniform(-np.pi, np.pi, len(names))),
             )
-        if valid(message) is not None:  # what no driver can send has no number either
+        if valid(message) is not None:  # impossible messages of a driver have no number
             counter += 1
             yield message
             if 0 < kind <= 5:

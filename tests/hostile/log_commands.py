@@ -35,7 +35,6 @@ COMMANDS = {
 
 
 def peak_mib() -> float:
-    """Peak memory [MiB] of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 

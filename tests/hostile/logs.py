@@ -26,13 +26,12 @@ DIGEST = b"configur"
 
 
 def log_of(path: Path, *chunks: bytes) -> Path:
-    """A complete log with chunks of these records."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start()
         writer.add_metadata("teamslam", {"team": "demo"})
         for k, chunk in enumerate(chunks):
-            # What does not compress makes the rest's ratio believable.
+            # Incompressible bytes make the overall ratio plausible.
             noise = Random(k).randbytes(NOISE)
             records = struct.pack("<BQ", PRIVATE, NOISE) + noise + chunk
             data = zstandard.compress(records, 19)
@@ -45,7 +44,6 @@ def log_of(path: Path, *chunks: bytes) -> Path:
 
 
 def records_of(told: Sequence[tuple[ch.Channel, str, bytes]]) -> bytes:
-    """Channel records, and a message record for each payload."""
     out = RecordBuilder()
     keys = [f"team/demo/{channel.key(name)}" for channel, name, _ in told]
     numbers = {key: k + 1 for k, key in enumerate(dict.fromkeys(keys))}

@@ -44,7 +44,6 @@ def progress(robot: str, measurements: int, submaps: int, stamp_s: float = 12.0)
 
 
 def run() -> list[tuple[ch.Channel, str, m.Message]]:
-    """All messages that a centre receives of a team, in one possible order."""
     said: list[tuple[ch.Channel, str, m.Message]] = []
     for name, submaps in SUBMAPS.items():
         here = build.liveliness(node=f"robot/{name}")

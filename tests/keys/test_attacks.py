@@ -85,7 +85,6 @@ OWN = Outgoing(
 
 @contextmanager
 def door(keys: Folders | None) -> Iterator[Callable[[str], ZenohBus]]:
-    """A router, and a function that connects a node."""
     opened: list[ZenohBus] = []
     folder = None if keys is None else keys.own
     own = folder and (credentials_of(folder, "router"), load_roster(folder))
@@ -334,7 +333,7 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(tmp_path, monkeyp
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.3)
     make_keys(tmp_path, TEAM, nodes_of(["r1"]))
     told, took = "", 0.0
-    for life_s in (4.0, 12.0, 36.0):  # a busy machine may need more time to get in
+    for life_s in (4.0, 12.0, 36.0):  # a busy machine may need more time to connect
         ended = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=life_s)
         make_keys(tmp_path, TEAM, [], renew=["router"], days=1.0, now=ended)
         own = credentials_of(tmp_path, "router"), load_roster(tmp_path)

@@ -40,7 +40,6 @@ def test_a_nodes_files_are_enough_for_it(keys, tmp_path):
 
 
 def mixed(keys: Folders, tmp_path: Path, **files: Path) -> Path:
-    """A folder for robot-r1 with some of its files replaced."""
     for name in ("ca.pem", "robot-r1.pem", "robot-r1.key"):
         source = files.get(name.replace(".", "_").replace("-", "_"), keys.own / name)
         shutil.copy(source, tmp_path / name)

@@ -33,7 +33,6 @@ def start(robot: str, incarnation: int = 1) -> Member:
 
 
 def parcel(robot: str, sequence: int, mates: Sequence[str] = ()) -> list[Member]:
-    """A submap after the inter-robot measurements from it."""
     own = msgspec.structs.replace(submap(sequence, robot, 1), incarnation=1, sightings=len(mates))
     factors = [
         build.sighting_factor(
@@ -61,7 +60,6 @@ def done(robot: str, submaps: int) -> Member:
 
 @cache
 def said(robot: str, submaps: int, mate: str) -> tuple[list[Member], ...]:
-    """Members of one robot's life, by occasion."""
     parcels = [parcel(robot, k, [mate] if k % 3 == 1 else []) for k in range(submaps)]
     return ([start(robot)], *parcels, [done(robot, submaps)])
 
@@ -184,6 +182,5 @@ class Storm:
                 self.send(name, other, each.message)
 
     def fed(self, name: str) -> Iterator[m.Message]:
-        """Messages that a fresh fold receives."""
         self.nodes[name].restart_fold()
         return self.nodes[name].new_messages()

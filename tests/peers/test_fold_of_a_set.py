@@ -22,7 +22,6 @@ GIVEN_UP = Member(ch.GIVEN_UP.key("robot/r2"), encoded(_GIVEN_UP), _GIVEN_UP)
 
 
 def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
-    """The final map of a peer that gets its members in these portions."""
     node = PeerNode("robot/r1", ROBOTS)
     fold = PeerFold(CentralConfig(), ROBOTS, node)
     for k, batch in enumerate([*batches, []]):

@@ -83,7 +83,7 @@ def test_questions_in_another_nodes_name_take_nothing_from_that_node():
         node.take(each, "robot/r2")
     want = build.requested(robot="r2", last=39)
     request = encoded(build.members_request(node="robot/r2", requested=(want,)))
-    while node._given._bytes < GIVEN_BYTES // 4:  # more than one node was given in a second
+    while node._given._bytes < GIVEN_BYTES // 4:  # more than a node is sent in a second
         assert node.answer(request)
         node._given.note(GIVEN_BYTES // 16)
     assert node.answer(request)

@@ -131,7 +131,6 @@ def test_a_record_within_a_damaged_one_is_not_taken(tmp_path):
 
 
 def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypatch, caplog):
-    """A disk that becomes full takes a part without an error, and refuses the next write."""
     path = tmp_path / "r1.set"
     room = 5000
     pwrite = os.pwrite

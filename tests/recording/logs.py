@@ -17,14 +17,12 @@ def sampled(channel: c.Channel, name: str, message: m.Message, counter: int = 0)
 
 
 def recorded(path: Path, samples: list[Sample], **metadata: str) -> Log:
-    """A complete log of these samples, of the team `t`."""
     with Recorder(path, "t", metadata) as recorder:
         recorder.write(samples)
     return open_log(path)
 
 
 def recorded_examples() -> list[tuple[c.Channel, m.Message, Sample]]:
-    """An example of every recorded message, with its channel and sample."""
     of = {kind: channel for channel in c.CHANNELS if channel.recorded for kind in channel.kinds}
     kept = [(of[type(x)], on_its_key(of[type(x)], "alpha", x)) for x in examples() if type(x) in of]
     return [(channel, x, sampled(channel, "alpha", x, i)) for i, (channel, x) in enumerate(kept)]

@@ -26,7 +26,6 @@ from tests.support import ROOT, odometry, submap, wait_until
 
 
 def stream(count: int) -> list[Sample]:
-    """Interleaved measurements and submaps of two robots."""
     return [
         sampled(c.SUBMAP, robot, submap(i, robot), i)
         if i % 10 == 9
@@ -129,7 +128,6 @@ def test_a_full_disk_is_told_at_the_next_call_and_nothing_hangs(path):
 
 
 def killed(path: Path, count: int) -> Log:
-    """The log of a recorder killed after `count` samples."""
     program = (
         "import sys, threading; from pathlib import Path\n"
         "from teamslam.team.recording.recorder import Recorder\n"

@@ -42,7 +42,6 @@ def path(tmp_path):
 
 
 def killed_part(path: Path, samples: list[Sample]) -> None:
-    """A log that its recorder did not finish."""
     recorder = Recorder(path, "t", {"scenario": "s"})
     recorder.write(samples)
     wait_until(lambda: len(list(open_log(path).samples())) == len(samples))

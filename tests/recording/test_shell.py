@@ -118,7 +118,6 @@ def test_absent_nodes_are_a_warning_until_they_appear(path):
 
 
 def team_of(source: Bus) -> list[Outgoing]:
-    """Publish the messages of a small team, the final map last."""
     out = [Outgoing(c.ODOMETRY, "alpha", odometry(i)) for i in range(1_000)]
     out += [Outgoing(c.SUBMAP, "alpha", submap(i)) for i in range(20)]
     out.append(Outgoing(c.FINAL_MAP, "", FINAL))
@@ -138,7 +137,7 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path, endpoint):
             kwargs={"on_status": statuses.append},
         )
         thread.start()
-        received(team, 1)  # the recorder is alive: its subscriptions are declared
+        received(team, 1)  # its subscriptions are declared by then
         flows(team, path)
         published = team_of(team)
         wait_until(lambda: any(one.key == "central/final" for one in open_log(path).samples()))

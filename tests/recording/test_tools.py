@@ -37,7 +37,6 @@ SECOND = 10**9
 
 
 def drive(robot: str, seconds: int) -> list[Sample]:
-    """A configuration at zero, ten odometry measurements a second and a submap each second."""
     out = [sampled(c.ROBOT_CONFIG, robot, build.configuration(node=f"robot/{robot}"), 0)]
     for i in range(10 * seconds):
         stamp = 100 * SECOND + i * SECOND // 10
@@ -75,7 +74,6 @@ def status(counter: int, wall_s: int = 0, node: str = "central", **fields: objec
 
 
 def later(samples: list[Sample], **fields: object) -> list[Sample]:
-    """Samples of their publisher's second life."""
     return [msgspec.structs.replace(s, wall_ns=s.wall_ns + SECOND, **fields) for s in samples]
 
 

@@ -141,8 +141,6 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
 
 
 class Published(Source):
-    """A source with an initial pose and one odometry interval."""
-
     def answer(self, request: bytes) -> list[bytes]:
         super().answer(request)
         wanted = decoded(request, m.MeasurementsRequest)

@@ -38,7 +38,6 @@ def payloads(out, channel=ch.SUBMAP):
 
 @cache
 def lonely():
-    """Contributions of an undisturbed robot."""
     return payloads(driven(RobotNode(config()), MEASUREMENTS))
 
 

@@ -68,7 +68,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
     journal = robot._journal
     journal.mark("ended")
     sent = [journal.message(1, number) for number in range(journal.count(1))]
-    robot.close()  # nobody is there to take the stream
+    robot.close()  # no receiver for the stream
     (stream,) = folder(FolderWorld(path=str(tmp_path / "set")), [RobotConfig(id="r1")]).streams
     world = WorldNode(
         world_of(stream), frozenset(), build.configuration(node="world", incarnation=0)

@@ -52,7 +52,6 @@ def samples(out: Sequence[Outgoing]) -> list[Sample]:
 
 
 def world_log(of: Scenario) -> list[Sample]:
-    """All publications of a world without listeners."""
     node = WorldNode(streams(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
@@ -63,7 +62,6 @@ def world_log(of: Scenario) -> list[Sample]:
 def final_map(
     ids: Sequence[int], means: np.ndarray, covariance: np.ndarray, *, joint: bool = True
 ) -> Outgoing:
-    """A final map of the rule `join`."""
     content = translate.covariance_bytes(covariance, joint=joint)
     message = fused_map(
         stamp_ns=STEPS * 10**9,
@@ -88,7 +86,6 @@ def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: floa
 
 
 def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoing]:
-    """Pose messages of r1 at the end of each step, with unit covariance."""
     ends = streams(of).streams[0].intervals.end_ns.tolist()
     unit = from_floats(np.eye(3))
     return [

@@ -32,7 +32,6 @@ def thesis(steps: int, **options: str | int) -> Scenario:
 
 
 def team_samples(scenario: Scenario) -> list[Sample]:
-    """Run the scenario in memory and return its samples."""
     return list(run_team(scenario, streams_of(scenario)))
 
 

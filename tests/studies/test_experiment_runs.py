@@ -45,8 +45,6 @@ def test_a_team_that_fuses_nothing_has_the_figures_of_its_robots(estimator):
 
 
 class Mean:
-    """An experiment of three runs."""
-
     def __init__(self, *tasks: Task) -> None:
         self._tasks = list(tasks)
 
@@ -122,8 +120,6 @@ def task(value: float, cost: float = 1.0) -> Task:
 
 
 class Values:
-    """An experiment whose runs return their parameter."""
-
     def tasks(self, options: Options) -> list[Task]:
         return [task(seed / 8, 1.0 + seed) for seed in options.seeds]
 

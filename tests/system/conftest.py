@@ -14,7 +14,7 @@ import pytest_asyncio
 from tests.system.processes import Processes
 from tests.system.scenarios import short
 
-# A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
+# A shell's background jobs, and their children, ignore Ctrl-C.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -31,8 +31,6 @@ async def until(condition: Callable[[], object], what: str, timeout_s: float = 1
 
 
 class Process:
-    """One process of a test; its output goes into a file."""
-
     def __init__(self, name: str, process: asyncio.subprocess.Process, output: Path) -> None:
         self.name = name
         self.output = output
@@ -92,14 +90,12 @@ class Terminal:
 
     def _read(self) -> None:
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
-        with contextlib.suppress(OSError):  # how a terminal says that nobody holds its other end
+        with contextlib.suppress(OSError):  # the terminal's other end is closed
             while written := os.read(self._mine, 65_536):
                 self.shown += decoder.decode(written)
 
 
 class Processes:
-    """The processes of one test; they work in `folder`."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
         self._started: list[Process] = []
@@ -123,23 +119,20 @@ class Processes:
         return started
 
     async def start(self, *arguments: str | Path, name: str = "") -> Process:
-        """Start `teamslam` with these arguments."""
         number = len(self._started)
         return await self.run(name or f"{number}-{arguments[0]}", [*PROGRAM, *arguments])
 
     async def router(self) -> str:
-        """Start a router; return its endpoint."""
         process = await self.start("router", "--listen", "tcp/127.0.0.1:0")
         await process.says("listening at tcp/127.0.0.1:")
         await process.says("\n")
         return process.said().split()[-1]
 
     def alive(self) -> dict[int, list[str]]:
-        """Command lines of this test's living processes, by id."""
         found = {}
         for entry in _PROC.iterdir():
             if entry.name.isdigit():
-                # Not ours to look at, or it has ended: a zombie has no working folder either.
+                # Not readable, or ended: a zombie has no working folder.
                 with contextlib.suppress(PermissionError, FileNotFoundError, ProcessLookupError):
                     if (entry / "cwd").readlink().is_relative_to(self.folder):
                         command = (entry / "cmdline").read_bytes().decode()
@@ -152,7 +145,7 @@ class Processes:
         found: list[int] = []
 
         def alone() -> bool:
-            # Before it has become the program that it is to be, a child looks as its parent.
+            # Before its exec a child has its parent's command line.
             lines = self.alive().items()
             found[:] = [pid for pid, line in lines if {"teamslam", *words} <= set(line)]
             return len(found) == 1
@@ -161,7 +154,6 @@ class Processes:
         return found[0]
 
     async def none_left(self, timeout_s: float = 10.0) -> None:
-        """Return when no process of this test lives."""
         try:
             await until(lambda: not self.alive(), "no process is left", timeout_s)
         except AssertionError:

@@ -20,7 +20,6 @@ def short(folder: Path, base: str = "thesis", steps: int = STEPS, more: str = ""
 
 
 def final_map(samples: "list[tuple[str, bytes]]") -> bytes:
-    """Bytes of the one final map among (key, payload)."""
     (payload,) = [payload for key, payload in samples if key == FINAL_MAP.key()]
     return payload
 

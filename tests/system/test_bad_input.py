@@ -32,7 +32,6 @@ async def refused(team: Processes, *arguments: str | Path) -> str:
 
 @pytest.fixture
 def dataset(team):
-    """A small data set of three robots."""
     folder = team.folder / "MRCLAM_Dataset0"
     write_utias(streams_of(load(short(team.folder, "waypoints", 40))), folder)
     return folder

@@ -31,7 +31,6 @@ async def launched(team: Processes, speed: str = PACE) -> tuple[Process, Path]:
 
 
 def submaps_in(log: Path) -> int:
-    """Number of submaps in a log so far."""
     try:
         return len(list(open_log(log).samples([ch.SUBMAP])))
     except LogError:
@@ -66,13 +65,11 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team):
 
 
 def standing(pid: int) -> tuple[int, int, int]:
-    """Parent, process group and session of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return int(fields[1]), int(fields[2]), int(fields[3])
 
 
 def other(team: Processes, words: tuple[str, ...]) -> int | None:
-    """Id of the process with these words, if any."""
     found = [pid for pid, line in team.alive().items() if {"teamslam", *words} <= set(line)]
     return found[0] if found else None
 

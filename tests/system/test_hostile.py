@@ -28,7 +28,7 @@ async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team):
     for process in started:
         await process.says("connected to team")
     rng = Random(11)
-    unsaid = (*OF_THE_RUN, m.Fault, m.Status)  # the last two are what is looked at
+    unsaid = (*OF_THE_RUN, m.Fault, m.Status)  # only the last two are compared
     storm = (each for each in payloads(rng) if each[0].message not in unsaid)
     with ZenohBus(load(scenario).team, endpoint) as stranger:
         for count, (channel, name, payload) in enumerate(islice(storm, MESSAGES)):

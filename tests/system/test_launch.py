@@ -97,7 +97,6 @@ def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(launche
 
 
 async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, object]:
-    """Launch at full speed without a report and views; return the JSON."""
     process = await team.start(
         *("launch", scenario, "--speed", "max", "--no-report", "--no-views", "--output", "run"),
         *("--json", "result.json", *options),

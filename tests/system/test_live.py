@@ -30,7 +30,7 @@ def recorded(folder: Path) -> bytes:
     simulated = with_options(load(short(folder)), robots=2)
     write_folder(streams_of(simulated), folder / "data")
     for tables in (folder / "data").glob("r*"):
-        (tables / "sightings.csv").unlink(missing_ok=True)  # the example does not say them
+        (tables / "sightings.csv").unlink(missing_ok=True)  # the example omits them
     (folder / "lab.toml").write_text(LIVE)
     scenario = with_options(load(folder / "lab.toml"), dataset=folder / "data")
     samples = run_team(scenario, streams_of(scenario))
@@ -70,7 +70,7 @@ async def test_robots_join_live_and_deaths_and_cuts_change_no_bit_of_the_map(tea
     log = open_log(team.folder / "run" / "log.mcap")
     (found,) = [sample.payload for sample in log.samples([FINAL_MAP])]
     assert found == expected
-    killed = ("robot/r1/tally", "source/r1/tally")  # their last words are missing, nothing else
+    killed = ("robot/r1/tally", "source/r1/tally")  # only their last messages are missing
     assert [each for each in holes(log) if each.where not in killed] == []
     result = json.loads((team.folder / "result.json").read_text())
     assert result["scenario"] == "lab"

@@ -75,7 +75,7 @@ def place_of(page: Page, robot: str) -> tuple[float, float]:
 
 
 def seek(page: Page, time: float) -> None:
-    # What is written over, all tables are written with.
+    # Replacing one table rewrites all.
     page.ask(f"document.querySelector('#end').textContent = ''; teamslam.seek({time})")
     page.wait(f"document.querySelector('#now').textContent === '{time:.1f}'")
     page.wait("document.querySelector('#end').textContent !== ''")

@@ -55,7 +55,6 @@ async def assembled(team: Processes, speed: str, r1_connects: str = "") -> Team:
 
 
 async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Process:
-    """Start the robot r1."""
     return await team.start("robot", found.scenario, "r1", "--connect", endpoint, name=name)
 
 
@@ -67,7 +66,7 @@ async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
         Observer(found.endpoint, [ch.ODOMETRY, ch.END]) as seen,
     ):
         found.robots["r1"] = await robot(team, found, link.endpoint, "r1")
-        await seen.sees(STEPS // 4, ch.ODOMETRY, "r1")  # of the world, however slow r1 is
+        await seen.sees(STEPS // 4, ch.ODOMETRY, "r1")  # of the world, at any speed of r1
         link.cut()
         await seen.sees(1, ch.END)
         link.mend()

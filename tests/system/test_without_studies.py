@@ -34,7 +34,6 @@ a direct child of another, in the checkout.
 
 
 def without_studies(folder: Path) -> Path:
-    """The sources without the removable folders."""
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, symlinks=True)
     for name in REMOVABLE:

@@ -50,7 +50,6 @@ def contribution(rows: np.ndarray, robot: int, sigma: float, classes: np.ndarray
 
 
 def find(folder: Path, site: str, sigma: float, *, classed: bool) -> dict[tuple[int, int], Closure]:
-    """Best alignment of each ordered pair of maps."""
     objects = [np.loadtxt(folder / f"robot{robot}Map_{site}.txt") for robot in ROBOTS]
     classes = np.unique(np.concatenate(objects)[:, 0]) if classed else np.empty(0)
     profile = profile_for(Sensor(range_sigma=sigma, bearing_sigma=1e-6), 1.0)

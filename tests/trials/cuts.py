@@ -92,7 +92,7 @@ class Team:
             log = self.folder / "run" / f"{robot}.log"
             while "connected" not in log.read_text("utf-8", "replace"):
                 if not self.is_alive(robot):
-                    self.start(robot)  # the first connection has its patience only
+                    self.start(robot)  # the first connection has a limited patience
                 time.sleep(0.2)
         for node in drivers:
             self.start(node)
@@ -196,7 +196,6 @@ def play(
 
 
 def options_of(description: str, kills: int) -> argparse.ArgumentParser:
-    """Common options of trials with cut links."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--kills", type=int, default=kills, help="in each run")

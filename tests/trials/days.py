@@ -59,7 +59,6 @@ class Site:
         self.places = list(map(tuple, self._random.uniform(0.0, SITE_M, (LANDMARKS, 2)).tolist()))
 
     def change(self) -> dict[int, str]:
-        """Change landmarks overnight; return the new state of each."""
         changes = {}
         for number, place in enumerate(tuple(self.places), 1):
             if place == AWAY or self._random.random() >= CHANGED:
@@ -133,7 +132,6 @@ def _figures(
 
 
 def draw(days: list[Day], path: Path) -> None:
-    """Draw size, cost, accuracy and detection over the days."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -128,7 +128,6 @@ def final_in(folder: Path) -> bytes | None:
 
 
 def shortened(folder: Path, steps: int) -> Path:
-    """A scenario file: `thesis` with so many steps."""
     scenario = folder / "short.toml"
     scenario.write_text(f'base = "thesis"\n[world]\nsteps = {steps}\n')
     return scenario
@@ -265,7 +264,6 @@ def hit(
 
 
 def kept_in(path: Path | None) -> list[Run]:
-    """Runs stored by an earlier call."""
     if path is None or not path.exists():
         return []
     rows = json.loads(path.read_text())
@@ -273,7 +271,6 @@ def kept_in(path: Path | None) -> list[Run]:
 
 
 def keep_in(path: Path | None, runs: list[Run]) -> None:
-    """Store all runs so far."""
     if path is not None:
         path.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
 

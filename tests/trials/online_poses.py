@@ -54,7 +54,7 @@ def run(scenario_name: str, seed: int) -> list[dict[str, Any]]:
         if found is not None and found[0] is ch.TEAM_POSE:
             _, name, message = opened(sample)
             assert isinstance(message, m.PoseEstimate)
-            # The node speaks in bunches: of each bunch the warnings are those at its end.
+            # The node publishes in bursts; the warnings hold at the end of each.
             warned[name, message.stamp_ns] = bool(nodes[name].status().warnings)
     found = []
     for name, judged in evaluate(samples).robots.items():

@@ -89,7 +89,6 @@ def variants(scenario: Scenario, *, is_aligned: bool) -> Iterator[tuple[str, Fig
 
 
 def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and its standard error."""
     return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 

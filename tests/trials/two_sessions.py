@@ -46,8 +46,6 @@ MATCHINGS = 5
 
 
 class Session(NamedTuple):
-    """The robots of one session and their measurements."""
-
     scenario: Scenario
     world: WorldStreams
 
@@ -221,7 +219,6 @@ def of_robots(session: Session, robots: Sequence[str], *, begins: bool) -> Sessi
 
 
 def in_one(whole: Session, parts: Sequence[Session]) -> Session:
-    """Put the robots of several sessions into one, in the order of the whole."""
     of = {each.robot: each for session in parts for each in session.world.streams}
     streams = tuple(of[each.robot] for each in whole.world.streams)
     return Session(whole.scenario, replace(whole.world, streams=streams))

@@ -87,7 +87,6 @@ def of_robot(stream: RobotStream) -> list[ros.Message]:
 
 
 def write_bags(streams: tuple[RobotStream, ...], folder: Path) -> None:
-    """Write both bags, and the file of their topics."""
     messages = sorted((m for s in streams for m in of_robot(s)), key=lambda m: m[0])
     for name in ("mcap", "db3"):
         ros.write_bag(folder / name, messages, db3=name == "db3")
@@ -110,7 +109,7 @@ def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
     return found
 
 
-# The publisher: a process of its own, with nothing of ours but the bag's reader.
+# The publisher: a process with the bag's reader alone.
 
 
 def publish(mode: str, bag: Path, port: int, speed: float) -> None:
@@ -147,7 +146,7 @@ def publish(mode: str, bag: Path, port: int, speed: float) -> None:
                 continue
             time.sleep(max(0.0, began + 1e-9 * (at - first) / speed - time.monotonic()))
             attached = None
-            if mode == "rmw":  # as rmw_zenoh numbers what a publisher sends
+            if mode == "rmw":  # as rmw_zenoh numbers a publisher's samples
                 numbers[topic] += 1
                 gid = topic[-16:].encode().ljust(16)
                 attached = struct.pack("<qqB16s", numbers[topic], at, 16, gid)
@@ -182,7 +181,6 @@ def of_log(log: Path) -> tuple[bytes, bytes, bytes]:
 
 
 def typed(*words: object) -> str:
-    """Run a command; an error carries its output."""
     done = subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, text=True, check=False,
                           env={**os.environ, **ONE_THREAD})  # fmt: skip
     if done.returncode:
@@ -275,7 +273,6 @@ def settled(run: Path, robots: list[str]) -> None:
 
 
 def one(way: str, source: Scenario, place: Path, speed: float) -> tuple[bytes, bytes, bytes]:
-    """The final map by a way."""
     streams = streams_of(source)
     if way == "zip":
         return of_data_set(source)

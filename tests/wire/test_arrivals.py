@@ -34,7 +34,7 @@ def test_a_gap_is_asked_for_after_a_while_and_again_later_and_later():
     arrivals.take(3, 3)
     asked = []
     for tick in range(100):
-        arrivals.take(4 + tick, 0)  # what goes on behind the gap is no reason to wait
+        arrivals.take(4 + tick, 0)  # later messages do not delay the request
         wanted = arrivals.due(tick * 0.1)
         if wanted is not None:
             asked.append((tick, wanted))

@@ -37,7 +37,6 @@ def endpoint():
 
 @pytest.fixture(params=["memory", "zenoh"])
 def joined(request):
-    """Each call joins one more bus to the same team."""
     with ExitStack() as stack:
         if request.param == "memory":
             network = MemoryNetwork()
@@ -235,7 +234,7 @@ def test_replies_to_a_request_come_with_what_arrives(joined):
     arrived: list[Sample] = []
 
     def all_here() -> bool:
-        if not arrived:  # the answerer's declaration may still be on its way
+        if not arrived:  # the answerer's declaration may not have arrived yet
             centre.request(c.SENT, "alpha", build.submaps_request(robot="alpha"))
         robot.receive(0.02)
         arrived.extend(centre.receive(0.02))

@@ -38,7 +38,6 @@ def channel_table() -> str:
 
 
 def query_table() -> str:
-    """The table of queries as Markdown."""
     rows = ["| key | request | replies |", "|---|---|---|"]
     rows += [f"| `{q.template}` | {_carried(q)} | {q.meaning} |" for q in c.QUERIES]
     return "\n".join(rows)
@@ -51,7 +50,6 @@ def _carried(channel: c.Channel) -> str:
 
 
 def view_table() -> str:
-    """The table of views as Markdown."""
     rows = ["| key | schema | rate | meaning |", "|---|---|---|---|"]
     for view in v.VIEWS:
         schema = view.schema if isinstance(view.schema, str) else f"teamslam.{view.schema.__name__}"

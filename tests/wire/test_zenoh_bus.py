@@ -194,7 +194,7 @@ def test_an_answer_that_never_comes_is_an_error(endpoint):
                 asker.ask(c.SUBMAPS, "", build.submaps_request(robot="alpha"), 0.2)
             except BusError as error:
                 return "team/t/central/submaps" in str(error)
-            return False  # its declaration is still on its way
+            return False  # its declaration has not arrived yet
 
         wait_until(timed_out)
 
@@ -292,7 +292,7 @@ def test_a_heartbeat_on_half_a_key_is_nobodys(endpoint, caplog):
             return "attachment" in caplog.text
 
         wait_until(heard)
-        until = time.monotonic() + 1.0  # what is missing is asked for after half a second
+        until = time.monotonic() + 1.0  # missing samples are requested after half a second
         while time.monotonic() < until:
             bus.receive(0.05)
         assert bus.find_missing() == {}
@@ -454,7 +454,7 @@ def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(en
         flowing(source, sink, c.STATUS)
         for k in range(3_000):
             deep = f"team/t/robot/r1/x{k}/status"
-            odd = f"team/t/robot/X{k}/status"  # as deep as a status, and no node's
+            odd = f"team/t/robot/X{k}/status"  # as many parts as a status key, of no node
             for key in (deep, odd):
                 session.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
         assert source.publish(Outgoing(c.STATUS, "robot/r1", status))

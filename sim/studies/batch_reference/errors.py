@@ -107,7 +107,7 @@ def profile_graph(
         scan = chains[look.chain].scans[look.pose - 1]
         R = scan.noise(look.number, sensor, distance)[::-1, ::-1]
         white = np.array([sensor.bearing_white, sensor.range_white])
-        if scan.own.size:  # a detector's covariance is that of one measurement
+        if scan.own.size:  # a detector's covariance is of one measurement
             white = np.ones(2)
         variances = np.diag(R)
         model = (

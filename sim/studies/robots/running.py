@@ -183,7 +183,7 @@ class RunningEstimator:
         increment, *scan = step
         judged = NOTHING
         with np.errstate(all="ignore"):
-            with suppress(NotACovarianceError):  # then without an innovation
+            with suppress(NotACovarianceError):  # without an innovation
                 judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
             try:
                 state = self._filter.filter_step(self._state, self._config, step, self._generator)

@@ -147,7 +147,7 @@ def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
     declared = defaultdict(list)
     for name, config in sorted(robots.items()):
         sensor, biases = config.sensor, config.front_end.biases
-        biases = () if biases == FrontEnd().biases else biases  # small where nothing is stated
+        biases = () if biases == FrontEnd().biases else biases  # small by default
         shares = {"range_white": sensor.range_white, "bearing_white": sensor.bearing_white}
         lasting = [f"{each} = {share:g}" for each, share in shares.items() if share < 1.0]
         if lasting or biases:

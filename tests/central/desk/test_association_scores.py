@@ -104,8 +104,8 @@ def test_duplicates_wrong_members_and_what_is_left_out_are_counted():
     assert found["duplicates_confirmed"] == 0
     assert found["labelled_detections_left_out"] == 1
     assert found["wrong_percent"] == pytest.approx(100.0 / 6.0)
-    assert found["precision"] == pytest.approx(2.0 / 4.0)  # of 3 + 1 pairs 1 + 1 are right
-    assert found["recall"] == pytest.approx(2.0 / 10.0)  # of the pairs of five sevens
+    assert found["precision"] == pytest.approx(2.0 / 4.0)  # 1 + 1 of 3 + 1 pairs are right
+    assert found["recall"] == pytest.approx(2.0 / 10.0)  # of all pairs of five equal labels
     assert found["windows"]["recall"] == pytest.approx(2.0 / 4.0)
 
 

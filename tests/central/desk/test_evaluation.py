@@ -280,7 +280,7 @@ def unnamed_log(
     world = streams(of)
     ids = [*world.landmark_ids.tolist()[:named], *UNNAMED_IDS[: len(means) - named]]
     said = [final_map(ids, means, 0.01 * np.eye(2 * len(means)))]
-    if labels:  # of a scan none of whose detections has a label
+    if labels:  # a scan without labels
         unknown = m.TruthLabels(
             robot="r1",
             stamp_ns=5,

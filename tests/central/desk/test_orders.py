@@ -24,8 +24,6 @@ CONFIG = on_its_key(ch.ROBOT_CONFIG, "r3", EXAMPLE)
 
 
 class Centre(threading.Thread):
-    """A centre that answers an order with a map."""
-
     def __init__(self, network: MemoryNetwork, answer: m.FusedMap | None) -> None:
         super().__init__(daemon=True)
         self.bus, self.answer = MemoryBus(network), answer

@@ -62,7 +62,7 @@ def test_the_ends_of_the_ellipse_are_at_the_95_percent_distance(a, b, share):
 
 @pytest.mark.parametrize("speed", [0.4, -0.4])
 def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed):
-    theta = np.array([0.3, 0.35, 2.0, 3.3])  # an eye for landmarks only at these; up to 95° between
+    theta = np.array([0.3, 0.35, 2.0, 3.3])  # landmarks are in sight here; up to 95° between
     radius = speed / 0.2
     arc = np.column_stack([radius * np.sin(theta), -radius * np.cos(theta), theta])
     drawn = curve_through(arc)

@@ -89,7 +89,7 @@ def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
 
 def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_path):
     home = take_home(recorded_of(log))
-    assert home.datum is None  # its frame is that of the start poses
+    assert home.datum is None  # the frame of the start poses
     fused = evaluate(log).map
     classes = {int(fused.ids[0]): ("tree", 0.75)}
     write_map(fused, home.measurements, tmp_path, DATUM, classes)

@@ -57,7 +57,6 @@ def exported(samples, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def read(exported):
-    """(log time, message) by topic, decoded by the file's own schemas."""
     found = defaultdict(list)
     with exported.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -141,7 +140,7 @@ def test_no_robot_hears_a_view(node):
     assert ch.VIEW not in node.listens
 
 
-# What is drawn.
+# Drawings.
 
 
 # Errors.

@@ -72,7 +72,7 @@ def frames(log):
     return found
 
 
-# What the page is told.
+# The page's frames.
 
 
 def test_the_page_is_greeted_first_and_told_the_end_last(log):

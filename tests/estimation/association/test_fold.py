@@ -34,7 +34,6 @@ LOOP = circle((0.0, 0.0), 20.0, 24, 1.25)
 
 
 def _world(seed: int) -> np.ndarray:
-    """Landmarks along a ring, at least a metre apart."""
     rng, kept = np.random.default_rng(seed), []
     while len(kept) < 90:
         angle, r = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(16.0, 24.0)
@@ -123,7 +122,7 @@ def test_robots_with_unknown_initial_poses_are_merged_by_their_landmarks():
 
 
 def test_robots_with_unknown_initial_poses_are_not_merged_in_a_grid_of_equal_rooms():
-    # Of 200 seeds the last one was merged while rivals were charged with what they left over.
+    # Of 200 seeds the one that merges if rivals are charged with the remainders.
     for seed, heading in ((0, 0.0), (1, 0.0), (80, np.pi)):
         rng = np.random.default_rng(seed)
         room = rng.uniform(0.5, 7.5, (9, 2))
@@ -205,4 +204,4 @@ def test_verdicts_that_contradict_each_other_over_a_third_landmark_keep_the_two_
         told = fold_tick(before, Tick([submaps[3]], verdicts=tuple(sorted(verdicts))), SETTINGS)
         identity = told.landmarks.identity
         assert (identity(a) == identity(c)) == one
-        assert identity(a) == identity(b)  # the first of those that say "one" in their order
+        assert identity(a) == identity(b)  # the first verdict "one" in order

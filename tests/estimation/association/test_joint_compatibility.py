@@ -245,7 +245,7 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
     for count, sd, merged in ((2, 0.3, 0), (2, 0.05, 2), (3, 0.3, 3)):
         points = np.concatenate([known, known[:count] + np.array([1.0, -0.5])])
         n = len(points)
-        shift = np.zeros((2 * n, 2))  # an error of 1 m that all that is seen again has in common
+        shift = np.zeros((2 * n, 2))  # a common error of 1 m of all repeated landmarks
         shift[6::2, 0] = shift[7::2, 1] = 1.0
         seen = np.arange(n) >= len(known)
         apart = (seen[:, None] == seen) & ~np.eye(n, dtype=np.bool_)
@@ -280,7 +280,7 @@ def test_far_landmarks_are_merged_that_near_ones_make_certain(heading_sigma, mer
 def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it():
     twins_and_another = [(0.0, 0.0), (0.25, 0.0), (3.0, 1.0)]
     points = np.array([*twins_and_another, (0.12, 0.0), (3.0, 1.0)])  # the first is either twin
-    shift = np.zeros((10, 2))  # an error of 1 m that what is seen again has in common
+    shift = np.zeros((10, 2))  # a common error of 1 m of all repeated landmarks
     shift[6::2, 0] = shift[7::2, 1] = 1.0
     seen = np.arange(5) >= 3
     apart = (seen[:, None] == seen) & ~np.eye(5, dtype=np.bool_)

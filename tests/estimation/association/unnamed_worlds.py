@@ -56,14 +56,12 @@ def drive(
 def circle(
     centre: tuple[float, float], radius: float, steps: int, turns: float, phase: float = 0.0
 ) -> Float[np.ndarray, "k 3"]:
-    """Poses on a circle, counter-clockwise."""
     angle = phase + np.linspace(0.0, 2.0 * np.pi * turns, steps + 1)
     x, y = centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)
     return np.column_stack([x, y, (angle + np.pi / 2 + np.pi) % (2 * np.pi) - np.pi])
 
 
 def ring(rng: np.random.Generator, count: int) -> Float[np.ndarray, "k 2"]:
-    """Landmarks about a circle of 20 m, irregular in angle and radius."""
     angle = 2.0 * np.pi * (np.arange(count) + 0.6 * rng.uniform(size=count)) / count
     r = rng.uniform(17.0, 23.0, count)
     return np.column_stack([r * np.cos(angle), r * np.sin(angle)])

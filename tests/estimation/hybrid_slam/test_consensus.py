@@ -93,7 +93,7 @@ def test_measurements_are_judged_by_the_covariances_that_they_claim(points):
     window = drive(3)
     few = np.arange(1, 40, 5)
     r, b = window.measurements.T
-    r[few] += 1.5  # fifteen times the sensor's deviation
+    r[few] += 1.5  # fifteen sigmas of the sensor
     sigmas = np.tile([0.1, 0.02], (40, 1))
     claims = {"those": sigmas.copy(), "narrow": sigmas}
     claims["those"][few] = [2.0, 0.2]

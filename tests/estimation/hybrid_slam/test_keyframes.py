@@ -114,7 +114,6 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
 
 
 def keyframe(scans, forward=0.0, yaw_rate=0.0):
-    """The keyframe of 1 s with these (stamp_ns, scan)."""
     segmenter = Segmenter(MotionModel(), Sensor(), 1.0)
     segmenter.begin(0)
     for stamp_ns, rows in scans:

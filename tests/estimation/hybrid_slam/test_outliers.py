@@ -22,7 +22,6 @@ from tests.teams import config, driven, published, stream
 
 
 def robot() -> RobotConfig:
-    """The small robot with windows of five steps."""
     plain = config()
     front_end = msgspec.structs.replace(plain.front_end, window_s=5.0)
     return msgspec.structs.replace(plain, front_end=front_end)
@@ -74,7 +73,6 @@ def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(mo
 
 
 def world_with(kind: str, steps: int = 200) -> Scenario:
-    """The thesis' world B in longer steps, 30 % outliers."""
     scenario = load("thesis-b")
     world = msgspec.structs.replace(
         scenario.world, steps=steps, outlier_share=0.3, outlier_kind=kind

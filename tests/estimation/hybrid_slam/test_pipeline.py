@@ -125,7 +125,7 @@ NOISY = MotionModel(forward=MotionNoise(per_s=0.01), turn=MotionNoise(per_s=0.01
 
 def test_the_window_of_a_standing_robot_goes_on_until_it_moves_or_has_lasted_long_enough():
     assert [w.end_ns // 10**9 for w in standing(0.0)] == [10, 20, 30, 40, 50, 60]
-    # 30 s is as long as one may stand; then at 46 s it moves, and by 56 s the next ten are over.
+    # A stop lasts at most 30 s; it moves at 46 s, and the next ten end by 56 s.
     assert [w.end_ns // 10**9 for w in standing(0.05)] == [30, 46, 56]
 
 

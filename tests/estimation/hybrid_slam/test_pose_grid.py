@@ -45,7 +45,6 @@ def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
 
 
 def arc(seconds, forward=0.6, yaw_rate=0.25):
-    """Position and heading on the robot's circle."""
     angle = yaw_rate * seconds
     middle = forward / yaw_rate * (np.exp(1j * angle) - 1.0) / 1j
     return np.array([middle.real, middle.imag, angle])
@@ -201,7 +200,7 @@ def test_the_covariance_of_nodes_and_end_is_that_of_the_particles_paths():
     deviations = np.hstack([off(*each) for each in zip(poses, means, strict=True)])
     expected = (weights[:, None] * deviations).T @ deviations
     effective = 1.0 / np.sum(weights**2)
-    expected *= effective / (effective - 5.0)  # what a sample's inverse is too large by
+    expected *= effective / (effective - 5.0)  # bias of a sample covariance's inverse
     expected += np.diag(np.tile(POSE_JITTER, 3))
     np.testing.assert_allclose(local.covariance[:9, :9], expected, atol=1e-12)
 

@@ -27,7 +27,6 @@ WINDOWS = {1011: 34, 1022: 34, 1074: 21}
 
 
 def nees_of_window(seed, sequence):
-    """NEES of that window's end pose, three degrees of freedom."""
     scenario = with_options(load("thesis"), seed=seed)
     config, stream = scenario.robots[0], streams_of(scenario).streams[0]
     slam, start_ns = HybridSlam(config, 1), 12_000_000_000 * sequence

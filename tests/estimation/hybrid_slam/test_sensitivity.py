@@ -155,7 +155,7 @@ def stated(window, motions, points):
         for k, landmark in zip(keyframes, seen, strict=True):
             slot = np.searchsorted(ids, landmark)
             d = points[slot] + x[3 * K + 2 * slot :][:2] - poses[k][:2]
-            at = points[slot] - path[k][:2]  # the bearing from there on, which has no jump
+            at = points[slot] - path[k][:2]  # the bearing change, without a jump
             turn = np.angle(complex(*d) / complex(*at))
             found.append(np.array([np.hypot(*d), turn - x[3 * k + 2]]))
         return np.concatenate(found)

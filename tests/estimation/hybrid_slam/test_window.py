@@ -74,7 +74,6 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
 
 
 def move(window, motion, seed):
-    """Move the particles without a keyframe."""
     random = random_numbers(seed, "a", 0, 0)
     window.core.move(motion.mean, motion.covariance, random)
 

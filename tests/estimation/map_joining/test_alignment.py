@@ -25,8 +25,6 @@ def joined(submaps, starts, tick=2):
 
 
 def seeing_only(submaps, robot, ids):
-    """The submaps, those of one robot reduced to these landmarks."""
-
     def reduced(each):
         index = np.flatnonzero(np.isin(each.local.ids, ids))
         keep = np.concatenate([np.arange(3), *(3 + 2 * k + np.arange(2) for k in index)])

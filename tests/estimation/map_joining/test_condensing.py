@@ -24,7 +24,6 @@ ROBUST = JoinSettings()
 
 
 def ticks_of(world):
-    """Submaps by tick, one of each robot."""
     ends = sorted({each.end_ns for each in world.submaps})
     return [[each for each in world.submaps if each.end_ns == end] for end in ends]
 
@@ -37,7 +36,6 @@ def empty_fold(world):
 
 
 def both(world, settings):
-    """The full fold and the bounded one."""
     full = bounded = empty_fold(world)
     for tick in ticks_of(world):
         full = fold_submaps(full, tick, settings)

@@ -205,6 +205,6 @@ def test_a_pose_behind_a_bad_heading_has_the_covariance_of_its_arc():
     np.testing.assert_allclose(
         told / np.outer(sigma, sigma), sampled / np.outer(sigma, sigma), atol=0.06
     )
-    assert told[0, 0] > 4.0 * S[0, 0]  # along the way: what an ellipse leaves out
+    assert told[0, 0] > 4.0 * S[0, 0]  # along the path, which an ellipse does not contain
     np.testing.assert_array_equal(found.mean, mean)
     assert found.covariance[2, 2] == pytest.approx(S[2, 2])

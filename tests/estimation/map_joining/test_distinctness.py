@@ -29,7 +29,6 @@ PAIR = [(2.0, 0.0), (2.0, 0.2)]
 def seen(
     sequence: int, places: list[tuple[float, float]], pose_sd: float, heading_sd: float = 0.001
 ) -> Contribution:
-    """A submap of a standing robot, with landmarks that one keyframe saw together."""
     sd = np.array([pose_sd, pose_sd, heading_sd, *[SD] * (2 * len(places))])
     local = LocalMap(
         (UNNAMED + np.arange(len(places))).astype(np.uint32),
@@ -85,7 +84,7 @@ def test_a_landmark_that_is_another_one_is_shown(how):
 
 
 def test_of_what_may_be_one_landmark_the_place_that_is_known_best_is_shown():
-    fold = folded((2.0, 0.1), times=4)  # more submaps have seen it than either of the two
+    fold = folded((2.0, 0.1), times=4)  # more submaps have it than either of the two
     one, two = (fold.landmarks.identity(member(0, k)) for k in (0, 1))
     assert {*shown_landmarks(fold, CentralConfig(), "final").ids} == {one, two}
 

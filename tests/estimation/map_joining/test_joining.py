@@ -100,7 +100,7 @@ def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
     np.testing.assert_allclose(prior.covariance[np.ix_(keep, keep)], covariance, atol=1e-8)
 
 
-# --- the set decides, not the way it came ---
+# --- a function of the set, not of its order ---
 
 
 @settings(deadline=None, max_examples=10)

@@ -51,7 +51,6 @@ def fold_of(world, submaps, options, full=solve_fold):
 
 
 def errors_of(world, fold):
-    """RMSE [m] of the landmarks and of r0's path."""
     found = landmark_map(fold)
     graph, state = fold.main.graph, fold.main.state
     ends = np.array([state[graph.offset[k] :][:2] for k in graph.streams["r0", 0][1:]])
@@ -166,7 +165,6 @@ def after(ticks, island):
 
 
 def off_m(island):
-    """Distance [m] of r1's node from its measured place."""
     begin = island.graph.offset[island.graph.streams["r1", 0][1]]
     return abs(float(island.state[begin + 1]))
 

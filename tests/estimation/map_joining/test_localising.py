@@ -14,7 +14,6 @@ START, MOTION = np.array([3.0, 2.0, 2.4]), np.array([1.5, 0.4, 0.7])
 
 
 def spread(rng, n, sigma):
-    """A covariance of n numbers with correlations."""
     root = sigma * (np.eye(n) + 0.4 * rng.standard_normal((n, n)) / np.sqrt(n))
     return root @ root.T
 

@@ -36,7 +36,6 @@ def island_of(world, sightings=()):
 
 
 def thrown(island, seed):
-    """The island with random values of all unknowns."""
     rng = np.random.default_rng(seed)
     free = np.repeat(~island.graph.fixed, np.diff(island.graph.offset))
     state = np.where(free, rng.uniform(-30.0, 30.0, len(free)), island.state)

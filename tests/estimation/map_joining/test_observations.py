@@ -13,7 +13,6 @@ STEP = 1e-6
 
 @pytest.fixture(scope="module")
 def island():
-    """A joined team with doubled covariances."""
     world, settings = team(2), JoinSettings(covariance_factor=2.0)
     return solved(joined_with(world.submaps, world.starts, (), settings), settings).main
 

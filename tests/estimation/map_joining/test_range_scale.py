@@ -48,7 +48,7 @@ def carts(seed, robots=2, submaps=12, own=OWN, common=0.0, way=0.01, marker=0.0)
             for at in range(3, 13, 2):
                 off = truth[at : at + 2] - middle
                 angle = np.arctan2(off[1], off[0]) + 0.01 * random.standard_normal()
-                # The scale multiplies what is there; the noise of the measurement adds to it.
+                # The scale multiplies the true range; the noise adds.
                 share = 1.0 + errors[robot] + SHARE * random.standard_normal()
                 share += of_marker[at // 2 - 1]
                 ahead = np.array([np.cos(angle), np.sin(angle)])
@@ -120,7 +120,7 @@ def _with_offset(submap):
     return replace(submap, local=replace(local, biases=both, sensitivity=columns))
 
 
-# --- what all robots have in common ---
+# --- errors that all robots share ---
 
 
 def test_a_marker_is_the_teams_and_its_prior_is_no_sensors_bias():

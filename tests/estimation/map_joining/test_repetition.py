@@ -24,7 +24,6 @@ ROUND = 14
 
 
 def field(seed: int, count: int = 30, half: float = 15.0) -> np.ndarray:
-    """Landmarks in a square, at least two metres apart."""
     rng, kept = np.random.default_rng(seed), []
     while len(kept) < count:
         point = rng.uniform(-half, half, 2)

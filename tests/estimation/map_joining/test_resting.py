@@ -21,7 +21,6 @@ NEVER = 1_000_000
 
 
 def world(seed, submaps=24):
-    """Robots that see a part of the place at a time, and come back."""
     return team(seed, submaps=submaps, landmarks=40, size=40.0, reach=10.0)
 
 
@@ -31,7 +30,6 @@ def ticks_of(found):
 
 
 def folds(found, settings, first, starts=None):
-    """The fold after each tick."""
     fold = EMPTY_FOLD
     for start in found.starts if starts is None else starts:
         fold = add_start(fold, start)

@@ -31,7 +31,6 @@ SENSOR = Sensor(range_sigma=0.5, bearing_sigma=0.05)
 
 
 def driven(robot, aside, rng):
-    """Submaps of one robot on the line y = aside, a step of 1 m each second."""
     submaps = []
     for window in range(WINDOWS):
         keyframes = []

@@ -244,7 +244,6 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
 
 @pytest.fixture(scope="module")
 def slipping():
-    """A simulated team whose bases drive 10 % farther than their odometry."""
     world = SimulatedWorld(
         steps=840,
         step_s=0.25,

@@ -22,7 +22,6 @@ SIGMAS = (0.05, 0.01, 0.1)
 
 @cache
 def folds_of(seeds, claimed=1.0):
-    """Teams of four whose submaps claim `claimed` times their true variance."""
     folds: list[Fold] = []
     for seed in seeds:
         world = team(seed, robots=4, submaps=8, landmarks=8, reach=30.0, sigmas=SIGMAS)
@@ -33,7 +32,6 @@ def folds_of(seeds, claimed=1.0):
 
 
 def told(contribution, claimed):
-    """The submap with its covariance times `claimed`."""
     local = replace(contribution.local, covariance=claimed * contribution.local.covariance)
     return replace(contribution, local=local)
 

@@ -22,7 +22,6 @@ SPEED = 0.25
 
 
 def fast_team(biases: tuple[Bias, ...]) -> Scenario:
-    """Three robots that drive three times as fast as their odometry was calibrated for."""
     motion = MotionModel(
         forward=MotionNoise(per_m=0.01),
         turn=MotionNoise(per_m=0.02, per_rad=0.02),

@@ -20,7 +20,6 @@ from tests.sim.logs import scenario, streams, world_log
 
 
 def run(*arguments: object) -> tuple[int, str, str]:
-    """Exit status, standard output and standard error; a `LogError` as `main` prints it."""
     result = CliRunner().invoke(app, ["log", *map(str, arguments)], env={"COLUMNS": "80"})
     if isinstance(result.exception, LogError):
         return WRONG_USE, result.stdout, f"error: {result.exception}"
@@ -77,7 +76,7 @@ def test_a_log_that_is_cut_off_is_repaired(log, tmp_path):
     assert run("check", tmp_path / "cut.mcap")[0] == 1
     assert run("repair", tmp_path / "cut.mcap", "-o", tmp_path / "whole.mcap")[0] == 0
     status, out, _ = run("check", tmp_path / "whole.mcap")
-    assert (status, out) == (1, f"file: {NO_FINAL}\n")  # nobody knows what came after the cut
+    assert (status, out) == (1, f"file: {NO_FINAL}\n")  # the rest after the cut is unknown
     assert list(open_log(tmp_path / "whole.mcap").samples()) == published()
 
 

@@ -11,7 +11,6 @@ from tests.support import ROOT
 
 
 def message_in(said: str, status: object) -> str:
-    """The one message of a wrongly used command."""
     assert "Traceback" not in said
     assert status == WRONG_USE, said
     errors = [line for line in said.splitlines() if line.startswith("error: ")]

@@ -74,7 +74,7 @@ def test_what_is_written_is_read_again_to_the_last_bit(tmp_path):
     write_folder(world, tmp_path)
     again = read(tmp_path, *names)
     assert same(again.streams[1:], world.streams[1:])
-    assert "of itself" in str(again.streams[0].notes)  # all of them see r9, it too
+    assert "of itself" in str(again.streams[0].notes)  # all of them see r9, as r9 itself does
     assert same((again.landmark_ids, again.landmarks), (world.landmark_ids, world.landmarks))
 
 
@@ -375,7 +375,7 @@ def test_odometry_that_is_reset_or_has_a_wrong_row_goes_on_as_before(tmp_path, w
     assert stream.intervals.increments is not None
     expected = np.tile([0.05, 0.0, 0.0], (29, 1))
     if first == 1:
-        expected[:2] = 0.0  # nobody knows how it had moved before
+        expected[:2] = 0.0  # its earlier motion is unknown
     np.testing.assert_allclose(stream.intervals.increments, expected, atol=1e-9)
     assert "at which its pose jumps, by" in " ".join(stream.notes)
 

@@ -49,13 +49,11 @@ def simulated():
 
 @pytest.fixture
 def folder(tmp_path, simulated):
-    """A fresh data set of three robots."""
     write_utias(simulated, tmp_path / "MRCLAM_Dataset0")
     return tmp_path / "MRCLAM_Dataset0"
 
 
 def edited(path: Path, change: Callable[[list[str]], list[str]]) -> None:
-    """Change the rows of a file after its two comment lines."""
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:2] + change(lines[2:])) + "\n")
 
@@ -173,7 +171,7 @@ def test_measurements_that_mean_nothing_are_dropped_and_counted(folder):
         "50.2 101 1.0 0.0",  # the robot itself
         "50.3 106 0.0 0.0",  # no range
         "50.4 106 2.0 0.1",
-        "50.4 106 2.5 0.2",  # again, at the same time
+        "50.4 106 2.5 0.2",  # repeated at the same time
         "5000.0 106 2.0 0.1",  # long after the last odometry
         "5000.0 102 2.0 0.1",
     ]
@@ -400,7 +398,7 @@ def test_of_a_real_set_every_row_is_a_measurement_or_in_a_note(number, odometry_
         for stream in world.streams
     )
     intervals = sum(len(stream.intervals.end_ns) for stream in world.streams)
-    last_rows = len(world.streams)  # the last row of a robot has no next one that ends it
+    last_rows = len(world.streams)  # a robot's last row has no end
     assert intervals + last_rows + given + sum(counts) == odometry_rows + measurements
     for landmark in world.landmark_ids.tolist():
         assert abs(np.median(range_errors(world, landmark))) < 0.25

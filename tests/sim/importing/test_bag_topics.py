@@ -15,7 +15,6 @@ BACK = (0.0, 0.0, 1.0, 0.0)
 
 
 def odometry(topic: str, child: str, speed: float = 1.0) -> list[ros.Message]:
-    """Three poses along x."""
     told: list[ros.Message] = []
     for k in range(3):
         message = ros.odometry(k * S, ros.pose(speed * k), speed)

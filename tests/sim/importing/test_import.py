@@ -34,7 +34,6 @@ def read(path: Path) -> WorldStreams:
 
 
 def drive(robot: str = "") -> list[ros.Message]:
-    """Three poses, two scans and the truth."""
     at = f"/{robot}" if robot else ""
     poses = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.1), (2.0, 0.25, 0.2)]
     drove: list[ros.Message] = [

@@ -27,7 +27,6 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def made(command: str, folder: Path) -> None:
-    """Run `python examples/… NAME` of a page."""
     python, program, name = command.split()
     assert python == "python"
     subprocess.run([sys.executable, ROOT / program, name], cwd=folder, check=True)

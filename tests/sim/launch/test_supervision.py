@@ -17,8 +17,6 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 
 
 class Quiet(Child):
-    """A running process."""
-
     pid = 0
     exit = None
     is_stopped = is_computing = False
@@ -28,14 +26,10 @@ class Quiet(Child):
 
 
 class Stopped(Quiet):
-    """A stopped process."""
-
     is_stopped = True
 
 
 class Service(Supervised):
-    """The robot of this number."""
-
     def __init__(self, number: int) -> None:
         self.name, self.child = f"robot-r{number}", Quiet(100 + number)
 
@@ -54,7 +48,6 @@ class Team:
             self.watch.last_message[f"robot/r{k}"] = self.now
 
     def after(self, seconds: float) -> list[str]:
-        """Advance the clock and return the new notes."""
         self.now, known = self.now + seconds, len(self.watch.notes)
         self.silence.look(self.services, self.watch)
         return self.watch.notes[known:]
@@ -66,7 +59,7 @@ def test_of_many_silent_processes_one_line_says_how_many(monkeypatch):
     (said,) = team.after(11.0)
     assert "50 processes, robot-r0, robot-r1, robot-r2 among them, have sent no message" in said
     lines = 0
-    for k in range(100):  # an overloaded computer: each speaks now and then, at times of its own
+    for k in range(100):  # an overloaded computer: rare messages, at each one's times
         team.hears(k % 50)
         lines += len(team.after(1.0))
     assert lines <= 2
@@ -77,8 +70,6 @@ def test_of_many_silent_processes_one_line_says_how_many(monkeypatch):
 
 
 class Ending(Quiet):
-    """A process that has ended with this status."""
-
     def __init__(self, status: int) -> None:
         self.exit = status
 
@@ -96,8 +87,6 @@ def test_a_process_that_fails_five_times_is_given_up_whatever_it_says():
 
 
 class Refused(MemoryBus):
-    """A bus whose link to the router is refused."""
-
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         raise BusError("operator.pem has expired")
 

@@ -29,7 +29,6 @@ UNNAMED = {name: SEEN[name] for name in ("ranges", "bearings")}
 
 
 def moving(k: int, **fields: Any) -> m.Measurement:
-    """The k-th interval, of one second."""
     kind = m.Increment if "increment" in fields else m.Odometry
     return seeing(k, kind, duration_ns=SECOND, **fields)
 
@@ -39,7 +38,6 @@ def seeing(at_s: float, kind: type[m.Measurement], **fields: Any) -> m.Measureme
 
 
 def stream(measurements: Sequence[m.Measurement]) -> list[m.Message]:
-    """Number by time, the initial pose first."""
     begin = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
     kinds = m.AnyOdometry
     ordered = sorted(measurements, key=lambda each: (each.stamp_ns, isinstance(each, kinds)))

@@ -77,7 +77,7 @@ def test_every_recomputable_message_of_a_run_comes_out_again(log):
     silent = {ch.SIGHTING_FACTOR.name, ch.CENTRAL_POSE.name, ch.ASSOCIATION.name}
     recomputable = {
         c.name for c in ch.CHANNELS if c.recomputable and not c.name.startswith("team_")
-    } | {ch.TEAM_POSE.name}  # the others are what peers say
+    } | {ch.TEAM_POSE.name}  # the others are messages between peers
     assert counts(result).keys() == recomputable - silent
     assert counts(result)["submap"] == (12, 12)
     assert verify(log, processes=2) == result
@@ -191,7 +191,7 @@ def restless(seed: int, *, cache: int | None = None, dies: bool = False) -> Team
     robots = [stream("r1", 40), stream("r2", 40, y=1.0)]
     team = Team(world_of(*robots), [config("r1"), config("r2")], random.Random(seed))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("teamslam.sim.publisher.node.BATCH", 4)  # the world is not at its end so soon
+        patch.setattr("teamslam.sim.publisher.node.BATCH", 4)  # the world has not ended yet
         while len(team.sent[ch.SUBMAP.key("r1")]) < 3:
             assert team.step()
         team.kill("r1", patience=not dies)
@@ -285,7 +285,7 @@ def final(samples: list[Sample]) -> bytes:
 def test_without_a_robot_the_map_is_that_of_a_team_that_never_had_it(log, samples):
     run = changed_run(log, Changes(without=("r2",)))
     assert messages(run, ch.SUBMAP, "r1") == messages(samples, ch.SUBMAP, "r1")
-    alone = team_samples(thesis(STEPS, robots=1))  # there nobody is sighted: fewer measurements
+    alone = team_samples(thesis(STEPS, robots=1))  # without sightings: fewer measurements
     (one,), (other,) = (messages(each, ch.FINAL_MAP) for each in (run, alone))
     assert (one.means, one.covariance) == (other.means, other.covariance)
     assert one.members == other.members == build.version(r1=STEPS // 10 - 1)

@@ -57,7 +57,6 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
 
 
 def rows_of(page: str, cls: type[msgspec.Struct]) -> dict[str, list[str]]:
-    """Cells of the table below the heading that names the class, by field."""
     section = page.partition(f": `{cls.__name__}`\n")[2].partition("\n## ")[0]
     cells = [line.strip("| ").split(" | ") for line in section.splitlines() if "| `" in line[:3]]
     return {name.strip("`"): rest for name, *rest in cells}

@@ -141,7 +141,6 @@ def test_a_clock_offset_that_the_robot_does_not_know_is_found_out():
 
 
 def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
-    """Submaps of the robot's stream, without a centre."""
     sent = driven(RobotNode(robot), published(world.streams[0]))
     return [each.message for each in sent if isinstance(each.message, m.Submap)]
 

@@ -43,7 +43,6 @@ def of_name(estimator, **options):
 
 
 def fed(member, measurements=MEASUREMENTS):
-    """All new messages, in order."""
     driven = []
     for measurement in measurements:
         if isinstance(measurement, m.Observations):

@@ -20,7 +20,6 @@ from tests.teams import config, published, stream
 
 
 def team_run(world, fusion, estimator, steps):
-    """Run a team in memory with few particles, on which the measurements do not depend."""
     scenario = with_options(load(world), fusion=fusion, estimator=estimator)
     robots = tuple(
         msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, particles=50))
@@ -58,7 +57,6 @@ MEASUREMENTS = {"r1": published(stream("r1", 9)), "r2": published(stream("r2", 7
 
 
 def heard(configs, **options):
-    """A team's measurements at the centre, one after the other."""
     node = make_centre(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():

@@ -13,7 +13,6 @@ from tests.estimation.submap_world import correlated
 
 
 def one(x, variance, id_=1):
-    """A map of one landmark with this x; y is 0 with variance 1."""
     return LandmarkGaussian(
         np.array([id_], np.uint32), np.array([[x, 0.0]]), np.diag([variance, 1.0])
     )
