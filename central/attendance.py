@@ -16,9 +16,8 @@ MOST_NOTED = 1_000
 class Attendance:
     """The progress and presence of one robot at the centre.
 
-    done: the accepted one of the `Done` messages `dones`. began: the latest incarnation that has
-    begun; 0: none. head: the newest of its driver, in a live team. driver: whether that is present;
-    None: unknown.
+    done: the accepted one of the `Done` messages `dones`. began: the latest incarnation; 0: none.
+    head: its driver's newest; driver: whether that is present; None: unknown.
     """
 
     alive: bool = False
@@ -117,8 +116,8 @@ class TeamAttendance:
     """Progress and presence of each robot of the team.
 
     now_ns: the newest team time in any message. world_end: the world's last counters. ends: all
-    announced ends, refused ones included; one that the robots' `Done` messages confirm becomes
-    world_end. ordered: an operator has ordered the live team to end.
+    announced ends; one that the robots' `Done` messages confirm becomes world_end. ordered: an
+    operator has ordered the live team to end.
     """
 
     robots: dict[str, Attendance]
@@ -142,7 +141,7 @@ class TeamAttendance:
     def of(
         cls, robots: Sequence[str], has_received: HasReceived, processed: Processed
     ) -> "TeamAttendance":
-        """Create the attendance of a team at its start."""
+        """Create a team's attendance."""
         return cls({robot: Attendance() for robot in sorted(robots)}, has_received, processed)
 
     def admit(self, robot: str) -> None:
@@ -151,14 +150,14 @@ class TeamAttendance:
         self._changed.add(robot)
 
     def forget_members(self) -> None:
-        """Forget `Done` and `GivenUp`, members of a set that is filed again."""
+        """Forget `Done` and `GivenUp`, which are filed again."""
         for robot in self.robots.values():
             robot.done, robot.given_up = None, False
             robot.dones.clear()
         self._changed.update(self.robots)
 
     def take(self, message: m.Message) -> None:
-        """Update the attendance from a message; messages of strangers are ignored."""
+        """Update the attendance from a message of the team."""
         self.note_change(message)
         match message:
             case m.Submap() | m.MapEstimate():
@@ -194,7 +193,7 @@ class TeamAttendance:
                 pass
 
     def note_change(self, message: m.Message) -> None:
-        """Note that the state of a message's robot may have changed."""
+        """Note that a message's robot may have changed."""
         name = getattr(message, "robot", None) or getattr(message, "node", "").rpartition("/")[2]
         if name in self.robots:
             self._changed.add(name)
@@ -216,13 +215,12 @@ class TeamAttendance:
 
     @property
     def is_live(self) -> bool:
-        """Whether drivers, not a world, publish the measurements and ends."""
+        """Whether drivers, not a world, publish."""
         return self.ordered or self._has_head
 
     @property
     def end(self) -> m.End | None:
-        """The last counters of all streams, from a world or from every driver; None while one is
-        open.
+        """The last counters of all streams; None while one is open.
 
         In a live team that was ordered to end, a robot without a driver ends where it is done.
         """
@@ -246,7 +244,7 @@ class TeamAttendance:
         return self.ordered and not self.robots[name].began
 
     def is_complete(self, name: str) -> bool:
-        """Whether the robot is done and all its messages have been processed."""
+        """Whether the robot is done and its messages are processed."""
         done = self.robots[name].done
         return (
             done is not None
@@ -271,8 +269,8 @@ class TeamAttendance:
         return None
 
     def is_settled(self, name: str) -> bool:
-        """Whether the final map need not wait for this robot: all its submaps arrived, it was given
-        up, or it was withdrawn and is offline.
+        """Whether the final map need not wait for this robot: complete, given up, or withdrawn and
+        offline.
 
         It waits for a lost robot, whose return must not change the map.
         """
@@ -297,7 +295,7 @@ class TeamAttendance:
         ]
 
     def awaited(self) -> list[str]:
-        """The absent robots that the final map waits for."""
+        """The absent robots that the map awaits."""
         return [r for r, a in self.robots.items() if not (a.alive or self.is_settled(r))]
 
     def _is_last_incarnation(self, name: str, incarnation: int) -> bool:

@@ -27,11 +27,10 @@ Pose = Float[np.ndarray, "3"]
 class CarriedOff(NamedTuple):
     """A motion of a robot that its odometry did not measure.
 
-    before, after: numbers of the submaps around it. begin_ns, end_ns: end of the former and
-    beginning of the latter, equal where no submap is between. by: the motion in the map's frame (x
-    [m], y [m], turn [rad]); empty until the later part has a place there. in_all: `by` includes the
-    robot's own motion in a spoilt submap. evidence: log-likelihood ratio. place: (x, y) [m] in the
-    map.
+    before, after: the submaps around it. begin_ns, end_ns: end of the former, beginning of the
+    latter. by: the motion in the map's frame (x [m], y [m], turn [rad]), once the later part has a
+    place there. in_all: `by` includes the robot's own motion in a spoilt submap. evidence:
+    log-likelihood ratio. place: (x, y) [m].
     """
 
     robot: str

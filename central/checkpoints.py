@@ -17,8 +17,8 @@ NEAR = 4
 class Checkpoint:
     """The fold after a tick.
 
-    tested: number of submaps when suspects were last tested. number: count of folded ticks. ahead:
-    the same fold condensed, for the next tick.
+    tested: number of submaps at the last test of suspects. number: of folded ticks. ahead: the same
+    fold condensed, for the next tick.
     """
 
     tick: int
@@ -58,7 +58,7 @@ class Checkpoints:
         self.kept = (*(replace(each, ahead=None) for each in keep[:-NEAR]), *keep[-NEAR:])
 
     def condense(self, fold: Fold, limits: Limits) -> Fold:
-        """Condense a fold; that of the newest checkpoint is condensed once."""
+        """Condense a fold, the newest checkpoint's once."""
         *before, last = self.kept or (None,)
         if last is None or last.fold is not fold:
             return condense_submaps(fold, limits)

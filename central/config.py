@@ -59,32 +59,10 @@ class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The fusion rule and its parameters.
+    """The fusion rule and its parameters; docs/scenario.md describes every field.
 
-    fusion: `join` joins submaps by least squares; `teamslam.team.pairs` lists the inputs of the
-    others. Rules with feedback but `covariance-intersection` count measurements more than once in
-    the robots' covariance. tick_s: team time that is folded at once. broadcast_s: least team time
-    between two maps. batch_robust_c: for `batch` and `batch-reference`, scale of the Cauchy loss on
-    sqrt(chi2) of each measurement; absent: plain squares. landmark_submaps: number of consistent
-    submaps that a landmark needs to enter the map; above 1 where outliers are expected.
-    covariance_factor: scales the submaps' covariances; 1 for independent errors. normal_scale: the
-    monitor's covariance scale where covariances are right; below 1 where part of the errors
-    outlasts a window. particles: of `joint-fastslam`.
-
-    bias_sigma: of the errors whose sensitivities robots send. common_bias_sigma: of the part that
-    all robots share, in addition. joined_ranges: for errors proportional to the range, weight a
-    submap's landmarks by the range in the joined map; by the measured range short measurements
-    weigh more and the map shrinks. landmark_sigma [m]: standard deviation, per direction, of the
-    point that all robots measure about the landmark's place (the front of a cylinder); added to the
-    map's covariance. withdraw_above: a robot is withdrawn if the cost of the team's submaps per
-    degree of freedom exceeds this with it, and the rest of the team agrees without it and without
-    no other robot; absent: by an operator only. least_sigma: least standard deviations [m, rad] of
-    one submap, which raise smaller ones; 0: none. bounds: submaps, inter-robot measurements and
-    initial poses beyond them are refused. association: thresholds for merging landmarks without
-    identities, by kind of sensor. surveyed: landmarks at known places, which fix the team's frame.
-    datum: latitude and longitude of that frame's origin (x east, y north), for results in degrees.
-    classes: names of the classes 0, 1, …, in tables and reports. localise: localise robots in the
-    loaded saved map, which stays as it is; under `join`.
+    `teamslam.team.pairs` lists the inputs of each rule. Rules with feedback but
+    `covariance-intersection` count measurements more than once in the robots' covariance.
     """
 
     fusion: FusionRule = "join"

@@ -208,7 +208,7 @@ def _student(sigmas: float, freedom: float) -> float:
 
 
 def clock_remedy(late_s: float) -> str:
-    """Describe the remedy for detections that are stamped late by so much."""
+    """Describe the remedy for late stamps of detections."""
     return _CLOCK.format(value=late_s)
 
 
@@ -337,7 +337,7 @@ def widening(found: Sequence[m.Diagnosis]) -> float:
 
 
 def describe(found: m.Diagnosis) -> str:
-    """Describe a cause in a sentence, with its figures and the remedy."""
+    """Describe a cause, with figures and remedy."""
     return f"{_statement(found)}: {found.remedy}"
 
 

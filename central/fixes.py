@@ -1,9 +1,9 @@
 """Warnings about fixes that contradict the map, with a delay or antenna that explains them.
 
 At a pose node (p, θ) with velocity v, a fix z of the antenna a with covariance σ² I leaves e =
-R(θ)ᵀ (z − p) − a. Fixes late by δ, of an antenna off by b, have e = b − δ v. Weighted least squares
-give (b, δ) with covariance, scaled by the remaining residuals. The map follows its fixes in part,
-so an error is rather larger than the estimate.
+R(θ)ᵀ (z − p) − a. Fixes late by δ, of an antenna off by b, have e = b − δ v: weighted least squares
+give (b, δ), with covariance scaled by the remaining residuals. The map follows its fixes in part:
+estimates are rather small.
 """
 
 import math

@@ -112,11 +112,11 @@ class Members:
         return any(key[1] not in gone for key in self._ticks[tick])
 
     def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
-        """List the submaps of a tick in canonical order, without withdrawn robots."""
+        """List the remaining robots' submaps of a tick in canonical order."""
         return sorted(key for key in self._ticks[tick] if key[1] not in gone)
 
     def contribution(self, key: Key) -> Contribution:
-        """Decode a submap, with its covariance raised to the least one."""
+        """Decode a submap, its covariance raised to the least."""
         found = self._made.get(key)
         if found is None:
             found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
@@ -136,7 +136,7 @@ class Members:
         return found
 
     def raised(self, gone: Collection[str]) -> Mapping[str, int]:
-        """Count, by robot, the decoded submaps with a raised covariance."""
+        """Count, by robot, the decoded submaps of raised covariance."""
         robots = sorted(key[1] for key in self._raised if key[1] not in gone)
         return Counter(robots)
 
@@ -194,7 +194,7 @@ class FoldInputs:
             self._add_known(*survey_of(config.surveyed))
 
     def add_start(self, start: InitialPoseFactor) -> None:
-        """Add a stream's initial pose, before its first submap."""
+        """Add a stream's initial pose, before its submaps."""
         self._starts[(start.robot, start.incarnation)] = start
 
     def add_submap(

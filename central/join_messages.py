@@ -140,9 +140,9 @@ def _landmarks(
 class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
-    Left out: undecided, possible duplicates of a shown one; weak, observed only by submaps of a
-    poorly known heading; missed, by nearly all submaps that look there; those of `repeated` parts
-    of the map. headings: largest heading standard deviation [rad] of each lost stream.
+    Left out: undecided, possible duplicates of a shown one; weak, only of a poorly known heading;
+    missed, by nearly all submaps that look there; `repeated` parts of the map. headings: largest
+    heading standard deviation [rad] of each lost stream.
     """
 
     ids: Sequence[int] = ()

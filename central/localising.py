@@ -1,8 +1,8 @@
 """Localise robots in a saved map, which stays unchanged (`localise`).
 
-Landmarks that the saved map lacks are left out of the robots' submaps, which is their marginal.
-Robots have no start, so the frame is the map's. The published map is the saved one; priors and
-paths are those of the joint solution.
+The robots' submaps are their marginals without landmarks that the saved map lacks. Robots have no
+start: the frame is the map's. The published map is the saved one; priors and paths are those of the
+joint solution.
 """
 
 from collections.abc import Iterable

@@ -23,11 +23,10 @@ _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTI
 
 
 class StoredSet:
-    """A centre's set on disk: the messages of robots and operators, each once (format:
-    `teamslam.team.peers.set_file`).
+    """A centre's set on disk: the messages of robots and operators
+    (`teamslam.team.peers.set_file`).
 
-    A restarted centre continues from it: no member is sent again, and the map is the same. Raises
-    SetFileError.
+    A restarted centre continues from it with the same map. Raises SetFileError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,17 +37,17 @@ class StoredSet:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The members missing in the file, for the centre's status."""
+        """The members missing in the file."""
         return self._keeper.warnings
 
     def samples(self) -> list[Sample]:
-        """Return the members in the file as samples that arrive now."""
+        """Return the members as samples that arrive now."""
         now_ns, found = time.time_ns(), self._found
         self._found = []
         return [member.as_sample(now_ns) for member in found]
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Store the valid and new members among these samples."""
+        """Store valid and new members."""
         news = []
         for sample in samples:
             found = ch.channel_of(sample.key)
@@ -86,7 +85,7 @@ class CentralShell:
     """The centre's process: it subscribes, answers requests for its set, runs, and leaves last.
 
     patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
-    that the scenario does not name. store: file of the set. maps: saved maps of earlier days.
+    that the scenario does not name. store: file of the set. maps: saved maps.
     """
 
     def __init__(
@@ -118,7 +117,7 @@ class CentralShell:
         self._orders_due = 0.0
 
     def run(self) -> None:
-        """Run until the final map is out and the others have left."""
+        """Run until the final map, and leave last."""
         for channel in self.node.listens:
             self._bus.subscribe(channel)
         self._bus.watch_alive()

@@ -78,7 +78,7 @@ class MapPublisher:
         return self._publish_whole(closed_ns, now_ns)
 
     def publish_final(self, now_ns: int) -> list[Outgoing]:
-        """Make the last messages, with the final map after all others."""
+        """Make the last messages, the final map last."""
         return self._publish("final", math.inf, now_ns)
 
     def _is_due(self, closed_ns: float, now_ns: int) -> bool:
@@ -88,10 +88,8 @@ class MapPublisher:
         return self._has_news(closed_ns)
 
     def _publish_closed(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish the map of the closed ticks, or of the whole set if that has more submaps.
-
-        A teammate's new submap helps at once the robots that measure the same landmarks. No map has
-        less than the one before it.
+        """Publish the map of the closed ticks, or of the whole set if that has more submaps: a
+        teammate's new submap helps at once, and no map has less than the one before it.
         """
         ticks_end_ns = closed_ns
         if math.isfinite(closed_ns):  # a tick has the submaps that end in (a, b]

@@ -61,9 +61,8 @@ NOTHING = Finding({}, ())
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     """Describe where the team's data contradict the models of all robots.
 
-    Odometry and ranges both determine the size of a map. Where they contradict, the robots' range
-    scales, each held near its model's, move in one direction: their mean shows it, the joint cost
-    hardly.
+    Where odometry and ranges contradict each other about the size of a map, the robots' range
+    scales move in one direction: their mean shows it, the joint cost hardly.
     """
     ranges = _mean_of(biases, "range_scale")
     if ranges is None:
@@ -89,9 +88,8 @@ def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
 def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) -> Finding:
     """Compute the team's and every robot's figures, and the scales out of bounds.
 
-    normal: the right covariance scale, to which the reported one is relative. final: only the final
-    map reports too large covariances, since before a loop closure a robot's submaps hardly
-    contradict each other.
+    normal: the right covariance scale. final: only the final map reports too large covariances:
+    before a loop closure a robot's submaps hardly contradict each other.
     """
     figures = {}
     if agreement.dof >= 1.0:

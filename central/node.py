@@ -37,9 +37,9 @@ MOST_ROBOTS = 100
 class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
-    inputs: the channels of the set. fold_class: of its fold. announcement: the configuration, whose
-    digest maps carry. admit: a robot that the scenario does not name joins when it, or its driver,
-    appears. warnings: failures in words, the newest last.
+    inputs: the channels of the set. announcement: the configuration, whose digest maps carry.
+    admit: a robot that the scenario does not name joins when it, or its driver, appears. warnings:
+    failures in words, the newest last.
     """
 
     inputs: ClassVar[tuple[ch.Channel, ...]] = (
@@ -92,7 +92,7 @@ class CentralNode:
         return tuple(dict.fromkeys((*self.inputs, *own, *others)))
 
     def load_maps(self, maps: Sequence[m.SavedMap]) -> None:
-        """Load saved maps of earlier days, before `begin`."""
+        """Load saved maps, before `begin`."""
         self._loaded = tuple(maps)
 
     def begin(self) -> list[Outgoing]:
@@ -143,9 +143,8 @@ class CentralNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue after an exception in `handle`, and give the sender the credit.
 
-        A member that could not be filed counts as refused. A running map that raises does not
-        affect the final one; the newest computable map replaces a final one that raises,
-        provisional and with the reason.
+        A member that could not be filed counts as refused. The newest computable map replaces a
+        final one that raises, provisional and with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)
@@ -237,7 +236,7 @@ class CentralNode:
         return self.maps.publish_newest(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_final(self) -> list[Outgoing]:
-        """Make the last messages, with the final map after all others."""
+        """Make the last messages, the final map last."""
         return self.maps.publish_final(self.attendance.now_ns)
 
     def _counted(self, out: list[Outgoing]) -> list[Outgoing]:
@@ -253,12 +252,12 @@ class CentralNode:
     # Conclude.
 
     def has_received(self, done: m.Done) -> bool:
-        """Whether every input announced in a robot's `Done` has arrived."""
+        """Whether every input in a robot's `Done` has arrived."""
         return self.store.processed((done.robot, done.incarnation)) >= done.submaps
 
     @property
     def has_all_measurements(self) -> bool:
-        """Whether all raw measurements for the centre have arrived: it consumes none."""
+        """Whether all raw measurements have arrived: the centre consumes none."""
         return True
 
     @property
@@ -301,7 +300,7 @@ class CentralNode:
 
     @property
     def awaited(self) -> list[str]:
-        """The absent robots that the final map waits for."""
+        """The absent robots that the map awaits."""
         return [] if self.finished else self.attendance.awaited()
 
     @property
@@ -310,7 +309,7 @@ class CentralNode:
         return self.attendance.end is not None
 
     def requests(self) -> list[m.MeasurementsRequest]:
-        """Requests for missing raw measurements: the centre consumes none."""
+        """Requests for raw measurements: the centre consumes none."""
         return []
 
     def lacking(self) -> list[m.SubmapsRequest]:
@@ -332,7 +331,7 @@ class CentralNode:
         ]
 
     def answer_submaps(self, request: bytes) -> Iterable[bytes]:
-        """Answer a `SubmapsRequest` with a robot's members, its latest incarnation first."""
+        """Answer with a robot's members, the latest incarnation first."""
         robot = decoded(request, m.SubmapsRequest).robot
         return [encoded(message) for message in self.store.messages_of(robot)]
 
@@ -397,7 +396,7 @@ def _stream_of(member: m.Submap | m.SightingFactor) -> Stream:
 
 
 def node_class(config: CentralConfig) -> type[CentralNode]:
-    """Return the node class of the configured fusion rule; raises NotInstalledError."""
+    """Return the fusion rule's node class; raises NotInstalledError."""
     found: type[CentralNode] = load(
         RULES[config.fusion].made_by, f"the fusion rule {config.fusion}"
     )
@@ -411,7 +410,7 @@ def make_centre(
     admit: bool = False,
     maps: Sequence[m.SavedMap] = (),
 ) -> CentralNode:
-    """Make the node of the configured fusion rule; raises NotInstalledError."""
+    """Make the fusion rule's node; raises NotInstalledError."""
     centre = node_class(config)(config, robots, admit=admit)
     centre.load_maps(maps)
     return centre

@@ -204,8 +204,8 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     """List the state of each landmark against the saved maps in the main island, by number.
 
     Of several maps the one with the largest change counts. A landmark that one submap places
-    elsewhere, while none sees it at its former place beyond chance, is gone: a single wrong number
-    does not move it.
+    elsewhere, while none sees it at its former place, is gone: a single wrong number does not move
+    it.
     """
     if fold.main_key is None:
         return ()

@@ -1,10 +1,8 @@
 """Select the robots that need a prior: those it gives information from teammates (moved landmarks,
 inter-robot measurements), or landmarks that they come near to.
 
-A robot joins its last prior with its later submaps, and priors are most of the centre's traffic.
-
-A robot outside the team's map gets the landmarks alone by the same rule, as if at the origin, or
-one message that withdraws its earlier priors, also from a restarted centre.
+Priors are most of the centre's traffic. A robot outside the team's map gets the landmarks alone, as
+if at the origin, or one message that withdraws its earlier priors, also from a restarted centre.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -40,8 +38,8 @@ NEVER = -1
 class _Sent:
     """The map of a robot's last prior and the landmarks in it.
 
-    encounter_ns: team time of the newest inter-robot measurement of or by the robot. since: number
-    of later broadcasts. frame: the team's, then. alone: without a pose.
+    encounter_ns: of the newest inter-robot measurement of or by the robot. since: number of later
+    broadcasts. frame: the team's, then. alone: without a pose.
     """
 
     blocks: LandmarkBlocks

@@ -105,8 +105,8 @@ class SubmapFold:
     ) -> list[Outgoing]:
         """Make a map of the stored set and the messages that accompany it.
 
-        The final map is the full solution, and the last message. Others have the ticks up to
-        `closed_ns` and, with `ahead`, all later ones.
+        The final map is the full solution. Others have the ticks up to `closed_ns` and, with
+        `ahead`, all later ones.
         """
         self._file_members()
         ticks, self._accused = self._ticks, {}
@@ -178,7 +178,7 @@ class SubmapFold:
 
     @property
     def convicted(self) -> Mapping[str, str]:
-        """The robots that the fold has withdrawn, with the reason in words."""
+        """The robots withdrawn by the fold, with the reason."""
         return self._ticks.convicted
 
     @property

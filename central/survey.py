@@ -62,8 +62,7 @@ def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -
     """Return the datum of a map's frame: the configuration's, else that of a loaded map in the
     survey's frame.
 
-    None where the frame is not absolute, or a landmark is farther than FARTHEST_M, as with
-    coordinates of a national grid.
+    None where a landmark is farther than FARTHEST_M, as with coordinates of a national grid.
     """
     places = floats(fused.means, "means")
     if fused.frame != SURVEY_FRAME or np.abs(places).max(initial=0.0) > FARTHEST_M:

@@ -13,13 +13,12 @@ KeyChunk = Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 
 
 class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """A scenario without its world: every robot and the centre have the seed, estimator and rule.
+    """A scenario without its world: every robot and the centre have the seed, estimator and rule
+    (docs/scenario.md).
 
-    team: the chunk of the keys `team/<team>/…` that separates two teams on one network. exchange:
-    with "rendezvous" a robot sends its submaps only when it observes a teammate or is observed.
-    peers: every robot keeps and folds the team's set (docs/without_a_centre.md). centre: whether
-    there is a central computer; else robots are peers. Fields of a world alone are ignored in
-    decoding.
+    team: the chunk of the keys `team/<team>/…` that separates two teams. exchange: with
+    "rendezvous" submaps are sent at encounters only. peers: every robot folds the team's set
+    (docs/without_a_centre.md). Fields of a world are ignored in decoding.
     """
 
     name: KeyChunk
@@ -35,7 +34,7 @@ class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def team_config(text: str) -> TeamConfig:
-    """Decode the team of a resolved scenario in JSON; raises ValueError."""
+    """Decode a resolved scenario in JSON; raises ValueError."""
     try:
         return msgspec.json.decode(text, type=TeamConfig)
     except (msgspec.MsgspecError, UnicodeEncodeError) as error:

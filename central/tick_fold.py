@@ -75,7 +75,7 @@ the running fold.
 
 
 def join_settings(config: CentralConfig) -> JoinSettings:
-    """Return the join's settings of a centre's configuration."""
+    """Return a centre's settings of the join."""
     return JoinSettings(
         iterations_per_tick=config.gauss_newton_per_tick,
         covariance_factor=config.covariance_factor,
@@ -95,8 +95,8 @@ class TickFold:
     """Folds a set of submaps tick by tick.
 
     limits: sizes for condensing; None: never. inputs: those of another fold, read only. convicts:
-    whether the fold withdraws robots by itself. undecided: in words, contradictory robots of the
-    last test, with the wrong one undetermined.
+    whether the fold withdraws robots by itself. undecided: contradictory robots with the wrong one
+    undetermined.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class TickFold:
     # Inputs.
 
     def add_start(self, start: InitialPoseFactor) -> None:
-        """Add a stream's initial pose, before its first submap."""
+        """Add a stream's initial pose, before its submaps."""
         self._inputs.add_start(start)
 
     def add_submap(
@@ -194,7 +194,7 @@ class TickFold:
 
     @property
     def convicted(self) -> Mapping[str, str]:
-        """The robots that the fold has withdrawn, with the reason in words."""
+        """The robots withdrawn by the fold, with the reason."""
         return self._conviction.withdrawn
 
     @property
@@ -208,7 +208,7 @@ class TickFold:
 
     @property
     def withdrawn(self) -> tuple[str, ...]:
-        """The withdrawn and suspended robots, which the fold leaves out."""
+        """The withdrawn and suspended robots."""
         return tuple(sorted(self._gone))
 
     @property
@@ -293,7 +293,7 @@ class TickFold:
         one.
 
         at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
-        of the map, so a fold that withdraws no robot computes it, too.
+        of every final map.
         """
         self.undecided = ""
         if not self._tries and math.isfinite(at):
@@ -366,8 +366,8 @@ class TickFold:
         """Fold each robot's submaps by themselves where joining them contradicts.
 
         It does where a robot's disagreement with the team exceeds the limit, and as many times its
-        disagreement alone: too small covariances are no contradiction. A fold in another frame than
-        the team's is empty. ahead: with the ticks that are not closed.
+        disagreement alone. A fold in another frame than the team's is empty. ahead: with the ticks
+        that are not closed.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
@@ -395,7 +395,7 @@ class TickFold:
     # Solutions beyond the closed ticks.
 
     def fold_ahead(self) -> Fold:
-        """Return the provisional fold: all inputs, those ahead of the watermark included."""
+        """Return the fold of all inputs, provisional ones included."""
         fold = self.fold
         for tick in self._open_ticks():
             fold = self._fold_tick(fold, tick)
@@ -404,8 +404,7 @@ class TickFold:
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
         """Find the robot that contradicts the rest in a provisional fold, with the reason.
 
-        None where nothing is ahead of the watermark: closed ticks have their own test. A trial's
-        result holds until the set has grown by GROWTH.
+        Closed ticks have their own test. A trial's result holds until the set has grown by GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
@@ -456,13 +455,13 @@ class TickFold:
 
     @property
     def raised(self) -> Mapping[str, int]:
-        """Number of folded submaps with a raised covariance, by robot."""
+        """Number of submaps with a raised covariance, by robot."""
         return self._inputs.raised(self._gone)
 
     # The names of a fold.
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
-        """Digest the fold's set: starts and submaps in canonical order, and `more`."""
+        """Digest the fold's set and `more`."""
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:

@@ -216,8 +216,8 @@ def _contradict_alone(
 ) -> int:
     """Count the robots whose submaps disagree when alone, by more than the rest may.
 
-    Of two such robots one is left whoever is left out. A fold of each suspect finds noise that the
-    team states too small.
+    Of two such robots one is left whoever is left out. Noise that the team states too small shows
+    here.
     """
     if len(robots) < 2:
         return 0

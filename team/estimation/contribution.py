@@ -116,7 +116,7 @@ class RobotBias(NamedTuple):
 class OwnBiases:
     """Errors o of single robots in a saved map: given the errors b that all robots share,
 
-    o ~ N(mean + Gᵀ b, covariance), cov(o, landmarks) = cross.
+        o ~ N(mean + Gᵀ b, covariance),   cov(o, landmarks) = cross.
 
     errors: ascending. by_common: G, a row for each of the map's `biases`. likeliest, evidence: the
     likelihood N(likeliest, evidence⁻¹) of (b, o) without their priors.

@@ -21,9 +21,9 @@ it.
 class Ledger:
     """The number of an incarnation's measurements by their disposition.
 
-    used: of a measurement that the estimator takes. It is counted on arrival; the closing window
-    lists those not used after all, so scans and inter-robot measurements are stored until then.
-    on_disposition: receives each.
+    used: of a measurement that the estimator takes, counted on arrival. Scans and inter-robot
+    measurements are stored until the closing window lists those not used. on_disposition: receives
+    each.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Ledger:
         self._sighted: set[int] = set()
 
     def count(self, measurement: m.Measurement, rejected: Rejection | None) -> None:
-        """Count one more measurement: rejected for this reason, or used."""
+        """Count a measurement: rejected for this reason, or used."""
         number, disposition = measurement.number, self.used
         if rejected is not None:
             disposition = rejected.disposition
@@ -75,7 +75,7 @@ class Ledger:
         self._detections.clear()
 
     def close(self, closed: ClosedWindow) -> None:
-        """Recount the measurements that a closed window could not use."""
+        """Recount the measurements that a closed window rejects."""
         self.leave_out(set().union(*(each.measurements for each in closed.sightings)))
         if closed.late:
             self._reject(self._last_scans(closed.late), Rejection.LATE, self.used)
@@ -91,16 +91,16 @@ class Ledger:
         self._detections.clear()
 
     def leave_out(self, used: set[int]) -> None:
-        """Recount the inter-robot measurements of the window that reached no pose node."""
+        """Recount inter-robot measurements that reached no pose node."""
         self._reject(sorted(self._sighted - used), Rejection.NO_NODE, IN_SIGHTING)
         self._sighted.clear()
 
     def uncover(self, count: int) -> None:
-        """Recount the last scans of a stream, which are behind all odometry."""
+        """Recount a stream's last scans, behind all odometry."""
         self._reject(self._last_scans(count), Rejection.NOT_COVERED, self.used)
 
     def entries(self) -> tuple[m.Disposition, ...]:
-        """The dispositions as the robot's `Done` reports them."""
+        """The dispositions for the robot's `Done`."""
         return tuple(
             m.Disposition(disposition=name, measurements=count)
             for name, count in sorted(self.counts.items())

@@ -98,7 +98,7 @@ class RobotShell:
         self.look_for_gaps()
 
     def look_for_gaps(self) -> None:
-        """Ask the source for missing measurements of the stream."""
+        """Ask the source for missing measurements."""
         requested = self.node.request()
         self._missing.look(() if requested is None else (requested,))
         if self._doubted and time.monotonic() >= self._ends_due_s:
@@ -217,10 +217,8 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Drop the ends and initial poses that the source does not confirm.
-
-        A new incarnation ends the one before it, so it begins only with the source's initial pose.
-        Without a source (a replayed log) the message alone counts.
+        """Drop the ends and initial poses that the source does not confirm: a new incarnation ends
+        the one before. Without a source (a replayed log) the message alone counts.
         """
         passed = []
         for sample in samples:

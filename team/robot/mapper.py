@@ -51,11 +51,8 @@ class Mapper:
     """Hybrid-SLAM on one incarnation of a robot's stream after the other.
 
     Call `begin` with an initial pose, `take` for each measurement in order, and `finish`; messages
-    are appended to `out`.
-
-    ledger: law 1's account. submaps: all closed ones. warnings: what is implausible. gated:
-    measurements that no others of their window confirmed. now_ns: the latest stamp. passed_ns: no
-    further window ends until then.
+    are appended to `out`. gated: measurements that no others of their window confirmed. now_ns: the
+    latest stamp. passed_ns: no further window ends until then.
     """
 
     used = "in a submap"
@@ -133,7 +130,7 @@ class Mapper:
         self.now_ns = self.passed_ns = last.stamp_ns
 
     def finish(self) -> bool:
-        """End the incarnation; returns whether that closed a last window."""
+        """End the incarnation; return whether that closed a window."""
         self.passed_ns = self.now_ns
         closed, uncovered = self._slam.finish()
         if closed is not None:
@@ -146,7 +143,7 @@ class Mapper:
     # A measurement.
 
     def take(self, measurement: m.Measurement) -> bool:
-        """Take the next measurement; returns whether it closed a window."""
+        """Take the next measurement; return whether it closed a window."""
         self._taking = measurement
         self.note_input(measurement.number)
         if isinstance(measurement, m.AnyOdometry):
@@ -174,7 +171,7 @@ class Mapper:
         self._taking = None
 
     def drive(self, measurement: m.AnyOdometry) -> bool:
-        """Take an odometry interval; returns whether it closed the window."""
+        """Take an odometry interval; return whether it closed the window."""
         before_ns = self._slam.last_keyframe_ns
         interval, rejected = self.judge_interval(measurement)
         closed = None
@@ -327,7 +324,7 @@ class Mapper:
         return True
 
     def repeat_window(self) -> None:
-        """Compute the open window again from its measurements."""
+        """Compute the open window again."""
         self._reopen_window()
         for measurement in self._window:
             self.note_input(measurement.number)
@@ -354,11 +351,11 @@ class Mapper:
         self._slam.last_measurement = number
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; returns the reason if it is rejected."""
+        """Take a scan, or return the reason to reject it."""
         return self._slam.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
-        """Take inter-robot measurements; returns the reason if they are rejected."""
+        """Take inter-robot measurements, or return the reason to reject them."""
         return self._slam.sight(measurement.stamp_ns, measurement.number, looks)
 
     def fix(self, measurement: m.Fix) -> Rejection | None:
@@ -382,7 +379,7 @@ class Mapper:
         return self._slam.innovation
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The running pose by own measurements alone, given the open window."""
+        """The running pose by own measurements."""
         return self.own_map.pose(window)
 
     def own_landmarks(self) -> LandmarkGaussian:

@@ -113,11 +113,9 @@ CONDENSED = 16
 class TeamMap:
     """The joint map of the last prior and the robot's later submaps, recomputed on change.
 
-    Without new priors the oldest submaps are condensed with it to one Gaussian, CONDENSED at a
-    time: the cost of a pose is bounded.
-
-    known, refused: numbers of landmarks of the newest submap and the open window that the rest of
-    the map has and contradicts. doubt: a warning about the last pose.
+    Without new priors the oldest submaps are condensed with it, CONDENSED at a time, which bounds
+    the cost of a pose. known, refused: landmarks of the newest submap and the open window that the
+    rest of the map has and contradicts. doubt: a warning about the last pose.
     """
 
     def __init__(self) -> None:
@@ -186,9 +184,8 @@ class TeamMap:
     def join(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
         """Join the prior with the incarnation's submaps that it does not contain.
 
-        Landmarks without identities are left out. The prior may contain more submaps than a robot
-        that has come back. If there is no joint solution, the cached error is raised at every
-        keyframe.
+        The prior may contain more submaps than a robot that has come back. Without a joint solution
+        the cached error is raised at every keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             if prior is not self._prior or len(submaps) < self._submaps:

@@ -38,9 +38,8 @@ from teamslam.team.wire.digest import announce_configuration
 class StreamAccount:
     """The counts of the current incarnation, and the last statements of earlier ones.
 
-    consumed: measurements; steps: odometry intervals consumed in this process; all_steps: of all
-    incarnations. acknowledged: submaps that the centre has dealt with. unreported: measurements
-    since the last report.
+    consumed: measurements; steps: odometry intervals in this process; all_steps: of all
+    incarnations. acknowledged: by the centre. unreported: measurements since the last report.
     """
 
     robot: str
@@ -65,7 +64,7 @@ class StreamAccount:
             self.all_steps += 1
 
     def acknowledge(self, progress: m.Progress) -> None:
-        """Note how many submaps the centre has dealt with."""
+        """Note the number of submaps that the centre has."""
         if progress.incarnation == self.incarnation:
             self.acknowledged = max(self.acknowledged, progress.submaps)
 
@@ -109,12 +108,10 @@ PROGRESS_MEASUREMENTS = 64
 class RobotNode:
     """The node of one robot: call `begin`, then `handle` for every message, until `finished`.
 
-    For recomputing a log: announced, the configuration's digest; poses, when and from which priors
-    poses are published; replaced, sent instead of a window, to show what that costs; on_window
-    receives each closed window.
-
-    finished: whether the team's final map, `final`, is there. withheld: number of messages that no
-    receiver would have accepted.
+    For recomputing a log: announced, the configuration's digest; poses, when and from which priors;
+    replaced, sent instead of a window; on_window receives each closed window. finished: `final`,
+    the team's final map, is there. withheld: number of messages that no receiver would have
+    accepted.
     """
 
     listens: tuple[ch.Channel, ...] = (
@@ -162,17 +159,17 @@ class RobotNode:
 
     @property
     def ledger(self) -> Ledger:
-        """Law 1's account of the incarnation that is being consumed."""
+        """Law 1's account of the current incarnation."""
         return self.mapper.ledger
 
     @property
     def incarnation(self) -> int:
-        """The incarnation of the stream that is being consumed."""
+        """The current incarnation."""
         return self.inbox.incarnation
 
     @property
     def next_measurement(self) -> int:
-        """The counter of the measurement that is consumed next."""
+        """The counter of the next measurement."""
         return self.inbox.next_measurement
 
     @property
@@ -182,7 +179,7 @@ class RobotNode:
 
     @property
     def overhears(self) -> tuple[ch.Channel, ...]:
-        """Channels to subscribe to for all robots: teammates' encounters, if they matter."""
+        """Channels of all robots to subscribe to: encounters, if used."""
         return (ch.RENDEZVOUS,) if self.mapper.submaps.buffers else ()
 
     def request(self) -> m.MeasurementsRequest | None:
@@ -212,7 +209,7 @@ class RobotNode:
         )
 
     def begin(self) -> list[Outgoing]:
-        """The first messages of the node: its configuration."""
+        """Make the first message: the configuration."""
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
     def take_over(self, stored: Sequence[m.Message]) -> None:
@@ -314,7 +311,7 @@ class RobotNode:
     # Order and estimate.
 
     def consume(self) -> None:
-        """Consume the measurements whose turn has come, while the centre gives credit."""
+        """Consume the measurements in turn, while credit lasts."""
         inbox = self.inbox
         while (inbox.ahead or inbox.later) and not self.is_held:
             measurement = inbox.take_next()
@@ -411,7 +408,7 @@ class RobotNode:
         self.out += (Outgoing(ch.ROBOT_DONE, self.robot, each) for each in statements)
 
     def statement(self) -> m.Done:
-        """The account of the incarnation, without what was consumed behind its end."""
+        """The account of the incarnation up to its end."""
         last = self.stream_end.last_of(self.account.incarnation)
         return self.account.statement(self.mapper, last)
 

@@ -38,10 +38,10 @@ class PoseEstimator(Protocol):
         """The number of the open window."""
 
     def open_window(self) -> RunningWindow | None:
-        """The Gaussian of the open window, if there is one."""
+        """Gaussian of the open window."""
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The pose by own measurements alone, given the open window."""
+        """The pose by own measurements."""
 
 
 @runtime_checkable
@@ -103,7 +103,7 @@ class RunningPoses:
 
     @property
     def has_prior(self) -> bool:
-        """Whether the robot is in the team's map by the newest prior."""
+        """Whether the newest prior has the robot's pose."""
         return self._prior is not None and self._prior.in_team_frame
 
     def prior_of(self, incarnation: int) -> m.Prior | None:
@@ -119,7 +119,7 @@ class RunningPoses:
         return prior if prior.in_team_frame or prior.ids else None
 
     def begin_incarnation(self, incarnation: int) -> None:
-        """Begin an incarnation: forget the prior of an earlier one."""
+        """Forget the prior of an earlier incarnation."""
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 

@@ -34,7 +34,7 @@ class MessageWriter:
     started: bool
 
     def submap(self, closed: ClosedWindow) -> m.Submap:
-        """The window's Gaussian with the names of its inputs."""
+        """The window's Gaussian with its inputs."""
         return translate.submap_message(
             robot=self.robot,
             incarnation=self.incarnation,
@@ -48,7 +48,7 @@ class MessageWriter:
         )
 
     def association(self, sequence: int, stamp_ns: int, became: Became) -> Outgoing:
-        """The outcomes of the window's detections without identities."""
+        """Outcomes of the window's detections without identities."""
         landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
         message = m.Association(
             stamp_ns=stamp_ns,
@@ -104,7 +104,7 @@ class MessageWriter:
         landmarks: LandmarkGaussian,
         kind: Literal["joint", "blocks"],
     ) -> Outgoing:
-        """The running map, with the joint covariance or with each landmark's own."""
+        """The running map, with joint or separate covariances."""
         joint = kind == "joint"
         message = m.MapEstimate(
             stamp_ns=stamp_ns,

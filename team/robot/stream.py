@@ -28,12 +28,12 @@ class Inbox:
         self._of_source: set[int] = set()
 
     def confirm(self, measurement: m.Measurement) -> None:
-        """Confirm a measurement by the source's answer, whatever its stamp."""
+        """Confirm a measurement by the source's answer."""
         if measurement.incarnation == self.incarnation:
             self._of_source.add(measurement.number)
 
     def resume(self, incarnation: int, next_measurement: int) -> None:
-        """Skip measurements of `incarnation` consumed by an earlier process."""
+        """Skip measurements consumed by an earlier process."""
         self.incarnation = incarnation
         self.next_measurement = next_measurement
         waiting = self.later.pop(incarnation, {}) | self.ahead
@@ -75,7 +75,7 @@ class Inbox:
         return another_time(measurement.stamp_ns, self._began_ns)
 
     def contradicts(self, end: m.End, robot: str) -> str | None:
-        """Why an announced end cannot be the end of the robot's stream."""
+        """Why an announced end contradicts the stream."""
         ends = {
             stream.incarnation: stream.measurements
             for stream in end.streams
@@ -92,7 +92,7 @@ class Inbox:
         return None
 
     def take_next(self) -> m.Measurement | None:
-        """Remove and return the next measurement, if its turn has come."""
+        """Remove and return the measurement whose turn has come."""
         while True:
             measurement = self.ahead.pop(self.next_measurement, None)
             if measurement is not None:
@@ -118,7 +118,7 @@ class Inbox:
 
     @property
     def received(self) -> int:
-        """Gap-free count of this incarnation's measurements, consumed or not."""
+        """Gap-free count of the incarnation's measurements."""
         self._received = max(self._received, self.next_measurement)
         while self._received in self.ahead:
             self._received += 1
@@ -144,7 +144,7 @@ class Inbox:
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: m.StreamEnd) -> bool:
-        """Whether every measurement of the stream has been consumed."""
+        """Whether the whole stream has been consumed."""
         return end.measurements == 0 or (
             self.incarnation == end.incarnation and self.next_measurement >= end.measurements
         )
@@ -175,7 +175,7 @@ class Inbox:
 
     @property
     def waiting(self) -> int:
-        """Number of measurements that wait for their turn."""
+        """Number of waiting measurements."""
         return len(self.ahead) + sum(len(r) for r in self.later.values())
 
 
@@ -211,12 +211,12 @@ class EndOfStream:
 
     @property
     def waits_for_driver(self) -> bool:
-        """Whether measurements must come from a driver that is not present."""
+        """Whether an absent driver has measurements to publish."""
         driven = self._head is not None and self.at_source is None
         return driven and self.driver_is_there is False
 
     def missing(self) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to ask the source for."""
+        """Incarnation, first and last measurement to request."""
         return None if self.waits_for_driver else self._inbox.missing(self._known())
 
     def _known(self) -> m.StreamEnd | None:

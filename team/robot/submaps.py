@@ -1,11 +1,11 @@
 """The robot's submaps, each held once, as its message's payload.
 
-A restarted centre may request all of them (`SubmapsRequest`), so they stay compact; the pose in the
-team's map decodes the few that it needs.
+A restarted centre may request all of them (`SubmapsRequest`); the pose in the team's map decodes
+the few that it needs.
 
 Under `rendezvous` closed submaps are buffered until the robot encounters a teammate (Xu, 5.1;
-Downs, 4.3). Only the observer notices the encounter: it announces it, and both release their
-buffers. This changes when a submap is sent, never its content.
+Downs, 4.3). The observer announces the encounter, and both release their buffers. This changes when
+a submap is sent, never its content.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,7 +40,7 @@ class _Stream:
         return message
 
     def between(self, first: int, end: int) -> Iterator[bytes]:
-        """The factors, then the submaps, of sequences in [first, end)."""
+        """The factors, then the submaps, in [first, end)."""
         for sequence in sorted(self.factors):
             if first <= sequence < end:
                 yield from self.factors[sequence]
@@ -51,7 +51,7 @@ class Submaps(Sequence[LocalMap]):
     """The messages for fusion of one robot, and its incarnation's submaps as a sequence of maps.
 
     Items have the landmarks with identities, and are decoded when read. buffers: whether submaps
-    wait for an encounter. sent: submaps of the incarnation that were sent, also earlier.
+    wait for an encounter. sent: number of those sent, also earlier.
     """
 
     def __init__(self, robot: str, exchange: Exchange) -> None:
@@ -84,7 +84,7 @@ class Submaps(Sequence[LocalMap]):
         self.sent = len(self._newest.submaps)
 
     def close(self, factors: Sequence[m.SightingFactor], submap: m.Submap) -> list[Outgoing]:
-        """Store a window's messages; returns those that go out now."""
+        """Store a window's messages; return those to send now."""
         if factors:
             self._newest.factors[submap.sequence] = [encoded(each) for each in factors]
         self._newest.submaps[submap.sequence] = encoded(submap)
@@ -100,7 +100,7 @@ class Submaps(Sequence[LocalMap]):
 
     @property
     def since_ns(self) -> int | None:
-        """Start of the oldest buffered window; None where nothing is buffered."""
+        """Start of the oldest buffered window, if any."""
         return None if self.sent == len(self) else self._newest.submap(self.sent).start_ns
 
     @property
@@ -134,7 +134,7 @@ class Submaps(Sequence[LocalMap]):
         return released
 
     def answer(self, request: bytes) -> list[bytes]:
-        """Answer `SubmapsRequest`: everything sent for fusion, also by an earlier process."""
+        """Answer with everything sent for fusion, also earlier."""
         requested = decoded(request, m.SubmapsRequest)
         return [*self._answer(requested)] if requested.robot == self._robot else []
 

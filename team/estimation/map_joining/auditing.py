@@ -23,7 +23,7 @@ from teamslam.team.estimation.map_joining.refusal import add_members
 
 
 def fold_tick(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Fold one tick: add its members, then undo closures that they contradict."""
+    """Fold one tick, and undo closures that it contradicts."""
     if tick.verdicts:
         verdicts = (*fold.landmarks.verdicts, *tick.verdicts)
         fold = replace(fold, landmarks=replace(fold.landmarks, verdicts=verdicts))

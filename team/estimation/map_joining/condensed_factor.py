@@ -51,8 +51,8 @@ class SubmapCost(NamedTuple):
 class EliminatedPath(NamedTuple):
     """The eliminated poses of a stream, first to last, at the state of their elimination.
 
-    blocks: runs of PATH_BLOCK poses, the last one shorter; later paths share them, so that
-    checkpoints store them once. is_fixed: whether the first pose is a constant.
+    blocks: runs of PATH_BLOCK poses, the last one shorter, stored once in checkpoints. is_fixed:
+    whether the first pose is a constant.
     """
 
     blocks: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -108,11 +108,9 @@ NOBODY = Departed({}, (), {}, {})
 class Resting:
     """Landmarks that no raw submap contains, given the nodes of the condensed factor.
 
-    x ~ N(means + gain d, covariance), d as in `Condensed`. They are no nodes until a submap
-    observes them.
-
-    ids: in the order in which they came to rest. covariance: its upper triangle, square or packed;
-    `upper` has the square.
+    x ~ N(means + gain d, covariance), d as in `Condensed`; no nodes until a submap observes them.
+    ids: in the order in which they came to rest. covariance: its upper triangle, square (`upper`)
+    or packed.
     """
 
     ids: Indices
@@ -135,12 +133,12 @@ class Resting:
 
     @cached_property
     def place(self) -> Mapping[int, int]:
-        """The place of each id in the order."""
+        """Place of each id."""
         return {id_: k for k, id_ in enumerate(self.ids.tolist())}
 
 
 def make_empty_rest(numbers: int) -> Resting:
-    """Make an empty `Resting` beside a condensed factor with this many numbers."""
+    """Make an empty `Resting` beside a condensed factor."""
     none = np.zeros(0)
     return Resting(none.astype(np.int64), none, np.zeros((0, numbers)), np.zeros((0, 0)))
 

@@ -161,9 +161,9 @@ class RobotPrior(NamedTuple):
 class Followed(NamedTuple):
     """A robot's map after its later submaps, with their agreement.
 
-    known: number of each submap's landmarks that the map or another submap contains. refused:
-    number of those that everything else contradicts. cost: χ² in `dof` degrees of freedom, without
-    the refused. disputed: that χ² is too large, or most of a submap would be refused.
+    known: number of each submap's landmarks in the map or another submap. refused: those that
+    everything else contradicts. cost: χ² in `dof` degrees of freedom, without these. disputed: that
+    χ² is too large, or most of a submap would be refused.
     """
 
     whole: WholeMap

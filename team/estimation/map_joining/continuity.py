@@ -1,14 +1,13 @@
 """Seams: places where a robot's view changes at once although its odometry measures no motion.
 
 Where a robot was carried off, or its odometry slips by metres, the landmarks of the scans before
-and behind a place differ. The evidence is the log-likelihood ratio of a robot elsewhere against one
-that overlooks landmarks,
+and behind a place differ. The log-likelihood ratio of a robot elsewhere against one that overlooks
+landmarks is
 
-ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
+    ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
-The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam is
-between two submaps, or inside one, which then is spoilt. Landmarks with identities:
-`central.carried_off`.
+The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam
+inside a submap spoils it. Landmarks with identities: `central.carried_off`.
 """
 
 import math
@@ -45,9 +44,8 @@ Indices = Int64[np.ndarray, " _"]
 class Seam(NamedTuple):
     """A place at which a stream is cut.
 
-    before, after: numbers of the last submap before it and the first one behind it; one between is
-    spoilt. begin_ns, end_ns: end of the former, beginning of the latter. evidence: log-likelihood
-    ratio.
+    before, after: the last submap before it and the first one behind it; one between is spoilt.
+    begin_ns, end_ns: end of the former, beginning of the latter. evidence: log-likelihood ratio.
     """
 
     stream: Stream

@@ -112,10 +112,9 @@ TRIED = 4
 class Repetition(NamedTuple):
     """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
-    ids: landmarks that only these submaps have; pairs: those that match another one. begin_ns,
-    end_ns: the end of the last submap before the boundary, and of the stream's last one. place: at
-    the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad] if each pair were one
-    landmark.
+    ids: landmarks that only these submaps have; pairs: those that match. begin_ns, end_ns: of these
+    submaps. place: at the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad] if
+    each pair were one landmark.
     """
 
     stream: Stream

@@ -166,7 +166,7 @@ class Island:
 
     @cached_property
     def sighting_scale(self) -> Float[np.ndarray, " S"]:
-        """Widening of each inter-robot measurement's gate at its age."""
+        """Widening of each inter-robot measurement's gate."""
         return self._scale_at(self.sighting_age)
 
     def _scale_at(self, age: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -193,18 +193,18 @@ class Island:
 
     @property
     def cost(self) -> float:
-        """The minimised cost, at the present robust scales."""
+        """The minimised cost."""
         return self.estimate.cost
 
     @cached_property
     def posterior(self) -> core.Cholesky:
-        """Cholesky factor of the information matrix at this state."""
+        """Cholesky factor of the information matrix."""
         with self.determined():
             return self.estimate.posterior
 
     @contextmanager
     def determined(self) -> Iterator[None]:
-        """Raise NotDeterminedError that names the node, where a matrix cannot be factored."""
+        """Raise NotDeterminedError that names the node of an unfactorable matrix."""
         try:
             yield
         except core.NotPositiveDefiniteError as error:
@@ -226,7 +226,7 @@ class Island:
 
     @cached_property
     def resting_points(self) -> Float[np.ndarray, "L 2"]:
-        """Positions [m] of the landmarks at rest, if there are some."""
+        """Positions [m] of the landmarks at rest."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -236,7 +236,7 @@ class Island:
 
     @cached_property
     def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
-        """Joint covariance of the condensed factor's nodes, if there is one."""
+        """Joint covariance of the condensed factor's nodes."""
         with self.determined():
             return self.estimate.boundary_covariance
 
@@ -253,7 +253,7 @@ class Island:
 
     @cached_property
     def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
-        """Covariance [m²] of each landmark at rest, if there are some."""
+        """Covariance [m²] of each landmark at rest."""
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -270,7 +270,7 @@ def age_factors(island: Island, iterations: int | None) -> Island:
 
 
 def final_cost(island: Island) -> float:
-    """Evaluate the cost with final robust scales, for comparison of islands."""
+    """Evaluate the cost at final robust scales."""
     is_final = (island.age >= FULL_AGE).all() and (island.sighting_age >= FULL_AGE).all()
     return island.cost if is_final else age_factors(island, FULL_AGE).cost
 
@@ -278,7 +278,7 @@ def final_cost(island: Island) -> float:
 def add_sightings(
     island: Island, waiting: Sequence[InterRobotFactor]
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Add the inter-robot measurements within an island; return the remaining ones."""
+    """Add the inter-robot measurements within an island; return the others."""
     candidates = [(each, encounter_of(island.graph, each)) for each in waiting]
     found = [between for _, between in candidates if between is not None]
     if not found:
@@ -406,8 +406,7 @@ def solve_with_fixed(
     """Move one number of the state by `by` and solve for all others given that.
 
     With p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose component along
-    w is the remaining displacement. The last one has a squared length (p + λ q)ᵀ A (p + λ q), in
-    standard deviations, below `shortest`.
+    w is the remaining displacement, until (p + λ q)ᵀ A (p + λ q) is below `shortest`.
     """
     missing = by
     for _ in range(iterations):

@@ -204,12 +204,12 @@ class Fold:
 
     @property
     def condensed_count(self) -> int:
-        """Number of condensed submaps (`condensing`), which are not among `contributions`."""
+        """Number of condensed submaps, none of `contributions`."""
         return self.size - len(self.contributions)
 
     @property
     def size(self) -> int:
-        """Number of submaps in the fold, condensed ones included."""
+        """Number of submaps, condensed ones included."""
         return sum(island.graph.size for island in self.islands.values())
 
     @property
@@ -219,7 +219,7 @@ class Fold:
 
     @property
     def has_unnamed(self) -> bool:
-        """Whether any submap has had an unnamed landmark."""
+        """Whether any submap has an unnamed landmark."""
         return bool(self.landmarks.log.streams)
 
     @cached_property
@@ -259,7 +259,7 @@ class Fold:
         return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence number of a stream's next submap in the fold."""
+        """Sequence number of a stream's next submap."""
         if stream not in self.home:
             return first_of(stream)
         return self.islands[self.home[stream]].graph.next_sequence(stream)
@@ -273,7 +273,7 @@ EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
 def add_start(fold: Fold, start: InitialPoseFactor) -> Fold:
-    """Add a stream's initial pose, before the stream's first submap."""
+    """Add a stream's initial pose, before its submaps."""
     if start.stream in fold.home:
         raise LateStartError(start)
     return replace(fold, starts={**fold.starts, start.stream: start})

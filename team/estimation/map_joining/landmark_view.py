@@ -29,7 +29,7 @@ def known(island: Island) -> list[int]:
 
 
 def resting_of(island: Island) -> Resting:
-    """Return the landmarks at rest; none where nothing is condensed."""
+    """Return the landmarks at rest, perhaps none."""
     old = island.graph.condensed
     if old is None:
         return make_empty_rest(0)
@@ -63,14 +63,14 @@ def blocks_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2 2"]:
 def joint(
     island: Island, nodes: Sequence[int], ids: Sequence[int]
 ) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Compute mean and joint covariance of nodes and landmarks, in this order."""
+    """Compute mean and joint covariance of nodes and landmarks."""
     return joints(island, [(nodes, ids)])[0]
 
 
 def joints(
     island: Island, groups: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> list[tuple[Values, Float[np.ndarray, "n n"]]]:
-    """Compute `joint` of several groups, with one solution for all their nodes."""
+    """Compute `joint` of several groups with one solution."""
     parts = [_sorted_out(island, ids) for _, ids in groups]
     members = [
         np.concatenate([np.array(nodes, np.int64), own])

@@ -258,7 +258,7 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
 def prior_for(
     fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
 ) -> RobotPrior:
-    """Make a robot's prior: its last end pose and the landmarks, jointly."""
+    """Make a robot's prior: last end pose and landmarks, jointly."""
     stream, island = (robot, incarnation), fold.island(robot, incarnation)
     chosen = known(island) if ids is None else sorted(ids)
     return _priors_in(island, {stream: chosen})[stream]
@@ -279,8 +279,7 @@ def main_priors(
     """Make the priors (`prior_for`) of streams of the main island.
 
     chosen: landmarks by ascending id; None: all. most: largest number in a prior, those nearest to
-    its pose. To the robot the others are new until the next prior: its pose is less accurate, and
-    as consistent.
+    its pose. The others are new to the robot: its pose is less accurate, and as consistent.
     """
     island = fold.main
     ids = np.array(known(island) if chosen is None else chosen)
@@ -315,7 +314,7 @@ def _priors_in(
 
 
 def trajectory(fold: Fold, robot: str, incarnation: int) -> EndPoses:
-    """Return the end poses of a stream's submaps, in their island's frame."""
+    """Return the end poses of a stream's submaps, in its island's frame."""
     island = fold.island(robot, incarnation)
     nodes = island.graph.streams[(robot, incarnation)]
     (start, start_covariance), *ends = (_own_marginal(island, node) for node in nodes)
@@ -351,7 +350,7 @@ _TERMS: WeakKeyDictionary[Island, Terms] = WeakKeyDictionary()
 
 
 def terms(island: Island) -> Terms:
-    """Evaluate the agreement of each factor of an island with the rest."""
+    """Evaluate the agreement of each factor."""
     found = _TERMS.get(island)
     if found is None:
         with island.determined():
@@ -392,9 +391,8 @@ def columns_of(costs: Sequence[SubmapCost]) -> Float[np.ndarray, "3 n"]:
 def unbounded_costs(island: Island) -> list[SubmapCost]:
     """Evaluate the agreement of the submaps without distortion by the robust loss.
 
-    Covariances far too small put sound submaps beyond their gates, and the solution follows the few
-    others. The island is therefore solved with the covariances times its scale; the costs are for
-    its own covariances.
+    Covariances far too small put sound submaps beyond their gates. The island is therefore solved
+    with the covariances times its scale; the costs are for its own covariances.
     """
     found, settings = terms(island).submaps, island.settings
     scale = scale_of(found)
@@ -432,7 +430,7 @@ def widen_covariances(fold: Fold, factor: float) -> Fold:
 
 
 def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
-    """Replace the costs of the fold's submaps in their agreement by `unbounded_costs`."""
+    """Replace the submaps' costs by `unbounded_costs`."""
     condensed = len(agreement.submaps) - len(fold.main.graph.submaps)
     return agreement._replace(submaps=(*agreement.submaps[:condensed], *unbounded_costs(fold.main)))
 

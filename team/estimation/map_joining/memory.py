@@ -1,9 +1,7 @@
 """Observations of condensed submaps for association: landmarks seen together, viewed places.
 
-Of each landmark the newest MOST submaps are stored whole, so their number does not depend on the
-duration of the run. Of older ones the pairs of landmarks that they kept apart remain.
-
-False detections would slow a team down: a landmark of n < MOST submaps is dropped when every
+Of each landmark the newest MOST submaps are stored whole, of older ones the pairs of landmarks that
+they kept apart. A landmark of n < MOST submaps, probably a false detection, is dropped when every
 landmark of MOST or more, last observed with it, has since been observed by MOST n submaps.
 """
 
@@ -37,7 +35,7 @@ class Observed(NamedTuple):
 
     @property
     def known(self) -> Indices:
-        """Nodes of its landmarks without the dropped ones."""
+        """Nodes of the landmarks but for dropped ones."""
         return self.landmarks[self.landmarks >= 0]
 
 

@@ -279,7 +279,7 @@ def place_island(
     main_from_other: Float[np.ndarray, "3"],
     waiting: Sequence[InterRobotFactor],
 ) -> tuple[Island, tuple[InterRobotFactor, ...]]:
-    """Join both islands, with every factor's robust scale at its beginning."""
+    """Join both islands at the initial robust scales."""
     graph, state = merge_graphs(main.graph, main.state, other.graph, other.state, main_from_other)
     new = ages(len(graph.submaps)), ages(len(graph.sightings))
     return add_sightings(Island(graph, state, *new, main.settings), waiting)

@@ -1,8 +1,8 @@
 """The search for the lowest minimum: one island solved from several starts.
 
-Headings give map joining many minima: after a long way without a landmark Gauss-Newton may fold a
-chain wrongly. A cost far above its degrees of freedom, or a lower end of another start, reveals
-that. A second minimum of similar cost is a second map of the same submaps.
+After a long way without a landmark Gauss-Newton may fold a chain wrongly. A cost far above its
+degrees of freedom, or a lower end of another start, reveals that. A second minimum of similar cost
+is a second map of the same submaps.
 """
 
 import math
@@ -68,7 +68,7 @@ class Search(NamedTuple):
 
     @property
     def ambiguous(self) -> bool:
-        """Whether a second minimum is about as likely as the best one."""
+        """Whether a second minimum is about as likely."""
         return self.second is not None and self.second.cost - self.best.cost < likely_rise()
 
 

@@ -1,9 +1,8 @@
 """Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
 One heading is displaced and everything else solved given that: the profile of the cost (Bates &
-Watts 1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement. After a long
-way without a landmark that χ² may be ten times the rise: the robot may be at a place that its
-covariance excludes.
+Watts 1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement; after a long
+way without a landmark that χ² may be ten times the rise.
 """
 
 from collections.abc import Iterator

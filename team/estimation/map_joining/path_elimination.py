@@ -98,7 +98,7 @@ def _mark_factors(
 
 
 def nodes_of(island: Island, factors: MarkedFactors, others: Iterable[Indices]) -> Indices:
-    """List the nodes of factors, and `others`, ascending, but for constants."""
+    """List the free nodes of factors and `others`, ascending."""
     graph = island.graph
     touched = [*others]
     touched += [graph.submaps[f].nodes for f in np.flatnonzero(factors.submaps)]

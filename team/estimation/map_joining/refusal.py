@@ -122,7 +122,7 @@ class _Selection:
     def add_solvable(
         self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
     ) -> Fold:
-        """Add the submaps first, then the inter-robot measurements, waiting ones included."""
+        """Add the submaps, then inter-robot measurements, waiting ones included."""
         unseen = replace(self._fold, waiting=())
         self._grow(unseen, members)
         base = replace(

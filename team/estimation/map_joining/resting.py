@@ -118,7 +118,7 @@ def put_to_rest(
 
 
 def wake_landmarks(island: Island, ids: Collection[int]) -> Island:
-    """Turn those of these landmarks that are at rest into nodes again."""
+    """Turn landmarks at rest into nodes again."""
     graph = island.graph
     old = graph.condensed
     if old is None or old.resting is None:

@@ -1,8 +1,7 @@
 """Split a node of a graph between its submaps, and drop a submap: hypotheses about a misfit.
 
-A moved landmark is two landmarks, before and after; a robot carried off at a seam ends one submap
-at another pose than the next one's start. Where its own submap is spoilt, the graph is solved
-without it.
+A moved landmark is two landmarks, before and after; a jump at a seam is two poses. A spoilt submap
+is left out.
 """
 
 from collections.abc import Collection

@@ -120,7 +120,7 @@ class Joined(NamedTuple):
 
     @property
     def factor(self) -> core.SubmapFactor:
-        """The factor over the submap's nodes. Raises NotACovarianceError that names the submap."""
+        """The factor. Raises NotACovarianceError that names the submap."""
         of = self.contribution
         if self.biases == of.local.biases:
             return of.factor
@@ -209,7 +209,7 @@ class Graph:
 
     @cached_property
     def observed(self) -> tuple[Observed, ...]:
-        """The submaps for data association: stored condensed ones, then the others."""
+        """Submaps for data association: stored condensed ones, then others."""
         own = (
             Observed(each.contribution.observation, each.landmarks, NO_COUNTS)
             for each in self.submaps
@@ -218,7 +218,7 @@ class Graph:
 
     @cached_property
     def factors(self) -> core.SubmapGraph:
-        """The factors, to compute with. Raises NotACovarianceError that names a submap."""
+        """The factors. Raises NotACovarianceError that names a submap."""
         return core.SubmapGraph(
             self.offset,
             self.fixed,
@@ -240,7 +240,7 @@ class Graph:
 
     @cached_property
     def boundary(self) -> Indices:
-        """Indices in the state of the numbers of the condensed factor's nodes."""
+        """Indices in the state of the condensed factor's numbers."""
         nodes = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
         return places(self.offset, nodes)
 
@@ -270,7 +270,7 @@ class Graph:
         return self.first_sequence(stream) + len(self.streams[stream]) - 1
 
     def first_sequence(self, stream: Stream) -> int:
-        """Sequence number of a stream's first submap that is not condensed."""
+        """Sequence number of a stream's first raw submap."""
         return self.gone.get(stream, first_of(stream))
 
     @property
