@@ -282,9 +282,8 @@ class TeamAttendance:
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
     def missing(self) -> list[str]:
-        """List the robots whose streams are not complete.
-
-        After an order to end, also those whose drivers may have measured more.
+        """List the robots whose streams are not complete or, after an order to end, may
+        have more.
         """
         return [
             name

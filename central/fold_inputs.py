@@ -154,9 +154,8 @@ class Members:
     def digest(
         self, before: tuple[bytes, ...], closed: float, last: float, gone: Collection[str]
     ) -> bytes:
-        """Digest these parts and the members up to a tick, in canonical order.
-
-        The digest up to `closed` is cached, by the parts before it.
+        """Digest these parts and the members up to a tick, in canonical order; cached up to
+        `closed`.
         """
         until, digest = self._named.pop(before, (math.inf, Digest()))
         if until > closed:
@@ -268,9 +267,8 @@ class FoldInputs:
         return self._members.raised(without)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
-        """Return the members of a tick without some robots' submaps and measurements of these.
-
-        Those beyond the bounds are refused, with the reason.
+        """Return the members of a tick without some robots' submaps and measurements of these;
+        refuse those beyond the bounds.
         """
         order = self._members.keys(tick, without)
         submaps = [self._members.contribution(key) for key in order]

@@ -156,8 +156,7 @@ class Shown(NamedTuple):
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     """Select the landmarks of the map.
 
-    The final map has only those known to be different; unnamed ones need a known heading and few
-    misses.
+    The final map has unnamed ones only if well placed, found again and known to be different.
     """
     if not fold.contributions:
         return Shown()
@@ -290,8 +289,8 @@ def priors(
 def gets_landmarks_alone(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, stream: Stream
 ) -> bool:
-    """Whether a stream outside the team's map, neither withdrawn nor cut, gets the landmarks of a
-    running map to be placed by.
+    """Whether a stream outside the team's map, neither withdrawn nor cut, gets a running map's
+    landmarks.
     """
     is_out = fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream)
     named_ones = sum(id_ < UNNAMED for id_ in shown)

@@ -73,7 +73,7 @@ def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -
 
 def survey_warnings(fold: Fold) -> Iterator[str]:
     """Warn of surveyed landmarks that the map places elsewhere beyond chance, and of saved maps
-    that already contain a survey.
+    with a survey.
     """
     if not fold.contributions:
         return

@@ -148,10 +148,7 @@ class TickFold:
             self._roll_back_others(tick)
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> None:
-        """Replace an operator's verdicts on pairs of unnamed landmarks, present or future.
-
-        The ticks are folded again from the first that judges a changed verdict.
-        """
+        """Replace an operator's verdicts; refold from the first tick that judges a changed one."""
         tick = self._inputs.set_verdicts(verdicts)
         if math.isfinite(tick):
             self._fold_again(tick)
@@ -342,7 +339,7 @@ class TickFold:
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
         """Fold the same inputs up to a time without some robots; withdraw no other.
 
-        The fold is kept and continued until no robot is suspected.
+        The fold is kept until no robot is suspected.
         """
         gone = self._gone.union(robots)
         other = self._others.get(gone)
@@ -465,9 +462,7 @@ class TickFold:
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """Return the version vector: the last sequence of each stream, folded or refused, but for
-        the survey's.
-        """
+        """Return the last sequence of each stream, folded or refused, but for the survey's."""
         last: dict[Stream, int] = {}
         parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]
         parts += [(key[1:3], key[3]) for key in fold.refused]

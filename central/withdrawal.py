@@ -48,7 +48,7 @@ Without = Callable[[Collection[str]], Agreement | None]
 class Trial:
     """The robot that is wrong beyond chance, or None, with the reason.
 
-    undecided: in words, contradictory robots with the wrong one undetermined.
+    undecided: contradictory robots with the wrong one undetermined.
     """
 
     robot: str | None = None
@@ -101,8 +101,7 @@ def disagreement(
 ) -> dict[str, float]:
     """Return the disagreement of each robot that can be judged.
 
-    chance: costs of a probability above e^−chance are no disagreement. least: fewest submaps to
-    judge a robot.
+    chance: costs of a probability above e^−chance do not count. least: fewest submaps.
     """
     costs: dict[str, list[tuple[float, float]]] = {}
     for (robot, _), _, chi2, dof, *_ in agreement.submaps:

@@ -290,10 +290,8 @@ class Mapper:
             self.publish_map(end_ns)
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether own map and particles are published at this window's end: it contains a multiple
-        of `pose_s`.
-
-        It depends on stamps alone, as a restarted robot needs.
+        """Whether own map and particles are published at this window's end: a multiple of `pose_s`
+        by stamps alone, as a restarted robot needs.
         """
         period_ns = self._period_ns
         return period_ns == 0 or end_ns // period_ns > start_ns // period_ns

@@ -213,10 +213,7 @@ class RobotNode:
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
     def take_over(self, stored: Sequence[m.Message]) -> None:
-        """Continue where the centre's set of this robot ends, from the latest incarnation.
-
-        Submaps of an earlier process can then be requested here, too.
-        """
+        """Continue where the centre's set of this robot ends, and answer for its submaps."""
         start = stored[0]
         assert isinstance(start, m.InitialPose)
         of_it = (
@@ -299,8 +296,8 @@ class RobotNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue behind a measurement whose handling raised, as if it had not come.
 
-        The mapper is reset to its last submap and the window's other measurements. If its last
-        window raises it ends with `Done` without it.
+        The mapper is reset to its last submap and the window's other measurements, or ends with
+        `Done` without its last window.
         """
         self.mapper.set_aside()
         if self.done and not self._has_sent_done:

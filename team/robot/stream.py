@@ -57,8 +57,7 @@ class Inbox:
     def refusal(self, measurement: m.Measurement) -> str | None:
         """Why a measurement cannot belong to this stream.
 
-        Counters are bounded. Incarnations follow one another and begin with their only initial
-        pose, the earliest stamp.
+        Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
         number, incarnation = measurement.number, measurement.incarnation
         if incarnation > MOST_LIVES or number > MOST_COUNT:
@@ -228,9 +227,7 @@ class EndOfStream:
         )
 
     def announced_by(self, end: m.End) -> tuple[int, int]:
-        """Incarnation and measurements at which an announced end ends this stream; a robot that it
-        does not name has none.
-        """
+        """Incarnation and measurements at which an announced end ends this stream; 0 if unnamed."""
         ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self._robot]
         return ends[0] if ends else (self._inbox.incarnation, 0)
 

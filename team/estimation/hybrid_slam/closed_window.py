@@ -11,11 +11,11 @@ from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 class ClosedWindow:
     """A submap with the names of its inputs, and the inter-robot measurements from its pose nodes.
 
-    window, keyframes_ns: its particles with their paths, and the keyframes' team times; None
-    without a solution. innovation: of the predicted measurements. gated: measurements that no
-    others of the window confirmed. late: rejected scans that are stamped behind the window's end.
-    became: the outcomes of detections without identity. slips: motions that the odometry missed.
-    unsolved: scans without a Gaussian, of which only the odometry's motion is in the submap.
+    window, keyframes_ns: its particles with their paths, and the keyframes' team times, if solved.
+    innovation: of predicted measurements. gated: measurements that no others confirmed. late:
+    rejected scans, stamped behind the window's end. became: outcomes of detections without
+    identity. slips: motions that the odometry missed. unsolved: scans without a Gaussian, of which
+    the submap has only the motion.
     """
 
     sequence: int

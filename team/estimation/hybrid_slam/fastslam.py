@@ -117,10 +117,10 @@ def propagated_and_updated(
 ) -> tuple[Particles, StepInfo]:
     """Resample if the particles are thin, move, then take the measurements.
 
-    Resampling, when the last effective sample size is below `resample_below`·M, comes first: the
-    particles of a window's last step keep their weights. ranges [m] and bearings [rad] are
-    calibrated, own their covariances (`teamslam.team.estimation.scans`); an id may occur twice.
-    Draws one uniform number if it resamples, and M × 3 normal ones. Raises NotACovarianceError.
+    Resampling, below an effective sample size of `resample_below`·M, comes first: the particles of
+    a window's last step keep their weights. ranges [m] and bearings [rad] are calibrated, own their
+    covariances (`teamslam.team.estimation.scans`); an id may occur twice. Draws one uniform number
+    if it resamples, and M × 3 normal ones. Raises NotACovarianceError.
     """
     parents = None
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):

@@ -72,10 +72,9 @@ class Segmenter:
     """Integrates odometry between keyframes; an observation splits an interval.
 
     With keyframe_s = 0 every observation message is a keyframe. Otherwise the scans within
-    keyframe_s are reduced to one range and bearing per landmark: the median, each scan first moved
-    by the odometry to the end of the interval that closes the keyframe. Each grid time is a
-    keyframe without measurements. Scans without identities are kept: their association is known at
-    the window's end.
+    keyframe_s are reduced to the median range and bearing per landmark, moved by the odometry to
+    the end of the interval that closes the keyframe. Each grid time is a keyframe without
+    measurements. Scans without identities are kept until the window's end.
     """
 
     def __init__(
@@ -183,9 +182,8 @@ class Segmenter:
         self._odometry.mark_scan()
 
     def cut(self, stamp_ns: int) -> tuple[list[Keyframe], Increment]:
-        """Close the window here: return its last open keyframe, and the motion after it.
-
-        `rest_forward` is that motion's `Keyframe.forward`.
+        """Close the window: return its last open keyframe, and the later motion (`rest_forward`:
+        its `Keyframe.forward`).
         """
         keyframes = [self._close_keyframe(stamp_ns)] if self._keyframe else []
         rest, self.rest_forward, _ = self._odometry.end_keyframe()

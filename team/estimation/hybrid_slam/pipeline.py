@@ -45,8 +45,8 @@ def _nanoseconds(seconds: float) -> int:
 class HybridSlam:
     """One incarnation of a robot's stream, from its beginning or last submap.
 
-    sequence: of the open window. last_measurement: its newest measurement, even a rejected one; set
-    by the caller. last_keyframe_ns: team time of its last keyframe.
+    sequence, last_keyframe_ns: of the open window. last_measurement: its newest, even a rejected
+    one; set by the caller.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:

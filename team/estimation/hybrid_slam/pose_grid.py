@@ -1,10 +1,10 @@
 """The team's time grid, at which every robot has a pose node, and inter-robot measurements.
 
-A robot does not know when it is observed, so all robots place nodes at the multiples of node_s. An
-inter-robot measurement belongs to the nearest grid time in the open window within sighting_s, to
-which the observer's odometry carries it; several of one teammate at one node are reduced to one, of
-fixes the nearest in time is used. The antenna of a fix delayed by d is T⁻¹ a seen from the robot at
-the fix's stamp, with the motion T over d.
+All robots place nodes at the multiples of node_s, since none knows when it is observed. The
+observer's odometry carries an inter-robot measurement to the nearest grid time in the open window
+within sighting_s; several of one teammate at one node are reduced to one, of fixes the nearest in
+time is used. The antenna of a fix delayed by d is T⁻¹ a seen from the robot at the fix's stamp,
+with the motion T over d.
 """
 
 from bisect import insort

@@ -110,9 +110,8 @@ SELF = ("self", 0)
 
 
 class SubmapCorrection(NamedTuple):
-    """The centre's corrections of a robot's submaps: covariance factor f, shared biases b.
-
-    biases: name, estimate and standard deviation.
+    """The centre's corrections of a robot's submaps: covariance factor f, shared biases b (name,
+    estimate, standard deviation).
     """
 
     covariance_factor: float = 1.0
@@ -142,8 +141,8 @@ class SubmapCorrection(NamedTuple):
 class RobotPrior(NamedTuple):
     """A robot's last joined end pose and landmarks: the joint covariance of (x, y, θ, x₁, y₁, …).
 
-    In the frame of the robot's island [m, rad], ids ascending; a row of zeros is a known constant.
-    shared: corrections of all the robot's submaps.
+    In the island's frame [m, rad], ids ascending; a row of zeros is a known constant. shared:
+    corrections of the robot's submaps.
     """
 
     pose: Float[np.ndarray, "3"]

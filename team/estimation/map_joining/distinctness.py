@@ -82,8 +82,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
 
 
 def find_lost_streams(island: Island) -> dict[Stream, float]:
-    """Find the streams with a heading standard deviation above `alignment_heading_sigma`, with the
-    largest one [rad].
+    """Find the streams with a heading standard deviation above `alignment_heading_sigma`, and the
+    largest [rad].
     """
     worst = {
         stream: max(heading_sigma(island, node) for node in nodes)

@@ -242,7 +242,9 @@ class Island:
 
     @cached_property
     def resting_spread(self) -> Float[np.ndarray, "r n"]:
-        """G R of the landmarks at rest: gain G, R Rᵀ of the nodes that they depend on."""
+        """G R, with the gain G of the landmarks at rest and R Rᵀ of the nodes that they
+        depend on.
+        """
         old = self.graph.condensed
         assert old is not None
         assert old.resting is not None
@@ -311,9 +313,8 @@ def likely_limit(dof: int) -> float:
 
 
 def is_solvable(island: Island) -> bool:
-    """Whether the numbers are finite and every unknown determined.
-
-    Pivots are judged by their diagonal entries (`core.Cholesky`), so units have no influence.
+    """Whether the numbers are finite and every unknown determined, whatever the units
+    (`core.Cholesky`).
     """
     try:
         with np.errstate(all="ignore"):
@@ -326,8 +327,8 @@ def is_solvable(island: Island) -> bool:
 def iterate_tick(island: Island) -> Island:
     """Apply the iterations of one tick.
 
-    With condensed submaps, iterations after the first are omitted whose step is shorter than STILL:
-    condensing displaces the map by more.
+    With condensed submaps, later ones shorter than STILL are omitted: condensing displaces the map
+    by more.
     """
     damping = 0.0
     bounded = island.graph.condensed is not None
@@ -362,8 +363,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
 
 
 def solve_island(island: Island) -> tuple[Island, int, float]:
-    """Solve in full from this state; return also the number of iterations and the last change [m,
-    rad].
+    """Solve in full; return also the number of iterations and the last change [m, rad].
 
     Least squares first: it is the robust solution where no factor is beyond its gate. Else the
     gates narrow anew. A solve ends when converged, after `max_iterations`, or where no step lowers

@@ -87,8 +87,8 @@ ALL = slice(None)
 
 
 class Sights(NamedTuple):
-    """Observations of one landmark, in order of time: the submap's place in the graph, position in
-    the map [m], and its covariance (xx, xy, yy) [m²].
+    """Observations of one landmark by time: the submap's place in the graph, position [m] and
+    covariance (xx, xy, yy) [m²].
     """
 
     places: Places
@@ -264,7 +264,7 @@ def change_of(sights: Sights) -> _Two | None:
 def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
     """Find two places among a landmark's observations, whatever their order.
 
-    scale: the covariance scale, which also scales the χ² that free assignments remove by chance.
+    scale: the covariance scale, by which chance removes more χ².
     """
     n = len(sights.places)
     one = _chi2_about(sights, median(sights.points))
@@ -511,8 +511,8 @@ def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
 
 
 def explain(island: Island) -> tuple[list[Hypothesis], Island]:
-    """Find landmarks with two places and robots that were carried off, and the island in which
-    these are unknowns.
+    """Find landmarks with two places and robots that were carried off, and the island with these
+    unknowns.
     """
     base = _solved(robust(island))
     graph = base.island.graph

@@ -116,10 +116,7 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """Estimate each stream's shared errors, in the stream's island.
-
-    Each is the sum of the robot's own error and the team's.
-    """
+    """Estimate each stream's shared errors (the robot's own plus the team's), in its island."""
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
 
@@ -156,8 +153,8 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
 
 
 class Scatter(NamedTuple):
-    """Standard deviation of a shared error by the scatter of the submaps, and the degrees of
-    freedom of its square.
+    """Standard deviation of a shared error by the submaps' scatter, and the freedom of
+    its square.
     """
 
     sigma: float
@@ -214,8 +211,8 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
     """List the main island's landmarks in at least `submaps` believed submaps; unnamed ones in the
     larger of `submaps` and `unnamed`.
 
-    A submap is believed where its landmark's weight is at least BELIEVED, so two contradictory
-    observations do not confirm each other.
+    Submaps with a landmark's weight below BELIEVED do not count: contradictory observations do not
+    confirm each other.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -245,9 +242,7 @@ def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """Return landmarks of the main island with one covariance each, `landmark_sigma` included, by
-    selected inversion.
-    """
+    """Return landmarks of the main island with separate covariances, `landmark_sigma` included."""
     island = fold.main
     own = island.settings.landmark_sigma**2 * np.eye(2)
     chosen = known(island) if ids is None else sorted(ids)
@@ -415,7 +410,7 @@ def _widened(island: Island, factor: float) -> Island:
 
 def widen_covariances(fold: Fold, factor: float) -> Fold:
     """Solve the main island with the submaps' covariances times a factor; unchanged without a
-    solution, and where fixes may be the cause.
+    solution, or where fixes may be at fault.
     """
     if factor == 1.0 or fold.main_key is None:
         return fold
@@ -436,9 +431,9 @@ def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
 
 
 def joint_cost(fold: Fold) -> Agreement:
-    """Evaluate the agreement of the main island's submaps, at the present estimate.
+    """Evaluate the agreement of the main island's submaps.
 
-    Condensed submaps count at condensing; the newest of them are listed.
+    Condensed submaps count at condensing; the newest are listed.
     """
     found = terms(fold.main)
     old = fold.main.graph.condensed

@@ -72,8 +72,8 @@ HOPELESS = 100.0
 class SharedPoint(NamedTuple):
     """One point: its node in both islands, and the measurement that ties them.
 
-    seen: the inter-robot measurement, at `seen.point` of the teammate; None for a landmark.
-    from_main: the observer is in the main island.
+    seen: the inter-robot measurement; None for a landmark. from_main: the observer is in the main
+    island.
     """
 
     main: int

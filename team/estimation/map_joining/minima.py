@@ -87,9 +87,9 @@ def search_minima(starts: Sequence[Island]) -> Search:
     """Find the lowest minimum from several starts of one graph, and from the relaxation of its
     headings.
 
-    The first start is the one used without a search. While the cost is suspicious, and always with
-    few landmarks, starts without inter-robot measurements and with wide robust scales are tried
-    too. A start without a solution is left out; raises NotDeterminedError where none has one.
+    The first start is the one used without a search. While the cost is suspicious, or with few
+    landmarks, starts without inter-robot measurements and with wide robust scales are tried too.
+    Raises NotDeterminedError where no start has a solution.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_solve_each(starts))
@@ -228,9 +228,7 @@ def _quadratic(island: Island, x: Values) -> float:
 
 
 def rival_distance(search: Search) -> float | None:
-    """Distance [m] of the second minimum from the best one, if about as likely and beyond its
-    standard deviation.
-    """
+    """Distance [m] of the second minimum from the best one, if as likely and significant."""
     if search.second is None or not search.ambiguous:
         return None
     island = search.best.island

@@ -64,7 +64,7 @@ def heading_sigma(island: Island, node: int) -> float:
 
 
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
-    """Profile the cost: likely islands with one heading displaced, and each rise.
+    """Profile the cost: islands with one heading displaced, and each rise.
 
     Empty where the heading is known too well for a curved valley.
     """
@@ -86,7 +86,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
 
 
 def ends(island: Island) -> list[tuple[Stream, str, int]]:
-    """List the first and last pose of every stream unless given, each with its word."""
+    """List the first and last pose of every stream unless given, named in words."""
     return [
         (stream, where, nodes[k])
         for stream, nodes in sorted(island.graph.streams.items())
@@ -96,7 +96,7 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
 
 
 def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
-    """Find the likely place of a pose that its covariance underrates most, at a minimum."""
+    """Find the likely place of a pose that its covariance underrates most."""
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.

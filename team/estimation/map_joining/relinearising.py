@@ -67,7 +67,7 @@ def restore_submaps(
     """Restore the condensed submaps as factors, and solve their islands; unchanged without a
     solution.
 
-    contributions, sightings: all members of the fold in canonical order, refused ones included.
+    contributions, sightings: all of the fold in canonical order, even refused ones.
     """
     contributions = cut_members(contributions, fold.cuts)
     sightings = cut_members(sightings, fold.cuts)

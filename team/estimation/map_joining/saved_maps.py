@@ -49,7 +49,7 @@ MOST_PAIRS = 2000
 class Displacement(NamedTuple):
     """Displacement [m] of a landmark since a saved map, in the island's frame.
 
-    chi2: of two degrees of freedom. is_apart: its former place has a node.
+    chi2: of two degrees of freedom. is_apart: it has two nodes.
     """
 
     landmark: int
@@ -77,10 +77,9 @@ def maps_of(graph: Graph) -> list[Joined]:
 def displacements(
     island: Island, saved: Joined, among: Collection[int] | None = None
 ) -> list[Displacement]:
-    """Estimate the displacement of each landmark of a saved map that others observed, by id.
+    """Estimate the displacement of each landmark of a saved map that others determine, by id.
 
-    among: the nodes to test, without those apart; None: all. Landmarks that the rest of the map
-    does not determine are left out.
+    among: the nodes to test, without those apart; None: all.
     """
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     nodes = saved.landmarks.tolist()
@@ -303,8 +302,8 @@ def agreeing(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the landmarks of two maps, N(a, A) and N(b, B), that one rigid motion places.
 
-    Starts at the largest set by the motion of a pair; then those that disagree are removed, the
-    worst first, and those that agree added again.
+    From the largest set by the motion of a pair those that disagree are removed, the worst first,
+    and those that agree added again.
     """
     agree = np.ones(len(a), np.bool_)
     if _disagreements(a, A, b, B, agree).max() > limit:

@@ -41,9 +41,7 @@ def robust(island: Island) -> Island:
 def split(
     island: Island, node: int, submaps: Collection[int], value: Float[np.ndarray, " k"]
 ) -> Island:
-    """Give some submaps, by place in the graph, a node of their own, the last one, in place of
-    `node`.
-    """
+    """Give some submaps, by place in the graph, a node of their own (the last) for `node`."""
     grown, state, new = append_nodes(island.graph, island.state, [value])
     split_up = tuple(
         each._replace(nodes=np.where(each.nodes == node, new[0], each.nodes))

@@ -91,9 +91,9 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, landmarks by id, biases.
 
-    biases: the error of each row of `sensitivity`; those of the whole team stand last. sensitivity:
-    ∂mean/∂b of each bias node: a robot's own error and the team's add up. A marker's row is that of
-    the ranges' scale, restricted to its landmark.
+    biases: the error of each row of `sensitivity`, the team's last. sensitivity: ∂mean/∂b: a
+    robot's own error and the team's add up. A marker's row is that of the ranges' scale, restricted
+    to its landmark.
     """
 
     contribution: Contribution
@@ -109,8 +109,8 @@ class Joined(NamedTuple):
         own: tuple[Bias, ...],
         common: tuple[CommonError, ...],
     ) -> "Joined":
-        """Make a submap whose `common` errors have a node of the whole team; those of single robots
-        in a saved map stand first.
+        """Make a submap; its `common` errors, those of single robots in a saved map first, have a
+        node of the team.
         """
         biases = (*own, *common)
         rows = _sensitivity(contribution.local, biases)
@@ -246,7 +246,7 @@ class Graph:
 
     @cached_property
     def landmark_start(self) -> Indices:
-        """First landmark of each submap among those of all submaps, and their number."""
+        """First landmark of each submap among all, and their number."""
         return _starts([len(each.contribution.local.ids) for each in self.submaps])
 
     @cached_property
@@ -375,9 +375,8 @@ def add_submaps(
 
     A new end pose or pose node is start ∘ local pose; the first submap that observes a landmark
     places it. A stream without an initial pose is fixed at (0, 0, 0), the gauge of its frame. A
-    bias has scale bias_sigma about 0 (submaps with an unscaled one are taken without biases), a
-    common error is N(0, common_bias_sigma²). numbers: the team's number of each landmark, for
-    submaps with unnamed ones.
+    bias has scale bias_sigma about 0 (without one the submap is taken without biases), a common
+    error is N(0, common_bias_sigma²). numbers: the team's, of unnamed landmarks.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -530,8 +529,8 @@ def remove_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> tuple[Graph, Indices]:
-    """Remove eliminated poses (a stream's first ones) and landmarks, keep the marked factors;
-    return each node's new number. Condensed factors are left out.
+    """Remove eliminated poses (a stream's first) and landmarks; keep the marked factors, but no
+    condensed one; return each node's new number.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
     streams, gone, out = {}, dict(graph.gone), eliminated.tolist()
@@ -583,9 +582,7 @@ def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"
 def append_nodes(
     graph: Graph, state: Values, values: Sequence[Values], fixed: Sequence[bool] = ()
 ) -> tuple[Graph, Values, range]:
-    """Append nodes at these values, which no factor contains yet; return the graph, the state and
-    the nodes.
-    """
+    """Append nodes without factors; return the graph, the state and the nodes."""
     marks = np.array(fixed or [False] * len(values), np.bool_)
     grown = replace(
         graph,
@@ -698,9 +695,7 @@ def merge_graphs(
 
 
 def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tuple[Graph, Values]:
-    """Renumber landmarks; those with the same new number become one node, at the value of the
-    first.
-    """
+    """Renumber landmarks; equal new numbers become one node, at the first's value."""
     first: dict[int, int] = {}
     remaining = np.ones(len(graph.fixed), np.bool_)
     stands_for = np.arange(len(graph.fixed))
