@@ -1,4 +1,4 @@
-"""Batch MAP over all measurements of a team, for `team.batch_map`."""
+"""Batch MAP of `team.batch_map`."""
 
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest

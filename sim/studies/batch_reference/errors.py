@@ -2,10 +2,10 @@
 
 A measurement (range r, bearing b) of a landmark at distance d from robot k at time t is
     b = β(x, l) + bias_b + σ_b √(1 − w_b) e_b(t) + σ_b √w_b ε,
-    r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1), white,
-with white shares w and, for each robot and landmark, a first-order Gauss-Markov process e of unit
-variance: e(t') = a e(t) + √(1 − a²) ε, a = exp(−(t' − t)/τ). The biases have the centre's priors.
-A measurement's own covariance is all of its noise, and white.
+    r = (1 + bias_r) d(x, l) + offset + σ_r √(1 − w_r) e_r(t) + σ_r √w_r ε,  ε ~ N(0, 1),
+with white shares w and a Gauss-Markov process e of each robot and landmark: e(t') = a e(t) + √(1 −
+a²) ε, a = exp(−(t' − t)/τ). Biases have the centre's priors. A measurement's own covariance
+replaces all of its noise, as white.
 """
 
 import math

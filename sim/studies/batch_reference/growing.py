@@ -1,9 +1,8 @@
 """Incremental batch MAP over all raw measurements of a team, by GTSAM.
 
 Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements over a pose per
-robot and keyframe and all landmarks (Dellaert & Kaess 2006). ρ is the identity, or Cauchy's c²
-log(1 + χ²/c²). R is at the predicted range, not differentiated, so each new estimate has a new
-graph. Poses are perturbed on the right.
+robot and keyframe and all landmarks (Dellaert & Kaess 2006). ρ: identity, or Cauchy's c² log(1 +
+χ²/c²). R: at the predicted range, not differentiated. Poses are perturbed on the right.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,9 +41,9 @@ class UnsolvableError(ValueError):
 class GrowingBatch:
     """Estimate of all poses and landmarks, in the map frame.
 
-    starts: initial poses with covariance in (x, y, θ); None: exact. Step k ends at pose
-    len(starts) + k. poses: (x [m], y [m], θ [rad]), initial poses first. robust_c: Cauchy's scale
-    on √χ² of a measurement; None: least squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. poses: (x [m], y [m], θ
+    [rad]), initial poses first, then one per step. robust_c: Cauchy's scale on √χ²; None: least
+    squares.
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]

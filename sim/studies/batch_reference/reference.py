@@ -1,10 +1,9 @@
 """Batch reference: the MAP over all raw measurements of a log, by GTSAM.
 
-One pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘
-Exp(ξ) with the tangent covariance of `increment_of`; each accepted range and bearing with the
-sensor's noise or its own, under a Cauchy loss with the centre's `batch_robust_c`.
-Levenberg-Marquardt starts from the joined solution, paths filled in three ways. Noise `white`:
-independent errors, inter-robot measurements unused; `profile`: see `errors`.
+A pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘ Exp(ξ)
+with the covariance of `increment_of`; accepted ranges and bearings, under a Cauchy loss with the
+centre's `batch_robust_c`. Starts from the joined solution. Noise `white`: independent errors,
+without inter-robot measurements; `profile`: see `errors`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -63,9 +62,9 @@ NO_BIASES = (None, None, None)
 class BatchReference:
     """Optimum of the batch.
 
-    cost = Σ‖r‖²; initial_cost: of the best initial values. gradient_norm: of the cost;
-    newton_decrement: √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases:
-    (bearing [rad], range offset [m], range scale) by robot. team: the run's own final map.
+    cost = Σ‖r‖²; initial_cost: at the best start. gradient_norm: of the cost; newton_decrement:
+    √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases: (bearing [rad],
+    range offset [m], range scale) by robot. team: the run's own final map.
     """
 
     ids: UInt32[np.ndarray, " L"]

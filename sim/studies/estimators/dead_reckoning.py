@@ -23,7 +23,7 @@ class DeadReckoning:
 
 
 def initial_state(pose: Pose) -> DeadReckoning:
-    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose (else step first by `uncertain_start`)."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 

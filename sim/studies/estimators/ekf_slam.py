@@ -33,7 +33,7 @@ class EkfSlam:
 
 
 def initial_state(pose: Pose) -> EkfSlam:
-    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose (else step first by `uncertain_start`)."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
@@ -47,8 +47,7 @@ def filter_step(
 ) -> EkfSlam:
     """Move, update by all known landmarks at once, then place the new ones.
 
-    ranges [m] and bearings [rad] are calibrated. Further measurements of a new landmark update it.
-    Raises NotACovarianceError.
+    Further measurements of a new landmark update it. Raises NotACovarianceError.
     """
     ids_after, slots, first = slots_of(state.ids, ids)
     n = 3 + 2 * len(ids_after)

@@ -1,8 +1,7 @@
 """EKF-SLAM step: motion, measurements of known landmarks, new landmarks.
 
-State: (x, y, theta, x₁, y₁, …); `mean` and `P` have room for new landmarks and change in place. A
-sensor is (σ_range², σ_range_per_m², σ_bearing²). Sums have a fixed order: the bits are the same on
-every processor.
+State: (x, y, theta, x₁, y₁, …); `mean` and `P` have room for new landmarks and change in place.
+Sensor: (σ_range², σ_range_per_m², σ_bearing²). Sums have a fixed order on every processor.
 """
 
 import numpy as np
@@ -28,8 +27,8 @@ def step(
 ) -> bool:
     """Step the pose and the first `known` landmarks; False: mean and P are invalid.
 
-    slots: landmark of each measurement in the state; first: first sight of it. Fails if the
-    innovation covariance is not positive definite.
+    slots: landmark of each measurement in the state; first: first sight of it. Fails if S is not
+    positive definite.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
@@ -131,8 +130,8 @@ def _condition(
 ) -> bool:
     """Update by measurements of the landmarks at `places`, linearised at the state before.
 
-    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), P by `_joseph`. False if S is not positive
-    definite.
+    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), P by `_joseph`. False: S is not
+    positive definite.
     """
     m = 2 * len(places)
     if m == 0:

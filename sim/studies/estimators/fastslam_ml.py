@@ -1,7 +1,7 @@
 """FastSLAM 1.0 with maximum-likelihood data association in each particle.
 
-Montemerlo and Thrun 2003: a detection belongs to the likeliest landmark, or to a new one if none
-is likelier than the gate's edge. The map is the heaviest particle's.
+Montemerlo and Thrun 2003. Beyond the gate a detection is a new landmark; the heaviest particle has
+the map.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from teamslam.team.shapes import Float, Int64
 
 @dataclass(frozen=True)
 class FastSlamMl:
-    """M particles with C landmark slots each, of which the first counts[m] are used.
+    """M particles with C landmark slots, of which the first counts[m] are used.
 
     seen: detections per slot. took: slot of each detection, by particle.
     """
@@ -72,8 +72,6 @@ def filter_step(
 
 
 class _Scan:
-    """Scan in progress: the state's arrays, and the used landmarks."""
-
     def __init__(self, state: FastSlamMl) -> None:
         self._state = state
         self._logs = state.logs.copy()

@@ -1,8 +1,7 @@
 """Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
-W. Xu, sections 4.2 and 4.3. The reset discards correlations and all pose uncertainty but the last
-step's, so covariances are far too small. Two corrections: a landmark's initial covariance follows
-from the measurement (thesis: 30 m), and weights restart with each step.
+W. Xu, sections 4.2 and 4.3. The reset makes covariances far too small. Corrected: a landmark's
+initial covariance follows from the measurement (thesis: 30 m), and weights restart with each step.
 """
 
 from dataclasses import dataclass
@@ -21,10 +20,10 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class ThesisState:
-    """Mean pose and a map of independent landmarks, in the map frame.
+    """Mean pose and independent landmarks, in the map frame.
 
-    pose: (x [m], y [m], theta [rad]). pose_covariance: spread of the last step's particles; may be
-    singular. ids: strictly ascending. landmarks: [m]; covariances: 2 × 2 each [m²].
+    pose: (x [m], y [m], theta [rad]). pose_covariance: of the last step's particles, may be
+    singular. ids: strictly ascending. landmarks: [m]; covariances: [m²].
     """
 
     pose: Pose
@@ -53,7 +52,7 @@ def filter_step(
 ) -> ThesisState:
     """Sample poses about the mean, update and weigh (FastSLAM 1.0), reset to eq. 4.5-4.6.
 
-    Unmeasured landmarks keep their bits. ranges [m] and bearings [rad] are calibrated.
+    Unmeasured landmarks keep their bits.
     """
     after, _ = fastslam.filter_step(
         particles=reset(state, ids, particles),

@@ -1,9 +1,8 @@
 """Hybrid-SLAM as in the appendix of W. Xu's thesis, where its program differs from its text.
 
-Poses and landmarks become their weighted mean after each step, but weights carry over
-(`particle_w(j) = particle_w(j)*w`, reset only if all are zero) without resampling. Particles keep
-their own landmark covariances; eq. 4.6 is unused. A new landmark begins with 15 m and 17.8°,
-rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
+Particles become their weighted mean after each step, but weights carry over (`particle_w(j) =
+particle_w(j)*w`) without resampling; landmark covariances stay each particle's own. A new landmark
+begins with 15 m and 17.8°, rotated by a matrix with one wrong sign (`Gz = [c r*s; s r*c]`).
 """
 
 import math
@@ -49,10 +48,7 @@ def filter_step(
     bearings: Float[np.ndarray, " n"],
     generator: np.random.Generator,
 ) -> CodedState:
-    """Move, multiply the weights, update the landmarks, set all to the mean.
-
-    ranges [m] and bearings [rad] are calibrated.
-    """
+    """Move, multiply the weights, update the landmarks, set all to the mean."""
     known = len(state.particles.ids)
     drawn, _ = fastslam.filter_step(
         particles=state.particles,

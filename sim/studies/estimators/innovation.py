@@ -30,12 +30,10 @@ def innovation(
 ) -> Innovation:
     """ν = z − ẑ of one keyframe's measurements, with their joint predictive covariance.
 
-    The particles before the keyframe predict measurements of known landmarks as the mixture Σ wᵢ
-    N(ẑᵢ, Sᵢ); ẑ and S are its moments, bearings on the circle:
+    Moments of the mixture Σ wᵢ N(ẑᵢ, Sᵢ) that the particles before predict for known landmarks:
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
-        S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
-    First sights are left out. ranges [m] and bearings [rad] are accepted and calibrated; own:
-    their noises. R is white. Raises NotACovarianceError if S is not positive definite.
+        S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ, bearings on the circle.
+    own: the measurements' noises; R is white. Raises NotACovarianceError.
     """
     noises = unclaimed(len(ids)) if own is None else own
     with CoreErrors():
@@ -59,8 +57,8 @@ def joint_innovation(
     """As `innovation`, of one Gaussian over pose and landmarks, such as an EKF's.
 
         S = A P Aᵀ + Hₓ Q Hₓᵀ + R,  A = (Hₓ Gᵀ F, Hₗ),
-    F = ∂(pose ∘ mean)/∂pose; G = blkdiag(R(θ'), 1). mean: (x, y, θ) and the position of each of
-    `landmarks`, N = 3 + 2 L.
+    F = ∂(pose ∘ mean)/∂pose; G = blkdiag(R(θ'), 1). mean: (x, y, θ), then `landmarks`; N = 3 + 2
+    L.
     """
     _, at, _ = slots_of(landmarks, ids)
     known = at < len(landmarks)

@@ -1,7 +1,7 @@
 """Multi-robot FastSLAM: a particle is a path of every robot and one map.
 
-p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, for
-any number of robots at known start poses. Overconfident sooner than with one robot.
+p(x¹, …, xᴿ, m | z, u) = p(m | x, z) Π_r p(xʳ | zʳ, uʳ): Ma & Ma, section IV-D, algorithm 1, at
+known start poses.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,11 +21,10 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class JointFastSlam:
-    """M particles (x¹, …, xᴿ, m, w).
+    """M particles (x¹, …, xᴿ, m, w); see `fastslam.Particles`.
 
-    poses: (x [m], y [m], theta [rad]) by robot and particle, in the map frame. Others as in
-    `fastslam.Particles`. resample_below: relative effective sample size below which a step first
-    resamples; 1: always, as in algorithm 1.
+    poses: (x [m], y [m], theta [rad]) by robot and particle. resample_below: relative effective
+    sample size below which a step first resamples; 1: always.
     """
 
     robots: tuple[str, ...]
@@ -41,7 +40,7 @@ class JointFastSlam:
 def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
-    """Start at exact poses; for an uncertain one begin with a turn by Increment(0, covariance)."""
+    """Start at exact poses (else turn first by `uncertain_start`)."""
     none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
         robots=tuple(poses),
@@ -60,8 +59,7 @@ def filter_step(
 ) -> JointFastSlam:
     """Resample if the particles are thin, then process the robots' turns in order.
 
-    Each turn multiplies the weights by p(zʳ | …). Draws one uniform number if it resamples and M ×
-    3 normal ones per turn. Raises ValueError for an unknown robot.
+    Each turn multiplies the weights by p(zʳ | …). Raises ValueError for an unknown robot.
     """
     thin = state.resample_below * len(state.log_weights)
     if fastslam.effective_sample_size(state.log_weights) < thin:

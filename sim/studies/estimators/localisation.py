@@ -28,8 +28,8 @@ from teamslam.team.shapes import Float, UInt32
 class Localisation:
     """Weighted poses and their map.
 
-    cloud: particles without landmarks, in the map frame. ids, landmarks: the map, ids strictly
-    ascending, [m]. resample_below: relative effective sample size below which a step resamples.
+    cloud: particles without landmarks. ids, landmarks: the map, ids strictly ascending, [m].
+    resample_below: relative effective sample size below which a step resamples.
     """
 
     cloud: Particles
@@ -44,7 +44,7 @@ def initial_state(
     ids: UInt32[np.ndarray, " L"],
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
-    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose (else step first by `uncertain_start`)."""
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
@@ -73,8 +73,7 @@ def filter_step(
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
-    ranges [m] and bearings [rad] are calibrated; unmapped landmarks are left out. Draws one
-    uniform number if it resamples and M × 3 normal ones.
+    Unmapped landmarks are left out.
     """
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)

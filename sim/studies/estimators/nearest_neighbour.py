@@ -1,7 +1,7 @@
 """EKF-SLAM over the whole run with nearest-neighbour data association.
 
-Individual compatibility (Neira and Tardós 2001, section II): the best pair of a scan first, each
-detection and landmark once; beyond the gate a landmark is new.
+Individual compatibility (Neira and Tardós 2001, section II), the best pair of a scan first; beyond
+the gate a landmark is new.
 """
 
 from dataclasses import dataclass, replace

@@ -1,7 +1,7 @@
 """FastSLAM over the whole run: one set of particles from start to end.
 
-Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. After a long run the particles
-share their early path, so the landmarks' covariance is far too small.
+Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Particles come to share their
+early path, so the landmarks' covariance is far too small.
 """
 
 from dataclasses import dataclass, replace
@@ -24,8 +24,7 @@ from teamslam.team.shapes import Float, UInt32
 class PlainFastSlam:
     """Weighted particles in the map frame, with their proposal and resampling.
 
-    resample_below: relative effective sample size below which a step resamples (Xu: 0.5); 1:
-    always (Ma & Ma, Montemerlo).
+    resample_below: relative effective sample size (Xu: 0.5); 1: always (Ma & Ma, Montemerlo).
     """
 
     particles: Particles
@@ -36,7 +35,7 @@ class PlainFastSlam:
 def initial_state(
     pose: Pose, particles: int, proposal: Proposal, resample_below: float
 ) -> PlainFastSlam:
-    """Start at an exact pose; for an uncertain one step first by Increment(0, covariance)."""
+    """Start at an exact pose (else step first by `uncertain_start`)."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 

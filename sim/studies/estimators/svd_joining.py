@@ -1,8 +1,8 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
-argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) over submaps (eq. 4.1), P the identity: a radian counts as a
-metre (sections 3.2 and 4.3). Robots that measure each other exchange maps, rotate one into the
-other's frame by SVD and join the landmarks alone (section 4.3, appendix II).
+argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) over submaps (eq. 4.1) with P the identity: a radian counts
+as a metre. Robots that measure each other exchange maps, aligned by SVD and joined by their
+landmarks (sections 3.2 and 4.3, appendix II).
 """
 
 from collections.abc import Mapping
@@ -41,8 +41,8 @@ class TooFewPointsError(ValueError):
 def reweight(local: LocalMap, weighting: Weighting) -> LocalMap:
     """Replace a submap's covariance for the join.
 
-    "identity": I. "spherical": a position and every landmark get half the trace of their block
-    times I, a heading keeps its variance, no correlations. "full": unchanged.
+    "identity": I. "spherical": half the trace of each block times I, no correlations. "full":
+    unchanged.
     """
     if weighting == "full":
         return local
@@ -143,12 +143,11 @@ def exchange_maps(
 ) -> ExchangedMap:
     """Join two maps in the frame of a, by common landmarks and the robots' positions.
 
-    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over the points x and (R, t): each common xᵢ is the
-    middle of its two points, and ½ Σ ‖aᵢ − R bᵢ − t‖² is minimised by `procrustes`. With n common
-    points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have σ̂² D + E Σ_T
-    Eᵀ: D = 1, E = 0 for those of a alone, 1 and G of b alone, 1/2 and G/2 for the common ones; σ̂²
-    = cost/(2n − 3). As in Downs, the maps' covariances are discarded. Raises TooFewPointsError for
-    n < 2.
+    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over x and (R, t): each common xᵢ is the middle of its
+    points, (R, t) is by `procrustes`. With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂²
+    (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have σ̂² D + E Σ_T Eᵀ: D = 1, E = 0 of a alone, 1 and G of b
+    alone, 1/2 and G/2 common; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances are
+    discarded. Raises TooFewPointsError.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -200,7 +199,7 @@ def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMa
     """Join two independent maps in the frame of a, each with its own covariance.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over x and (t, θ); covariance (JᵀWJ)⁻¹.
-    Raises TooFewPointsError for fewer than two common landmarks, NotACovarianceError.
+    Raises TooFewPointsError, NotACovarianceError.
     """
     _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
     if len(in_a) < NEEDED:

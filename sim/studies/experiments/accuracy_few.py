@@ -1,9 +1,9 @@
 """Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
-A map is wrong in another minimum than the truth's (`true_minimum`), silent without a warning.
-Submaps exclude the truth if the cost there exceeds the 99.9 % quantile. A map is beyond its
-ellipsoid if its shape, or the first pose of a robot that joined, is outside its 99.9 % region. An
-alarm is a warning of a right map about more than a large or nonlinear covariance.
+A map is wrong in another minimum than the truth's (`true_minimum`), silent without a warning, and
+beyond its ellipsoid if its shape or a joined robot's first pose is outside the 99.9 % region.
+Submaps exclude the truth beyond the 99.9 % quantile of the cost. An alarm is a warning of a right
+map about more than a large or nonlinear covariance.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options

@@ -1,7 +1,6 @@
 """Real data: every given UTIAS set, five robots, one fixed profile.
 
-`shape`: the error that no rigid motion explains; its NEES per landmark is 2 for a correct
-covariance.
+`shape`: the error after alignment; its NEES per landmark is 2 for a correct covariance.
 """
 
 from collections.abc import Mapping

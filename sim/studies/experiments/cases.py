@@ -131,5 +131,4 @@ def _arguments(task: Task) -> dict[str, Any]:
 def _result(
     work: str, parameters: dict[str, Any], program: str, local: dict[str, str]
 ) -> dict[str, Any]:
-    """Compute a case. program: part of the key of the stored result."""
     return Task(work, parameters, "", local=local).run()

@@ -42,8 +42,7 @@ def curves_task(
 ) -> Task:
     """Make the task of the curves of one run.
 
-    team_scenario: if it differs from the world's. late: measurements are those of the step before.
-    shots: steps whose maps and paths are stored.
+    late: measurements are those of the step before. shots: steps whose maps and paths are stored.
     """
     return Task(
         "teamslam.sim.studies.experiments.curves:curves_run",

@@ -1,9 +1,8 @@
 """Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
 
-Measurements are sampled to one second, with a submap per step, of which only the mean is used.
-Each robot's submaps are joined with the identity, and the maps aligned by singular values
-(`svd-join-spherical`). A submap is a window of the hybrid estimator; his is a step of an EKF
-without earlier landmarks.
+Measurements and submaps of one second; a robot's submaps are joined with the identity, the maps
+aligned by singular values (`svd-join-spherical`). A submap is a window of the hybrid estimator;
+his is an EKF step.
 """
 
 from collections.abc import Mapping, Sequence
@@ -244,7 +243,6 @@ def _mutual(
 def _looks(
     samples: Sequence[Sample], robot: str, sensor: Sensor
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Last calibrated (range [m], bearing [rad]) by teammate and step."""
     found: dict[str, dict[int, tuple[float, float]]] = {}
     for message in messages(samples, ch.SIGHTINGS.key(robot)):
         if isinstance(message, m.Sightings):

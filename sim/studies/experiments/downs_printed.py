@@ -1,8 +1,7 @@
 """Printed figures of J. Downs' thesis: root mean square errors in metres.
 
-Inconsistencies: rows 3 and 8 of table 5.2 are equal, as are rows 6 and 7 of table 5.3; smoothed
-paths of table 5.4 beat the truth system's accuracy of a millimetre; some averages are not those of
-their rows.
+Inconsistent: rows 3 and 8 of table 5.2 and rows 6 and 7 of table 5.3 are equal; table 5.4 has
+paths better than the truth system's millimetre; some averages are not those of their rows.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
 """Common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
 
 Parameters of its program: robot 1's initial pose is that of set 2, α₁ … α₆ are 0.1 for intervals
-of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad². The odometry is not
-calibrated.
+of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad², odometry is
+uncalibrated.
 """
 
 from collections.abc import Mapping

@@ -48,7 +48,6 @@ def _built_in(name: str, robots: int) -> Mapping[str, str]:
 
 
 def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Leaves by their dotted paths; values that all robots share once."""
     if isinstance(value, Mapping):
         for name, each in value.items():
             yield from _flat(each, f"{path}.{name}" if path else name)

@@ -126,8 +126,6 @@ class PlainCost:
 
 
 class _Sum:
-    """Sum of the terms' normal equations, of constant sparsity."""
-
     def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
         keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
         diagonal = np.arange(free) * (free + 2)

@@ -22,7 +22,7 @@ LIBRARIES = ("numpy", "scipy", "gtsam")
 class Task:
     """One run. work: `module:function`, from the parameters to a JSON object.
 
-    local: arguments without influence on the result, such as paths. cost: estimated run time [s].
+    local: arguments without influence on the result. cost: estimated run time [s].
     """
 
     work: str

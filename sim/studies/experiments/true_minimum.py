@@ -1,8 +1,8 @@
 """Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
 
-By the final map's own cost (`plain_cost`): whether a solution from the truth has less cost, or
-ends in another place about as likely, and the rise of the cost with the truth fixed (likelihood
-ratio, χ² of the fixed coordinates).
+By `plain_cost`: whether a solution from the truth has less cost, or ends elsewhere about as
+likely, and the rise of the cost with the truth fixed (likelihood ratio, χ² of the fixed
+coordinates).
 """
 
 from collections.abc import Iterable, Mapping
@@ -40,8 +40,8 @@ class TrueMinimum(NamedTuple):
     """The map's minimum compared with that of a solution from the truth.
 
     lower: by how much the latter's cost is less. other_minimum: it ends outside the map's 99.9 %
-    ellipsoid, at a cost that does not exclude it. rise: of the cost with the landmarks and the end
-    of each robot's first submap fixed at the truth; dof: number of fixed coordinates.
+    ellipsoid, at a cost that does not exclude it. rise: of the cost with landmarks and first
+    submaps' ends fixed at the truth; dof: number of these coordinates.
     """
 
     lower: float

@@ -1,7 +1,7 @@
 """Common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
 
-The scenario `thesis` with the 50 particles of section 4.4.2. A figure of the thesis is one run;
-ours is the median of many seeds with the 10 … 90 % band, and one run with its 3σ bound.
+The scenario `thesis` with the 50 particles of section 4.4.2: the median of many seeds with the 10
+… 90 % band, and one run with its 3σ bound; a figure of the thesis is one run.
 """
 
 import math
@@ -64,8 +64,8 @@ class Panel(NamedTuple):
     """One world of a figure, its methods, and the thesis' figures in metres.
 
     noise: of the odometry, (m, rad) in a step. reading: "stated": the text; "exact": exact
-    odometry, while the filters assume noise; "coded": the appendix' program (`as_coded`). printed:
-    by method, the largest error in text or picture.
+    odometry, while the filters assume noise; "coded": `as_coded`. printed: largest error by
+    method.
     """
 
     name: str
@@ -164,7 +164,6 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
 
 
 def _tell_every_step(scenario: Scenario) -> Scenario:
-    """Publish a map at every step of a filter without windows."""
     central = msgspec.structs.replace(scenario.central, broadcast_s=STEP_S)
     scenario = with_robots(scenario, "front_end", window_s=STEP_S)
     return msgspec.structs.replace(scenario, central=central)
@@ -174,9 +173,9 @@ def as_coded(scenario: Scenario) -> Scenario:
     """Set the inputs of the appendix' program where they differ from section 4.4.2.
 
     `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` in `add_control_noise` are variances used as standard
-    deviations: 2.5 mm and 0.16° instead of 5 cm and 3°. `R(2,2) = pi/18^2` is a variance: 5.6°,
-    not 10°. Landmarks are detected within 20 m. `get_observations(xtrue(:,i), …)` measures from
-    the pose before the motion.
+    deviations: 2.5 mm and 0.16°. `R(2,2) = pi/18^2` is a variance: 5.6°, not 10°. Landmarks are
+    detected within 20 m. `get_observations(xtrue(:,i), …)` measures from the pose before the
+    motion.
     """
     coded = with_world(scenario, visible_from_m=0.0, observe_at_start=True)
     return with_noise(with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE)

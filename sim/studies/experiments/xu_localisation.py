@@ -1,7 +1,7 @@
 """Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
 
-Its figures 3.2 to 3.5 are those of Fox et al. 2000. Here, on the thesis' world: the three steps of
-the filter after a stretch without measurements, and an unknown start.
+As figures 3.2 to 3.5 (Fox et al. 2000), on the thesis' world: the filter's three steps after a
+stretch without measurements, and an unknown start.
 """
 
 from collections.abc import Mapping

@@ -33,7 +33,7 @@ class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """Results of an odometry interval: stamps of a new running pose and map.
 
     cloud: the particles. judged: the innovation since its last report, and its time. became:
-    outcomes of all detections without identities, at the end of the stream.
+    outcomes of the stream's detections without identities, at its end.
     """
 
     pose_ns: int | None = None

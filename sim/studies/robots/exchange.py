@@ -1,7 +1,6 @@
-"""Exchange whole maps between a robot and a centre that fuses them.
+"""Exchange whole maps between a robot and a centre that fuses them, every `exchange_s`.
 
-A map is sent every `exchange_s`. Under a rule with feedback the robot waits for the answer
-(lockstep) and absorbs it.
+Under a rule with feedback the robot waits for the answer (lockstep) and absorbs it.
 """
 
 from collections import deque
@@ -20,7 +19,7 @@ class MapExchange:
     """Rounds of one robot.
 
     exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered, awaited:
-    last answered round, and that of the last sent map. last: its sequence; −1: none.
+    last answered and last sent round. last: its sequence; −1: none.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:

@@ -167,9 +167,9 @@ def _plain(proposal: Proposal) -> Filter:
 def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
-    """Draw an unknown initial pose where the sensor may detect a landmark of the known map.
+    """Draw an unknown initial pose in the known map's box, widened by the sensor's reach.
 
-    That is the map's box widened by the sensor's reach, at most by half its longer side.
+    The reach counts at most half the box's longer side.
     """
     front = config.front_end
     landmarks = known.landmarks

@@ -36,9 +36,8 @@ from teamslam.team.robot.maps import Cloud, InitialPose, thin_out
 class RunningEstimator:
     """State after every keyframe; its map is published once per window, or at every keyframe.
 
-    A restarted robot processes its stream again and publishes the same messages. sequence: number
-    of keyframes. associates: accepts scans without identities, whose outcomes are reported at the
-    end.
+    sequence: number of keyframes. associates: accepts scans without identities, with outcomes at
+    the end.
     """
 
     def __init__(

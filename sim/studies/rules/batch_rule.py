@@ -30,8 +30,7 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 class BatchCentre(MeasurementCentre):
     """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
 
-    Newest poses come with each map, whole paths with the final one. Persistent sensor errors and
-    biases are treated as white noise, with a warning.
+    Persistent sensor errors and biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch

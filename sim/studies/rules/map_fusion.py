@@ -1,7 +1,7 @@
 """Fusion of whole maps that the robots then absorb, for comparison.
 
-`kalman_per_axis` and `kalman` treat the maps as independent, which they are not after an exchange.
-Covariance intersection is consistent for any correlation.
+The Kalman rules treat the maps as independent, which they are not after an exchange; covariance
+intersection is consistent for any correlation.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -42,8 +42,8 @@ class MeasurementCentre(ComparisonCentre):
     """Estimate over all robots' raw measurements at the centre.
 
     The keyframes of one team time are one step, the clock of the maps. Robots with an unknown
-    initial pose are left out; if none is known the first robot's is the frame. A map's members
-    name each robot's last measurement.
+    initial pose are left out; if none is known the first robot's is the frame. Members name the
+    robots' last measurements.
     """
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)

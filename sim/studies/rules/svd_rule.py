@@ -1,7 +1,6 @@
 """Map joining as in Downs' thesis: each robot joins its own submaps, the maps are aligned by SVD.
 
-Each robot's least-squares map (section 4.1) is moved into the others' frame by SVD over the common
-landmarks, and joined (section 4.3). The first robot's initial pose fixes the frame.
+Sections 4.1 and 4.3. The first robot's initial pose fixes the frame.
 """
 
 import math
@@ -191,9 +190,9 @@ def align_maps(
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
     """Align greedily the map with the most landmarks in common with the aligned ones.
 
-    sightings: by two streams in order, the positions in both maps of robots that measured each
-    other; aligned like common landmarks, but not with `full`. A map with too few common points is
-    left out, with the reason.
+    sightings: by two streams in order, positions in both maps of robots that measured each other;
+    like common landmarks, but not with `full`. A map with too few common points is left out, with
+    the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}
