@@ -30,9 +30,9 @@ Judged = Callable[
 class Filter(NamedTuple):
     """Recursive estimator over its own state.
 
-    Steps take calibrated ranges [m] and bearings [rad]. looks: accepts landmarks; claims: with covariances; maps: has a map; joint: with covariances
-    between landmarks. absorbed: state with these landmarks. particles: for viewers. innovation: of
-    a step's measurements, predicted by the state before.
+    Steps take calibrated ranges and bearings. looks: accepts landmarks; claims: with covariances;
+    maps: has a map; joint: with covariances between landmarks. absorbed: state with these landmarks.
+    particles: for viewers. innovation: of a step's measurements, predicted by the state before.
     """
 
     initial_state: InitialState
