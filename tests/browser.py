@@ -28,8 +28,6 @@ def chromium() -> str | None:
 
 
 class Page:
-    """A page of the browser."""
-
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
         self._number = 0

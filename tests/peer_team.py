@@ -128,7 +128,6 @@ class PeerTeam:
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
-        """Restart a robot with its stored set."""
         world = self._world
         assert isinstance(world, WorldNode)
         self.seat(config)
@@ -218,7 +217,6 @@ class PeerTeam:
             self._say(to, seat.boundary.take(seat.node, sample))
 
     def _see(self) -> None:
-        """Deliver changes of liveliness by reach."""
         for robot, seat in self.seats.items():
             for other in self.seats:
                 if other == robot:

@@ -41,7 +41,6 @@ def modules_with_shapes() -> list[str]:
 
 
 def begin_test() -> None:
-    """Check every function again."""
     _calls.clear()
     for function in _through:
         del function.__no_type_check__

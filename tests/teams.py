@@ -261,7 +261,6 @@ class Team:
         return True
 
     def mend(self) -> bool:
-        """Let robots request missing measurements."""
         found = False
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.request()

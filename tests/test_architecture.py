@@ -1,5 +1,3 @@
-"""Files, names in files, links, commands and options in the documentation exist."""
-
 import ast
 import re
 from functools import cache
@@ -80,7 +78,6 @@ def dangling(page: Path) -> list[str]:
 
 
 def anchors(page: Path) -> set[str]:
-    """Headings of a page as links spell them."""
     plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in names_of(page))
     return {each.strip().replace(" ", "-") for each in plain}
 

@@ -1,5 +1,3 @@
-"""The end of a team is accepted from its author only."""
-
 import pytest
 
 from teamslam.team.end_query import EndQuery

@@ -332,7 +332,6 @@ def imports_of(path: Path) -> set[str]:
 
 
 def reached_from(module: str) -> set[str]:
-    """All modules that importing a module loads."""
     seen, ahead = set(), [module]
     while ahead:
         name = ahead.pop()

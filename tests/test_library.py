@@ -1,5 +1,3 @@
-"""The library's public names, and the programs in examples/."""
-
 import ast
 import json
 import re

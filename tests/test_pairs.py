@@ -1,5 +1,3 @@
-"""Pairs of estimator and rule; recipes of new ones."""
-
 import subprocess
 import sys
 from typing import get_args

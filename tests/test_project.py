@@ -1,5 +1,3 @@
-"""Versions, pins, extras, compose file, baselines."""
-
 import os
 import re
 import shlex
@@ -47,7 +45,6 @@ def closure(*roots: str) -> set[str]:
 
 
 def tracked() -> list[Path]:
-    """Files under version control; skips without a checkout."""
     git = shutil.which("git")
     if git is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout: nothing is tracked")
@@ -109,7 +106,6 @@ def test_no_data_set_and_no_log_is_committed():
 
 
 def commands(page: Path, program: str) -> set[str]:
-    """Sub-commands of `program` in the page's code."""
     found = re.findall(rf"^\s*(?:\$ )?{program} ([a-z][\w-]*)", page.read_text(), re.MULTILINE)
     return set(found)
 

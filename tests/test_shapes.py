@@ -1,5 +1,3 @@
-"""The checker of shapes runs in every test, at bounded cost."""
-
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError

@@ -1,5 +1,3 @@
-"""A node's shell: reports while waiting, and its end."""
-
 import logging
 import signal
 import threading
@@ -17,8 +15,6 @@ from tests import build
 
 
 class Waiting:
-    """A node that waits, then works."""
-
     finished = False
     state = "waiting"
 

@@ -1,5 +1,3 @@
-"""Teams with sightings: the laws hold, and the log reproduces the run."""
-
 import random
 
 import msgspec

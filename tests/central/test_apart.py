@@ -1,5 +1,3 @@
-"""While robots contradict each other, no prior contains another robot's submaps."""
-
 import math
 from functools import cache
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The bounded running fold of landmarks without identities."""
-
 import numpy as np
 import pytest
 
@@ -44,7 +42,6 @@ def cluttered():
 
 
 def with_clutter(local, rng):
-    """The submap with one false landmark."""
     n = len(local.ids) + 1
     at = rng.uniform(-5.0, 5.0, 2)
     return LocalMap(

@@ -1,5 +1,3 @@
-"""Absolute positions (GNSS) make the map absolute."""
-
 import dataclasses
 from functools import cache
 

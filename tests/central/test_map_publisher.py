@@ -1,5 +1,3 @@
-"""Maps and priors that the centre publishes."""
-
 from itertools import pairwise
 
 import msgspec

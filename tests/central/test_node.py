@@ -1,5 +1,3 @@
-"""The centre's node: ticks, the end, exchanges, attendance of robots."""
-
 import random
 
 import msgspec

@@ -1,5 +1,3 @@
-"""Surveyed landmarks fix the team's frame, also without a known start."""
-
 from functools import cache
 
 import msgspec

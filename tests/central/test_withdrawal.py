@@ -303,7 +303,6 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong():
 
 
 def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
-    """The small world with 30 % outliers."""
     of = scenario(landmark_submaps=2)
     replaced = msgspec.structs.replace
     team = tuple(replaced(r, front_end=replaced(r.front_end, particles=40)) for r in of.robots)

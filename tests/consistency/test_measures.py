@@ -1,5 +1,3 @@
-"""The statistics and their intervals, on errors of a given covariance."""
-
 import numpy as np
 import pytest
 from scipy.special import chdtri, gammaincinv

@@ -1,5 +1,3 @@
-"""Elementary functions and random numbers of the core."""
-
 import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext

@@ -1,5 +1,3 @@
-"""The sparse factorisation equals the dense one, and names an undetermined variable."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

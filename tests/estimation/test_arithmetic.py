@@ -1,5 +1,3 @@
-"""The estimation's bits do not depend on the processor's features."""
-
 import json
 import os
 import platform

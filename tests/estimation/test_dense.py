@@ -1,5 +1,3 @@
-"""Own products and solutions against NumPy's, and one order of every sum."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Motion and sensor models against central differences, samples and limits."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Measurements with their own noises, as range and bearing and as points."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""SE(2) against its own laws and against 3 × 3 matrices."""
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

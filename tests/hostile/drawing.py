@@ -53,7 +53,6 @@ def valid(message: m.Message) -> m.Message | None:
 
 
 def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
-    """A covariance of a kind that breaks solvers."""
     mild = rng.random() < 0.5
     sigmas = (
         np.full(n, 0.1) if mild else rng.choice(SIGMAS, n if rng.random() < 0.3 else 1) * np.ones(n)
@@ -75,7 +74,6 @@ def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def numbers(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Coordinates: mostly sensible, some equal, some far off."""
     if rng.random() < 0.6:
         return rng.uniform(-20.0, 20.0, n)
     if rng.random() < 0.3:

@@ -1,5 +1,3 @@
-"""Every node refuses, counts and reports impossible messages, and changes nothing."""
-
 import msgspec
 import pytest
 

@@ -40,7 +40,6 @@ def members_of(*keys: str, payload: bytes = b"x", signature: bytes = b"", node: 
 
 
 def asked_in(out: list) -> int:
-    """Number of submaps requested in some messages."""
     requests = [each.message for each in out if each.channel is ch.MEMBERS]
     return sum(w.last - w.first + 1 for each in requests for w in each.requested)
 

@@ -1,5 +1,3 @@
-"""A robot continues on any stream, and rejects measurements with a reason."""
-
 import os
 from collections import Counter
 from itertools import pairwise

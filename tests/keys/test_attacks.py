@@ -103,7 +103,6 @@ def door(keys: Folders | None) -> Iterator[Callable[[str], ZenohBus]]:
 
 
 def arriving(bus: ZenohBus, last: str) -> list[str]:
-    """Keys that arrive until this one does."""
     found: list[str] = []
 
     def look() -> bool:

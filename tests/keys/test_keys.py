@@ -1,5 +1,3 @@
-"""Certificates of a team: made, stored, renewed, revoked; errors are named."""
-
 import shutil
 import stat
 from datetime import UTC, datetime, timedelta

@@ -1,5 +1,3 @@
-"""Missing answers end no process; evidence against a certificate does."""
-
 import logging
 import socket
 import threading

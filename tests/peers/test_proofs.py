@@ -1,5 +1,3 @@
-"""With keys, members that a third robot carries need their author's signature."""
-
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -133,7 +131,6 @@ class Renewed:
         return PeerNode(ch.robot_node(robot), ROBOTS, Proofs(robot, signer))
 
     def own(self) -> Proofs:
-        """r1's proofs with its present key."""
         return Proofs("r1", Signer(credentials_of(self.folder, "robot-r1", "t")))
 
     def say(self, proofs: Proofs, *members: Member) -> None:

@@ -1,5 +1,3 @@
-"""Replicas of the set: members, questions, storms, the end."""
-
 import msgspec
 import pytest
 

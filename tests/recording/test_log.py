@@ -1,5 +1,3 @@
-"""Recorder, reader and repair: logs read back equal, and damage is named."""
-
 import hashlib
 import struct
 import subprocess

@@ -1,5 +1,3 @@
-"""Parts of a log, a robot's own log, and flipped bits."""
-
 import os
 import random
 import resource

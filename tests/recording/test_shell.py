@@ -1,5 +1,3 @@
-"""The recorder's and the replayer's processes."""
-
 import math
 import threading
 import time

@@ -1,5 +1,3 @@
-"""The inbox: measurements in order, each once, in any order of arrival."""
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -1,5 +1,3 @@
-"""The robot's process, one per name."""
-
 import threading
 import time
 from collections.abc import Callable

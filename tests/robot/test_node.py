@@ -1,5 +1,3 @@
-"""The robot's node: its contributions depend on its own measurements alone."""
-
 from functools import cache
 from itertools import pairwise
 

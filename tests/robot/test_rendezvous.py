@@ -1,5 +1,3 @@
-"""A rendezvous changes when submaps are sent, never their content."""
-
 import random
 
 import msgspec

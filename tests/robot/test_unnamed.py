@@ -1,5 +1,3 @@
-"""Landmarks without identities: detections, classes."""
-
 import msgspec
 import numpy as np
 import pytest

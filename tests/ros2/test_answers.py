@@ -1,5 +1,3 @@
-"""Results for ROS 2: right numbers and frames, read by independent readers."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""CDR of each supported type decodes to values; damage is an error."""
-
 import random
 from typing import Any
 

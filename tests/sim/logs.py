@@ -47,7 +47,6 @@ def streams(of: Scenario) -> WorldStreams:
 
 
 def samples(out: Sequence[Outgoing]) -> list[Sample]:
-    """Samples that a recorder stores of publications."""
     return [Sample(o.key, encoded(o.message), o.message.stamp_ns, 0, i) for i, o in enumerate(out)]
 
 

@@ -19,7 +19,6 @@ def bounds_of(seed, believed=lambda scenario: scenario):
 
 
 def halved(scenario):
-    """Claim a quarter of the variance."""
     sensors = [
         msgspec.structs.replace(r.sensor, bearing_sigma=0.5 * r.sensor.bearing_sigma)
         for r in scenario.robots

@@ -1,5 +1,3 @@
-"""The batch MAP: its factors, its unique optimum, its covariance."""
-
 import sys
 from dataclasses import replace
 

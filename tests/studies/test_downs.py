@@ -1,5 +1,3 @@
-"""The experiments after Downs' thesis: his protocol, and one of his tables."""
-
 from pathlib import Path
 
 import msgspec

@@ -1,5 +1,3 @@
-"""Runs of experiments, and shards computed apart."""
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,5 +1,3 @@
-"""Experiments: figures over seeds, goals, the page, the command line."""
-
 import pytest
 from typer.testing import CliRunner
 

@@ -1,5 +1,3 @@
-"""The growing batch MAP: equal to the dense solution, and consistent."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""The cost decides whether a map lies in the truth's minimum."""
-
 from dataclasses import replace
 from typing import Any
 

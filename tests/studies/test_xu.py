@@ -1,5 +1,3 @@
-"""The thesis' figures: its readings of the measurements, and its filter's steps."""
-
 import math
 from collections.abc import Mapping
 from typing import Any

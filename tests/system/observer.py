@@ -38,7 +38,6 @@ class Observer:
         return self._counts.get(channel.key(name), 0)
 
     async def sees(self, number: int, channel: Channel, name: str = "") -> None:
-        """Return after so many messages of the key."""
         what = f"{number} messages of {channel.key(name)}"
         await until(lambda: self.count(channel, name) >= number, what)
 

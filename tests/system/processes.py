@@ -57,14 +57,12 @@ class Process:
         assert text in self.said(), f"{self.name} ended with {self.exit}:\n{self.said()}"
 
     async def ended(self, timeout_s: float = 300.0) -> int:
-        """Its exit status after it ended by itself."""
         try:
             return await asyncio.wait_for(self._process.wait(), timeout_s)
         except TimeoutError:
             pytest.fail(f"{self.name} has not ended within {timeout_s:g} s:\n{self.said()}")
 
     async def end(self) -> None:
-        """End it at once."""
         if self.exit is None:
             self._process.kill()
         await self._process.wait()

@@ -1,5 +1,3 @@
-"""Processes started by hand: their output and refusals."""
-
 import signal
 
 from tests.system.scenarios import short

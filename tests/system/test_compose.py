@@ -1,5 +1,3 @@
-"""The services of docker-compose.yml, each in a network namespace, without containers."""
-
 import os
 import shutil
 import subprocess

@@ -1,5 +1,3 @@
-"""Hostile traffic through real processes; `tests/trials/hostile.py` has more."""
-
 import time
 from itertools import islice
 from random import Random

@@ -1,5 +1,3 @@
-"""The program as installed from its wheel."""
-
 import shutil
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""With lost messages the map is that of a run without losses."""
-
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +15,6 @@ from tests.system.scenarios import STEPS, final_map, map_in_memory, short
 
 @dataclass
 class Team:
-    """A team of single processes, started by hand."""
-
     scenario: Path
     endpoint: str
     robots: dict[str, Process]

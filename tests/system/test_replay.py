@@ -1,5 +1,3 @@
-"""`teamslam replay`: a log's traffic again, to an independent program."""
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +17,6 @@ Arrived = list[tuple[str, bytes, bytes]]
 
 @contextmanager
 def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
-    """Samples that a foreign Zenoh session receives."""
     config = zenoh.Config.from_json5(
         f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
         "scouting: {multicast: {enabled: false}}, "
@@ -37,7 +34,6 @@ def plain_subscriber(endpoint: str) -> Iterator[Arrived]:
 
 
 def recorded(launched: Launched) -> Arrived:
-    """The expected samples: the log's messages in order."""
     return [
         (
             (key := f"team/short/{sample.key}"),

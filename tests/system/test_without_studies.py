@@ -1,5 +1,3 @@
-"""The product works without the folders that are there for comparison."""
-
 import os
 import shutil
 import sys

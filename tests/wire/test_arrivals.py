@@ -1,5 +1,3 @@
-"""Order and gaps of arrivals, and intervals of numbers."""
-
 import itertools
 
 from hypothesis import given

@@ -1,5 +1,3 @@
-"""docs/wire.md matches the code: its tables are the code's, its program runs."""
-
 import ast
 import inspect
 import re
@@ -65,7 +63,6 @@ def message_list() -> str:
 
 
 def fields_by_type() -> dict[str, str]:
-    """Fields with the usual types, by type."""
     common: dict[str, list[str]] = {}
     for name, of in usual_types().items():
         common.setdefault(of, []).append(f"`{name}`")

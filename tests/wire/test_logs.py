@@ -1,5 +1,3 @@
-"""Foreign messages neither fill a log nor forge a line of it."""
-
 import logging
 
 from teamslam.sim.launch.watch import Watch

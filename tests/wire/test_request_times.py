@@ -1,5 +1,3 @@
-"""A missing message is requested after a while, at growing intervals."""
-
 import itertools
 
 from teamslam.team.wire.request_times import LONGEST_S, PATIENCE_S, RequestTimes

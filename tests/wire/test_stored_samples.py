@@ -1,5 +1,3 @@
-"""The samples that a router stores of a team, without a network."""
-
 import msgspec
 import pytest
 

@@ -1,5 +1,3 @@
-"""The bus over Zenoh: lost links, peers and processes; and the router."""
-
 import itertools
 import random
 import subprocess

@@ -31,7 +31,7 @@ class Filter(NamedTuple):
     """Recursive estimator over its own state.
 
     Steps take calibrated ranges and bearings. looks: accepts landmarks; claims: with covariances;
-    maps: has a map; joint: with covariances between landmarks. absorbed: state with these landmarks.
+    maps: has a map; joint: with covariances between landmarks. absorbed: with these landmarks.
     particles: for viewers. innovation: of a step's measurements, predicted by the state before.
     """
 

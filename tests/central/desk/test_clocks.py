@@ -1,5 +1,3 @@
-"""Robots' clocks in results and in a running team."""
-
 from pathlib import Path
 
 import numpy as np

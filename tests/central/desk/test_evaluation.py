@@ -1,5 +1,3 @@
-"""Figures of a run equal their definitions."""
-
 import json
 
 import msgspec

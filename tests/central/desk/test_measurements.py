@@ -1,5 +1,3 @@
-"""The first message of each number counts."""
-
 import msgspec
 import numpy as np
 from hypothesis import given, settings

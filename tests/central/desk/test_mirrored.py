@@ -1,5 +1,3 @@
-"""Bearings of the wrong sign are detected from the odometry alone."""
-
 from array import array
 from dataclasses import replace
 
@@ -20,7 +18,6 @@ ALONE = StressWorld(robots=1, seconds=150.0)
 
 @pytest.fixture(scope="module", params=[1, 2, 3])
 def sound(request, tmp_path_factory):
-    """Measurements of a robot without a fault."""
     world = replace(ALONE, seed=request.param)
     return timed_of(published(world, tmp_path_factory.mktemp("sound")), "r1")
 

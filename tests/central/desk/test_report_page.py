@@ -44,7 +44,6 @@ def log():
 
 @pytest.fixture
 def _without_pictures(monkeypatch):
-    """Skip drawing, which takes most of the time."""
     monkeypatch.setattr(report_page, "write_pictures", lambda *_: {})
 
 

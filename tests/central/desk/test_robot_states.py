@@ -24,7 +24,6 @@ from tests.central.test_withdrawal import run, scenario
 
 @pytest.fixture(scope="module")
 def samples():
-    """A run in which the centre withdraws r3."""
     return run(scenario(), "odometry")
 
 

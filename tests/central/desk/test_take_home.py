@@ -1,5 +1,3 @@
-"""Exported results: paths at keyframe rate with covariances, the map as tables."""
-
 import csv
 import json
 

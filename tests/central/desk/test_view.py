@@ -1,5 +1,3 @@
-"""Views of a team's messages, read back by an independent reader."""
-
 import json
 from collections import defaultdict
 

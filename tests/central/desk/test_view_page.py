@@ -1,5 +1,3 @@
-"""The live page: frames, access rules, channels for Foxglove."""
-
 import base64
 import json
 import re

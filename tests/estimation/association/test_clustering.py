@@ -1,5 +1,3 @@
-"""Association inside a window, in simulated windows of known landmarks."""
-
 from dataclasses import replace
 
 import numpy as np

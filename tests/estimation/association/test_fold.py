@@ -1,5 +1,3 @@
-"""The fold of submaps without landmark identities."""
-
 from dataclasses import replace
 
 import numpy as np

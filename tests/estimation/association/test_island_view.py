@@ -1,5 +1,3 @@
-"""Views of islands, their votes for a relative motion, their landmark numbers."""
-
 from itertools import permutations
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Pairs of landmarks: gates, likelihoods, classes, densities, joint compatibility."""
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,5 +1,3 @@
-"""Tests of a closure inside one map, and between two."""
-
 import numpy as np
 import pytest
 

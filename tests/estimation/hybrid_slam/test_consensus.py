@@ -1,5 +1,3 @@
-"""Outlier rejection in a window: consistent measurements stay, outliers go."""
-
 from dataclasses import dataclass
 
 import msgspec
@@ -24,8 +22,6 @@ PLACES = np.array([[5.0, 4.0], [9.0, -3.0], [12.0, 6.0], [2.0, -5.0]])
 
 @dataclass
 class Drive:
-    """A robot's window: motions and measurements, by keyframe."""
-
     motions: list[Increment]
     keyframes: np.ndarray
     ids: np.ndarray

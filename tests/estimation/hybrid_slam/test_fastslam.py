@@ -1,5 +1,3 @@
-"""FastSLAM against the exact posterior of linear problems, and its invariances."""
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

@@ -1,5 +1,3 @@
-"""The segmenter neither loses nor repeats motion, wherever observations fall into it."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""One measurement of a landmark against the textbook, with correlated covariances."""
-
 import math
 
 import numpy as np

@@ -28,7 +28,6 @@ def robot() -> RobotConfig:
 
 
 def spoilt(given: RobotStream) -> RobotStream:
-    """Displace every fifth measurement of the stream."""
     seen = given.landmark_detections
     rows = np.arange(len(seen.ids)) % 5 == 2
     ranges = np.where(rows, 2.0 + seen.ranges, seen.ranges)

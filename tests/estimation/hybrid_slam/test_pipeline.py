@@ -1,5 +1,3 @@
-"""The front end from measurements to closed windows; mounted sensors."""
-
 from itertools import pairwise
 
 import numpy as np

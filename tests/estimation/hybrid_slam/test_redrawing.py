@@ -1,5 +1,3 @@
-"""Windows against the truth and against dense solutions."""
-
 import numpy as np
 import pytest
 

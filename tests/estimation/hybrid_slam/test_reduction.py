@@ -1,5 +1,3 @@
-"""Windows of detections without identities."""
-
 import numpy as np
 import pytest
 

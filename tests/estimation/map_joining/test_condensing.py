@@ -1,5 +1,3 @@
-"""The bounded fold: condensed submaps, and the identities that it keeps."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -32,7 +32,6 @@ WHOLE = replace(ROBUST, landmark_gate=math.inf)
 
 
 def mistaken(world, seed, share=0.3):
-    """Exchange two landmarks in some submaps of r0."""
     rng = np.random.default_rng([seed, 3])
     submaps = []
     for each in world.submaps:

@@ -1,5 +1,3 @@
-"""Errors of linearisation: bent ellipses, and maps that become too long."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Observations of landmarks by single submaps: places, covariances, scatter."""
-
 import numpy as np
 import pytest
 

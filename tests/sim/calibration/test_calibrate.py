@@ -1,5 +1,3 @@
-"""Calibration recovers the simulated errors within its own uncertainty."""
-
 from dataclasses import replace
 from pathlib import Path as File
 from typing import Any

@@ -1,5 +1,3 @@
-"""Measurements determine factors on claimed covariances and the sensor's mount."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""The covariance factor is calibrated from the distances of single robots' maps."""
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,5 +1,3 @@
-"""Rates of clutter and missed detections, and claimed covariances, calibrate without identities."""
-
 from dataclasses import replace
 
 import msgspec

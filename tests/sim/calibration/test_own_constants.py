@@ -1,5 +1,3 @@
-"""Calibration distinguishes cameras that differ, and depth from distance."""
-
 from dataclasses import replace
 
 import numpy as np

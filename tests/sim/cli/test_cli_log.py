@@ -1,5 +1,3 @@
-"""`teamslam log`: output, files, refusals and exit status."""
-
 import msgspec
 import numpy as np
 import pytest

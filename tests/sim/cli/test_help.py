@@ -1,5 +1,3 @@
-"""The command line: help, suggestions, plain parsing, progress, comparison of runs."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Wrong use: exit status 2 and one clear message, without a traceback."""
-
 import sys
 from pathlib import Path
 

@@ -26,7 +26,6 @@ from tests import teams
 
 
 def data_set(path: Path, **tables: str) -> Path:
-    """A robot's tables by name, beside `landmarks`."""
     for name, text in tables.items():
         place = path if name == "landmarks" else path / "r1"
         place.mkdir(parents=True, exist_ok=True)

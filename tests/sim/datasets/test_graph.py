@@ -1,5 +1,3 @@
-"""Landmark graphs in the field's text formats: numbers, pieces, errors."""
-
 from pathlib import Path
 
 import numpy as np

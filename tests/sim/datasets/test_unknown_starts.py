@@ -1,5 +1,3 @@
-"""Real data with one stated start pose: all robots join."""
-
 from pathlib import Path
 
 import msgspec

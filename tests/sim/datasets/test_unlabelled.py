@@ -1,5 +1,3 @@
-"""Data sets without landmark identities."""
-
 from pathlib import Path
 
 import msgspec

@@ -1,5 +1,3 @@
-"""Maps of columns: references are no odometry, detections need no identities."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""The examples of docs/your_data.md and docs/your_ros2_robot.md work as described."""
-
 import re
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""A team in one process, with the same map in any process."""
-
 import os
 import subprocess
 import sys

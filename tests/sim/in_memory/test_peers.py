@@ -19,7 +19,6 @@ SECOND = 1_000_000_000
 
 
 def scenario():
-    """Three robots; the third meets the second only."""
     scenario = with_options(load("thesis"), robots=3)
     return msgspec.structs.replace(
         scenario, world=msgspec.structs.replace(scenario.world, steps=32)

@@ -1,5 +1,3 @@
-"""Consistency during a launch equals figures computed independently."""
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

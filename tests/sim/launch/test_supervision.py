@@ -1,5 +1,3 @@
-"""Supervised processes: silence, restarts, memory."""
-
 import os
 import signal
 import time

@@ -1,5 +1,3 @@
-"""The world compares the announced configurations with its scenario before it begins."""
-
 import msgspec
 import pytest
 

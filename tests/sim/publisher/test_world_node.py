@@ -1,5 +1,3 @@
-"""The world's node: order, credit, and answers to requests for missed measurements."""
-
 import numpy as np
 import pytest
 

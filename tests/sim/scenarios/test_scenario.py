@@ -1,5 +1,3 @@
-"""Scenarios: built-in ones, files, the command line, and errors in them."""
-
 from pathlib import Path
 
 import msgspec

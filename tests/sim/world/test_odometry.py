@@ -1,5 +1,3 @@
-"""The simulated odometry has the moments that the filter's models claim."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""The simulated world: noise as configured, and consistent truth."""
-
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +26,6 @@ def world_of(scenario: Scenario, seed: int = 1) -> WorldStreams:
 
 
 def content(stream: RobotStream) -> list[bytes]:
-    """Measurements without sightings of teammates."""
     seen, odometry = stream.landmark_detections, stream.intervals
     arrays = [odometry.forward, odometry.yaw_rate, seen.offsets, seen.ids, seen.ranges]
     assert stream.truth is not None

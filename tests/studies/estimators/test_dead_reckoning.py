@@ -1,5 +1,3 @@
-"""Dead reckoning composes its increments, and its Gaussian is true on SE(2)."""
-
 import numpy as np
 from hypothesis import strategies as st
 

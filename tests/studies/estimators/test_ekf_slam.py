@@ -1,5 +1,3 @@
-"""EKF-SLAM against the textbook's dense formulas, its own symmetries, and the truth."""
-
 import dataclasses
 import functools
 

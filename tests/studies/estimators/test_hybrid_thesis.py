@@ -1,5 +1,3 @@
-"""The thesis' scheme by its equations, and the program of its appendix."""
-
 import numpy as np
 
 from teamslam.sim.studies.estimators import hybrid_thesis, hybrid_thesis_coded

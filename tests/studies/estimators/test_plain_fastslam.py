@@ -1,5 +1,3 @@
-"""FastSLAM over a whole run: a window's filter, with the known overconfidence."""
-
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Downs' joining against an independent least squares, and its covariances."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

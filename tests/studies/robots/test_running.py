@@ -1,5 +1,3 @@
-"""Robots that run an estimator over a stream, with and without identities."""
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Fusion of whole maps: one-dimensional cases by hand, and each rule's properties."""
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

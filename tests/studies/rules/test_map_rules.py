@@ -1,5 +1,3 @@
-"""Whole maps without feedback: fused once, or not at all."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
