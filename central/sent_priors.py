@@ -1,5 +1,5 @@
-"""Select the robots that need a prior: those it gives information from teammates (moved landmarks,
-inter-robot measurements), or landmarks that they come near to.
+"""Select the robots that need a prior, since it has news from teammates (moved landmarks,
+inter-robot measurements) or landmarks nearby.
 
 Priors are most of the centre's traffic. A robot outside the team's map gets the landmarks alone, as
 if at the origin, or one message that withdraws its earlier priors, also from a restarted centre.

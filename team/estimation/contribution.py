@@ -166,8 +166,8 @@ NO_OWN = OwnBiases()
 class Contribution:
     """One submap of the set: `sequence` counts those of (robot, incarnation) from 0.
 
-    A saved map has landmarks only. own, by_own: the errors of single robots in it, and ∂mean/∂o of
-    `local`, which is given at o = 0.
+    A saved map has landmarks only. own, by_own: its errors of single robots, and ∂mean/∂o of
+    `local`, given at o = 0.
     """
 
     robot: str

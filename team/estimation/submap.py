@@ -49,7 +49,7 @@ class Slipped(NamedTuple):
 class Became:
     """Outcomes of a window's detections without identities.
 
-    stamps: of M scans [ns]; counts: detections of each. By detection: rows, its index in the
+    stamps, counts: of M scans [ns], and detections of each. By detection: rows, its index in the
     message; landmarks, its number in the submap, 0 for none; clutter, whether it is false.
     """
 

@@ -91,21 +91,18 @@ FULL_AGE = 1_000_000
 
 @dataclass(frozen=True)
 class JoinSettings:
-    """Settings of map joining.
+    """Settings of map joining; docs/scenario.md describes those of a scenario.
 
-    iterations_per_tick: of `fold_submaps`. robust: whether factors beyond their gates are
-    discounted. The gates of χ² are wider by robust_start² at first, and by robust_decay² less with
-    each iteration, down to 1. submap_gate: factor on the gate of a submap. landmark_gate: χ² of two
-    numbers from which a submap's landmark is discounted. covariance_factor: on every submap's
-    covariance. max_iterations, step_tolerance: end of a full solve, by number of iterations or
-    largest change [m, rad]. alignment_confidence: quantile of the χ² test for a merge of islands.
-    alignment_heading_sigma: for the same, largest `Alignment.heading_sigma` [rad]. bias_sigma:
-    scale of Student's t prior on each error of a robot's submaps. common_bias_sigma: standard
-    deviation of those that all robots share; "marker": share of the range. joined_ranges: whether
-    range errors are proportional to the range in the joined map
-    (`core.SubmapFactor.at_joined_ranges`). landmark_sigma: standard deviation [m], per direction,
-    of the measured point about the landmark's place: part of a map's covariance, not of the
-    weights.
+    robust: whether factors beyond their gates are discounted. The gates of χ² are wider by
+    robust_start² at first, and by robust_decay² less with each iteration, down to 1. submap_gate:
+    factor on the gate of a submap. landmark_gate: χ² of two numbers from which a submap's landmark
+    is discounted. max_iterations, step_tolerance: end of a full solve, by number or largest change
+    [m, rad]. alignment_confidence, alignment_heading_sigma: for a merge of islands, quantile of the
+    χ² test and largest `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on
+    each error of a robot's submaps. common_bias_sigma: standard deviation of those that all robots
+    share; "marker": share of the range. joined_ranges: see `core.SubmapFactor.at_joined_ranges`.
+    landmark_sigma: standard deviation [m] of the measured point about the landmark's place: part of
+    a map's covariance, not of the weights.
     """
 
     iterations_per_tick: int = 2

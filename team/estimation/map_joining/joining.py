@@ -4,10 +4,6 @@ Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the met
 all robots, and over the inter-robot measurements between their pose nodes. The fold is a pure
 function of the order and the ticks' boundaries. A stream with an unknown initial pose is an island
 until shared landmarks and inter-robot measurements tie it to the main island.
-
-Beyond adding nodes and factors and iterating, a tick may test saved maps (`Fold.has_maps`),
-associate, cut and audit (`Fold.has_unnamed`), treat condensed submaps (`Fold.condensed_count`),
-merge islands, and search for another minimum (a suspicious cost).
 """
 
 import math
@@ -139,9 +135,8 @@ class Tick:
     """The contents of one tick, in canonical order.
 
     sightings: the inter-robot measurements from the submaps' poses. starts: initial poses of the
-    streams that begin here. outside: reason for each submap refused in advance. set_aside: messages
-    about other refusals. verdicts: an operator's decisions on landmarks of these submaps or earlier
-    ones.
+    streams that begin here. outside: reason for each submap refused in advance; set_aside: other
+    refusals. verdicts: an operator's, on landmarks of submaps up to here.
     """
 
     contributions: Sequence[Contribution]
@@ -167,16 +162,14 @@ class Fold:
 
     home: island (a key of `islands`) of each stream. reasons: why an island is not merged, by its
     frame. joined: each merge and its certainty, by the former frame. warnings: signs of another
-    minimum of the full solution. rival_m: distance [m] of another minimum that is about as likely.
-    waiting: inter-robot measurements between two islands. judged: number of submaps of two islands
-    at their last failed merge attempt, and its reason. searched_at: number of submaps of an island
-    at its last failed search for a lower minimum. iterations, change: of the main island's last
-    full solution [m, rad]. refused: submaps that are not in the map, with the reason (`refusal`).
-    motion_only: submaps of which only the motion is in the map. left_out: inter-robot measurements
-    with which the map has no solution. set_aside: other refusals in words. landmarks: the sets of
-    unnamed landmarks, with the evidence. audits: closures that may be undone (`auditing`).
-    ambiguous: number of submaps of a stream's island and another one at their last attempt that
-    several alignments passed. cuts: seams at which streams are cut into parts, each a stream here
+    minimum; rival_m: its distance [m], if about as likely. waiting: inter-robot measurements
+    between two islands. judged: number of submaps of two islands at their last failed merge, and
+    its reason; ambiguous: where several alignments passed; searched_at: number at an island's last
+    failed search for a lower minimum. iterations, change: of the main island's last full solution
+    [m, rad]. refused: submaps not in the map, with the reason (`refusal`); motion_only: those with
+    their motion in the map; left_out: inter-robot measurements without a solution; set_aside: other
+    refusals. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
+    be undone (`auditing`). cuts: seams that cut a stream into parts, each a stream here
     (`continuity`).
     """
 
@@ -288,10 +281,9 @@ def fold_submaps(
     """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands where
     possible.
 
-    contributions: in canonical order, after all folded ones and without a gap in a stream; else
-    raises NotCanonicalError or GapError. sightings: the inter-robot measurements from these
-    submaps, each a factor from the tick on in which both of its nodes are in one island. Islands
-    without new submaps keep their state.
+    contributions: in canonical order, after all folded ones; else raises NotCanonicalError or
+    GapError. sightings: from these submaps, each a factor once both of its nodes are in one island.
+    Islands without new submaps keep their state.
     """
     _check_order(fold, contributions)
     home = dict(fold.home)

@@ -1,8 +1,8 @@
 """Place a robot without a start in the team's map, by shared landmarks.
 
-The robot's own map, a Gaussian over its pose p and its landmarks, is one submap with an unknown
-start. The alignment of the shared landmarks gives the start; least squares over the team's
-landmarks and this submap gives the pose with its covariance.
+The robot's own map, a Gaussian over its pose p and its landmarks, is one submap. The alignment of
+the shared landmarks gives its start, least squares over the team's landmarks and this submap the
+pose with its covariance.
 """
 
 from typing import NamedTuple
@@ -40,9 +40,8 @@ def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None)
     """Estimate a robot's pose in the frame of the team's landmarks, or give the reason why they do
     not determine it.
 
-    own: the robot's map from its start on; window: the open one. Where landmarks disagree, the
-    largest set of one rigid motion is used, if it is most of them. Raises NotACovarianceError,
-    NotDeterminedError.
+    own: the robot's map; window: the open one. The largest set of landmarks of one rigid motion is
+    used, if it is most of them. Raises NotACovarianceError, NotDeterminedError.
     """
     whole = own if window is None else join_submap(own, window.named)
     _, in_team, in_own = np.intersect1d(team.ids, whole.ids, return_indices=True)

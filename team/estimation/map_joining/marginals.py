@@ -103,8 +103,7 @@ class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in total, per robot and per submap; unweighted
     χ² of the inter-robot measurements, oldest first.
 
-    An inter-robot measurement counts for its observer, a discounted landmark by its weight. Without
-    a robust loss the total dof is the dimension of all factors less the number of unknowns. A
+    An inter-robot measurement counts for its observer, a discounted landmark by its weight. A
     chi2/dof that stays above 1.1 is a warning; above 1.3 the covariances cannot be trusted.
     """
 

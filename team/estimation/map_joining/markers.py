@@ -1,8 +1,8 @@
 """Marker errors of unnamed landmarks, as states of the full solution.
 
 A sensor that derives distance from an object's size measures each landmark too far by a constant
-share of the range, the same for all robots (`CommonBiasSigmas.marker`). The states are added after
-association, whose evidence separate errors of a landmark's parts would weaken.
+share of the range (`CommonBiasSigmas.marker`). The states are added after association, whose
+evidence they would weaken.
 """
 
 from collections.abc import Mapping

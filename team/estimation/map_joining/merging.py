@@ -1,9 +1,9 @@
 """Merge two islands when their common points leave a single likely place of one in the other.
 
-A merge is tried from every place that the shared points propose: all of them, the landmarks alone,
-the inter-robot measurements alone, and every heading at which they fit well; and from a start
-independent of them (`minima`). The full solution of lowest cost is accepted if the maps agree and
-no other place is about as likely; else the merge is deferred.
+Starts are the places that the shared points propose (all, the landmarks alone, the inter-robot
+measurements alone, every heading at which they fit well), and one independent of them (`minima`).
+The full solution of lowest cost is accepted if the maps agree and no other place is about as
+likely; else the merge is deferred.
 
 A shared point is a landmark of both, or a teammate observed from a pose node: in the observer's
 island at pose ∘ (range, bearing), in its own at its pose node. An inter-robot measurement and the

@@ -181,14 +181,13 @@ class Graph:
     """The nodes in the order of their addition, and the factors between them.
 
     streams: start, then end pose of submap 0, 1, … of each stream. landmarks: node of each id.
-    poses: node of each further pose, by (stream, stamp). biases: node of each error that a stream's
-    submaps share; common: of each error that all streams share, in one number with `biases`;
-    remembered: of each error of a robot on the days of a saved map, by the map. offset: index in
-    the state of each node's first number; the last entry is the state's length. fixed: constant
-    nodes (exactly known initial poses, the gauge). condensed: the quadratic that replaces older
-    submaps (`condensing`). gone: sequence behind a stream's submaps in `condensed`, at which
-    `streams` begins. former: the node of a moved landmark's old place, by (saved map, id). memory:
-    observations of the condensed submaps for data association.
+    poses: of each further pose, by (stream, stamp). biases, common: of each error that a stream's
+    submaps, or all streams, share; remembered: of each error of a robot on the days of a saved map.
+    offset: index in the state of each node's first number, and its length. fixed: exactly known
+    initial poses, the gauge. condensed: the quadratic that replaces older submaps (`condensing`);
+    gone: sequence behind a stream's submaps in it, at which `streams` begins. former: the node of a
+    moved landmark's old place, by (saved map, id). memory: observations of condensed submaps for
+    data association.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
