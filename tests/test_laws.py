@@ -228,7 +228,6 @@ def messages():
     ),
 )
 def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order, again):
-    """Duplicates of submaps and progress come at any time."""
     heard = [messages()[i] for i in order]
     for i, at in again:
         if isinstance(messages()[i], m.Submap | m.Progress):

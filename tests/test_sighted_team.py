@@ -112,7 +112,6 @@ def test_each_measurement_of_a_run_with_sightings_has_one_disposition(samples, t
 
 
 def test_sightings_whose_node_never_comes_are_rejected_at_the_end():
-    """The stream ends half a second before the node."""
     config = SCENARIO.robots[0]
     measurements = published(STREAMS.streams[0])
     wanted = next(

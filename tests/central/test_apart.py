@@ -68,7 +68,6 @@ def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_a
 
 
 def test_too_small_covariances_by_themselves_are_no_contradiction():
-    """All robots state a fifth of their standard deviations."""
     ticks = of_set(team_run())
     for each in messages(team_run(), m.Submap):
         covariance = floats(each.covariance, "covariance") / 25.0

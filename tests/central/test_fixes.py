@@ -94,7 +94,6 @@ def test_fixes_of_one_robot_place_a_team_without_known_starts():
 
 
 def test_a_fix_that_jumps_moves_nothing():
-    """Every tenth fix is 15 m off."""
     rmse, nees = errors(final_map(day(3, jumps=tuple(range(5, 120, 10)))[0]), day(3)[1])
     assert rmse < 0.3
     assert nees < 2.0

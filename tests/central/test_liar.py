@@ -122,7 +122,6 @@ def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
 
 @pytest.mark.parametrize(("liar", "kind"), [*(("r1", kind) for kind in LIES), ("r2", "modest")])
 def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
-    """r1 fixes the frame."""
     samples = run_with(liar, kind)
     final = final_map(list(samples))
     assert final.withdrawn == (liar,)
@@ -138,7 +137,6 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
 
 
 def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
-    """r1 lies for a while; the fold depends on the set alone."""
     samples = run_with("r1", "still")
     ticks = of_set(samples)
     ticks.fold_until(30e9)
@@ -241,7 +239,6 @@ def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map():
 
 
 def test_two_robots_that_contradict_each_other_are_named_and_stay():
-    """r1 shares nothing with r3, so no test decides between r1 and r2."""
     quiet = Agreement(0.0, 1.0, {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}, ())
     loud = Agreement(0.0, 1.0, {"r1": (1e4, 50.0), "r2": (60.0, 50.0), "r3": (50.0, 50.0)}, ())
 

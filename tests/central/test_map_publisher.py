@@ -75,7 +75,6 @@ def test_broadcasts_lie_so_far_apart_and_name_their_set():
 
 
 def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
-    """Windows of 3 s, ticks of 100 s: closed windows are published before their tick ends."""
     found, maps = rule(CentralConfig(tick_s=100.0, broadcast_s=3.0)), []
     for k in range(3):
         for name, behind_ns in (("r1", 3_000_000_000), ("r2", 0)):
@@ -93,7 +92,6 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
 
 
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
-    """A closed window of r1 is published although r2 lags and no broadcast is due."""
     config = CentralConfig(tick_s=100.0, broadcast_s=100.0)
     found, said = rule(config), []
     for name, k in (("r1", 0), ("r2", 0), ("r1", 1)):
@@ -109,7 +107,6 @@ def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
 
 
 def test_no_map_has_less_than_the_one_before_it():
-    """A map goes ahead of the watermark, then r2 comes, two windows behind r1."""
     found, maps = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0)), []
     for k in range(5):
         found.store.add_submap(SUBMAPS["r1"][k])

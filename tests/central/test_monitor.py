@@ -91,7 +91,6 @@ def test_outliers_of_a_minority_do_not_move_the_covariance_scale():
 
 @pytest.mark.parametrize(("dof", "scale"), [(1.0, 3.0), (2.5, 0.1), (8.0, 1.0), (40.0, 25.0)])
 def test_the_covariance_scale_of_drawn_terms_is_theirs(dof, scale):
-    """Mean and scatter of the scale over draws equal the stated ones."""
     rng = np.random.default_rng(0)
     draws = scale * rng.chisquare(dof, (400, 60))
     found = [covariance_scale(terms, np.full(60, dof)) for terms in draws]

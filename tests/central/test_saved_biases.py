@@ -127,7 +127,6 @@ def test_an_old_file_without_errors_is_still_read_and_leaves_todays_less_sure():
 
 
 def test_the_conditional_of_the_errors_is_the_saved_marginal():
-    """Marginalised over the biases, the factors are the landmarks of the file."""
     first, _, starts, _ = two_days(2)
     saved = saved_map(fold_of(first, starts))
     own, plain = translate.own_biases_of(saved), translate.local_map_of(submap_of(saved))

@@ -180,7 +180,6 @@ def test_one_misread_number_does_not_move_a_landmark_that_is_gone(detections):
 
 
 def test_a_running_centre_saves_the_map_of_its_present_set():
-    """The final map of that set, without effect on the running fold; a day counts once."""
     samples, _, centre = first_day()
     members = [s for s in samples if s.key.endswith(("/start", "/submap"))]
     config, robots = msgspec.structs.replace(centre.config, broadcast_s=10.0), list(centre.robots)
@@ -315,7 +314,6 @@ def test_the_saved_map_of_a_log_is_the_centres():
 
 
 def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
-    """Each day's map contains the earlier ones."""
     figures, sizes = [], []
     for seed in (1, 2):
         maps = []
@@ -438,7 +436,6 @@ def test_the_submap_of_a_map_has_landmarks_and_no_motion():
 
 
 def test_the_commands_save_show_and_load_a_map(tmp_path):
-    """`map save`, `map show`, and `rerun --map` of a later day."""
     log, later, site = (tmp_path / name for name in ("log.mcap", "later.mcap", "site.map"))
     for path, samples in ((log, first_day()[0]), (later, second_day(loaded=False)[0])):
         with Recorder(path, "small", {"seed": "1"}) as recorder:

@@ -51,7 +51,6 @@ def expected():
 @settings(deadline=None, max_examples=12)
 @given(st.deferred(lambda: st.permutations(range(len(SUBMAPS.every())))), st.data())
 def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(order, data):
-    """A stream's own submaps come in sequence, since the set delivers no gaps."""
     ticks = fresh()
     waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
     for i in order:

@@ -132,7 +132,6 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final):
 
 
 def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been():
-    """Whether the order comes before, among or after its submaps, or after a broadcast."""
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
     alone = _rule()
     for submap in two_robots()["r1"]:

@@ -210,7 +210,6 @@ def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimate
 
 
 def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
-    """Orders come from the operator alone."""
     node = CentralNode(CentralConfig(), ["r1", "r2", "r3", "r4"])
     for robot in ("r1", "r2", "r3", "r4"):
         report = build.withdrawal_heard(robot=robot, withdrawn="r2", reason="it never was")
@@ -262,7 +261,6 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Map
 
 
 def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
-    """At 35 s r3 is a suspect without enough evidence; five submaps later there is enough."""
     by_time = [each for each in one_closes_windows_often() if not isinstance(each, m.InitialPose)]
     ends = {k: each.stamp_ns * 1e-9 for k, each in enumerate(by_time)}
     at_once, expected = delivered(by_time, {})
@@ -280,7 +278,6 @@ def test_who_is_withdrawn_depends_on_the_set_and_not_on_when_maps_were_sent():
 
 
 def test_who_was_convicted_without_what_comes_late_is_acquitted():
-    """Two that agree outvote a third; a late submap of it invalidates the checkpoint."""
     samples = team_run("odometry")
     ticks = of_set(samples)
     ticks.fold_until(math.inf)

@@ -67,7 +67,6 @@ def nees_of_maps(seeds, common_bias_sigma):
 
 
 def test_a_map_is_consistent_only_with_a_state_of_each_error_that_all_robots_share():
-    """The scale of all ranges, and a common range offset of each landmark's marker."""
     low, high = chi2_interval(10, 0.999, len(SEEDS))
     states = {"range_scale": COMMON, "marker": MARKER}
     assert low < nees_of_maps(SEEDS, states) / 10.0 < high

@@ -87,7 +87,6 @@ def test_the_team_pose_is_overconfident_unless_it_joins_later_submaps_as_the_cen
 
 
 def test_the_team_pose_is_consistent_whatever_the_lag_of_the_last_broadcast():
-    """Broadcasts come late or not at all; the mutant counts the robot's submaps twice."""
     runs, honest, twice = 200, 0.0, 0.0
     for seed in range(runs):
         rng = np.random.default_rng(seed)

@@ -143,7 +143,6 @@ def test_a_file_has_one_driver_and_one_robot(tmp_path):
 
 
 def test_nobody_has_consumed_more_than_the_driver_has_numbered(tmp_path):
-    """A stranger's far count on robot, centre or recorder must not end the driver's credit."""
     node = SourceNode(filled(tmp_path / "r1.stream"))
     node.listening = False
     here = node.journal.count(1)

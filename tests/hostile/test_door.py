@@ -203,7 +203,6 @@ def test_what_a_team_can_say_is_refused_in_no_order(order):
 
 
 def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there():
-    """A stranger's far progress must not make the centre refuse the end."""
     (*said, end) = run()
     done = [each for each in said if each[0] == ch.ROBOT_DONE]
     before = [each for each in said if each[0] != ch.ROBOT_DONE]
@@ -249,7 +248,6 @@ FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
 @pytest.mark.parametrize("behind", [False, True])
 @pytest.mark.parametrize("what", FORGED)
 def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind):
-    """The end and the last messages that confirm each other are accepted, whatever else arrived."""
     (*said, end) = run()
     honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
     given(Boundary("central"), honest, *said, end)
@@ -262,7 +260,6 @@ def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, 
 
 
 def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out():
-    """Otherwise all of the robot's messages would precede its stream by years."""
     node = CentralNode(CentralConfig(), list(STREAMS))
     boundary = Boundary("central")
     given(boundary, node, (ch.START, "r1", FAR_START), *run())
@@ -271,7 +268,6 @@ def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source
 
 
 def test_a_world_goes_on_when_others_took_what_a_stranger_has_published():
-    """Progress beyond the stream, of a robot or the recorder, must not end the credit."""
     streams = world_of(*STREAMS.values())
     announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
     node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")

@@ -149,7 +149,6 @@ OWN_END = Outgoing(ch.TEAM_FINAL, "r2", FINAL)
 def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_elses(
     keys, *, locked
 ):
-    """The final map of a team with a centre is the centre's, whatever a robot or garbage adds."""
     true = msgspec.structs.replace(FINAL, dof=99)
     order = Outgoing(ch.ORDER, "r2", build.withdrawal(robot="r2", reason=""))
     with door(keys if locked else None) as enter:
@@ -349,7 +348,6 @@ def test_a_router_whose_certificate_ends_is_named_by_who_is_in(tmp_path, monkeyp
 
 
 def test_who_is_revoked_while_it_runs_learns_of_it_when_the_router_is_back(tmp_path, monkeypatch):
-    """Its link comes up again and delivers nothing; the other links deliver."""
     monkeypatch.setattr(session, "LINK_S", 0.3)
     home, carried = tmp_path / "home", tmp_path / "carried"
     make_keys(home, TEAM, nodes_of(["r1", "r2"]))

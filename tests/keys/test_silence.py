@@ -116,7 +116,6 @@ def test_only_an_answer_about_certificates_refuses_a_link(keys, answer, waits_fo
 def test_a_process_that_starts_beside_a_stopped_router_waits_for_it(
     keys, with_keys, monkeypatch, caplog
 ):
-    """The router stands still for longer than patience."""
     monkeypatch.setattr(session, "FIRST_LOOK_S", 0.2)
     monkeypatch.setattr("teamslam.team.wire.zenoh.handshake.TIMEOUT_S", 0.2)
     caplog.set_level(logging.WARNING, "teamslam")

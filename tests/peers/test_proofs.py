@@ -193,7 +193,6 @@ def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(tm
 
 
 def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_it_is_not(tmp_path):
-    """The certificate of r1 ended a day ago; the time of the check does not matter."""
     now = datetime.now(UTC)
     make_keys(tmp_path, "t", nodes_of(ROBOTS), now=now - timedelta(days=3))
     team = Renewed(tmp_path)

@@ -33,7 +33,6 @@ def digest_of(replica: Replica) -> bytes:
 
 
 def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
-    """A liar claims every submap and gives nothing; r2 has four submaps."""
     node, honest = (
         PeerNode("robot/r1", ("r1", "r2", "r3")),
         PeerNode("robot/r2", ("r1", "r2", "r3")),

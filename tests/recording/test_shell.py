@@ -49,7 +49,6 @@ GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 @pytest.mark.parametrize("peers", [("r1", "r2", "r3"), ()], ids=["peers", "a centre"])
 def test_a_robots_own_conclusion_does_not_end_the_log_of_a_team(path, peers):
-    """Without a centre the conclusions of all peers but those given up do; with one, its map."""
     network = MemoryNetwork()
     team, bus = MemoryBus(network), MemoryBus(network)
     with Recorder(path, "t", {}) as recorder:

@@ -191,7 +191,6 @@ def test_a_process_without_a_last_word_is_named(path):
 @settings(deadline=None, max_examples=150)
 @given(st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4), st.randoms())
 def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(lives, rng):
-    """One life of a publisher after the other, each with its message 0 first."""
     samples = [
         Sample("source/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
         for life, kept in enumerate(lives)

@@ -75,7 +75,6 @@ def test_what_an_earlier_life_consumed_is_not_taken_again():
 
 
 def test_the_tail_is_asked_for_whatever_a_stranger_has_published_behind_it():
-    """A stranger's far measurements must not stop the requests for those before them."""
     inbox = Inbox()
     for each in (*map(measurement, range(3)), measurement(4, incarnation=7)):
         inbox.put(each)

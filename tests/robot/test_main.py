@@ -80,7 +80,6 @@ def lived(
 
 
 def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone():
-    """A stranger's message must not make a robot leave its stream."""
     network = MemoryNetwork()
     source = Source(network)
 
@@ -111,8 +110,6 @@ def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path)
 
 
 def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source():
-    """A stranger's additional measurements must not make the robot wait for more."""
-
     class Ending(Source):
         def answer(self, request: bytes) -> list[bytes]:
             if not self.asked:  # the world ends while the forged ones are consumed
@@ -147,8 +144,6 @@ class Published(Source):
 
 
 def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
-    """A stranger's far end must not make the robot wait, nor an early one make it leave."""
-
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
     source.bus.declare_alive("world")
@@ -171,8 +166,6 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
 
 @pytest.mark.parametrize("state", ["ended", "open"])
 def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
-    """A stranger's head of a driver that does not exist must not stop the requests."""
-
     network = MemoryNetwork()
     source, viewer = Published(network), MemoryBus(network)
     viewer.subscribe(ch.ROBOT_DONE)
@@ -190,7 +183,6 @@ def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
 
 
 def test_a_stream_begins_where_its_source_says():
-    """A stranger's earlier messages, years away, must not refuse those of the source."""
     network = MemoryNetwork()
     source = Source(network)
 
@@ -216,7 +208,6 @@ def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_o
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
-    """One odometry as measurement 0 of incarnation 7 must not make a robot leave its stream."""
     network = MemoryNetwork()
     source = Source(network)
 

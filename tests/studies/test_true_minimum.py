@@ -53,7 +53,6 @@ def test_a_map_that_is_folded_wrongly_is_another_minimum():
 
 @pytest.mark.parametrize(("bearing_sigma", "lower"), [(30.0, False), (0.02, True)])
 def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
-    """Two equally likely places, and one that the measurements exclude."""
     island, across = mirrored(bearing_sigma, OPTIONS)
     stamps = np.array([1000, 2000, 3000, 4000, 5000])
     poses = {
@@ -68,7 +67,6 @@ def test_the_other_one_of_two_places_is_wrong(bearing_sigma, lower):
 
 
 def test_a_map_that_is_not_at_rest_is_wrong():
-    """The map is judged as published, without a further solution by the team's solver."""
     _, island, landmarks, paths = world(2)
     off = island.state.copy()
     at = island.graph.offset[next(iter(island.graph.landmarks.values()))]

@@ -38,7 +38,6 @@ def submaps_in(log: Path) -> int:
 
 
 async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team):
-    """A robot, the centre, the recorder, the world and the router, one after the other."""
     launch, folder = await launched(team, "4")
     killed = []
     for name, *words in (

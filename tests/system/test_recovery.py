@@ -55,7 +55,6 @@ async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Proce
 
 
 async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(team):
-    """The link is cut until the world has ended."""
     found = await assembled(team, "10")
     with (
         Link(found.endpoint) as link,
@@ -72,7 +71,6 @@ async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(
 
 
 async def test_an_order_and_an_earlier_life_s_submaps_outlive_the_centre_that_received_them(team):
-    """r1 dies and resumes, r2 is withdrawn, then the centre dies."""
     found = await assembled(team, "4")  # all of this comes before the end
     first = await robot(team, found, found.endpoint, "r1")
     there = ["--connect", found.endpoint]

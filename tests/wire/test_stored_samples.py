@@ -52,7 +52,6 @@ def test_orders_hold_until_the_final_map_is_out_or_the_team_has_gone():
 
 
 def test_a_robots_own_end_takes_nothing_from_the_team():
-    """No order is dropped, and the centre's final map stays."""
     stored = StoredMessages()
     stored.token("robot/r2", alive=True)
     stored.take(order(1), 0.0)
@@ -89,7 +88,6 @@ def test_what_is_no_valid_end_does_not_hide_the_true_one(wrong):
 
 
 def test_who_never_announced_its_end_has_missed_the_teams_until_it_does():
-    """A request in another node's name takes nothing from that node."""
     stored = StoredMessages()
     for node in ("killed", "well", "late"):
         assert not stored.token(node, alive=True)

@@ -442,7 +442,6 @@ def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, 
 
 
 def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):
-    """Such a flood is neither queued nor passed on, and logs a few lines."""
     status = build.status(state="x")
     with (
         ZenohBus("t", endpoint) as sink,

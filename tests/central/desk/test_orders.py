@@ -112,7 +112,6 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(mo
 
 
 def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkeypatch):
-    """Invalid payloads on every key that the commands read."""
     monkeypatch.setattr(orders, "CENTRE_S", 0.3)
     network = MemoryNetwork()
     stranger = MemoryBus(network)

@@ -79,7 +79,6 @@ def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]
 
 
 def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
-    """r1 alone has a known start; after its withdrawal the map is in the frame of r2."""
     of = scenario()
     streams = simulate(of.world, of.robots, of.seed)
     streams = without_starts(streams, "r2", "r3")

@@ -49,7 +49,6 @@ def test_a_path_has_every_keyframe_and_the_final_maps_ends(log):
 
 
 def test_between_the_ends_the_covariance_is_that_of_the_errors(log):
-    """NEES/3 per pose of two robots, between the ends of the submaps."""
     run = evaluate(log)
     within = []
     for robot, path in smoothed_paths(recorded_of(log)).items():

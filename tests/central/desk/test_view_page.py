@@ -95,7 +95,6 @@ def test_the_page_gets_every_pose_and_its_error(frames):
 
 
 def test_the_page_is_told_when_a_robots_poses_are_in_another_frame():
-    """Its earlier path is in its own frame."""
     page = PageFrames()
 
     def take(channel: ch.Channel, robot: str, message: m.Message) -> None:
@@ -164,7 +163,6 @@ def test_the_page_is_told_what_a_node_waits_for_and_when_no_more():
 
 
 def test_a_running_map_without_cross_covariances_has_no_nees(frames):
-    """NEES is defined on the final map's joint covariance alone."""
     *running, final = frames["map"]
     assert {each["nees"] for each in running} == {None}
     assert {each["rmse"] is None for each in running} == {False}

@@ -191,7 +191,6 @@ def test_the_smoother_finds_what_the_odometry_alone_lets_pass():
 
 @pytest.mark.parametrize("exactly", [False, True])
 def test_where_the_smoother_has_no_solution_the_pairs_alone_decide(exactly):
-    """The weight of such ranges is not finite: no Cholesky factor exists."""
     window = drive(0)
     if exactly:
         pose = np.zeros(3)

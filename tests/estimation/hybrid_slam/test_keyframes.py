@@ -187,7 +187,6 @@ def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
 
 
 def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_to_the_bit():
-    """Scans before, between and within intervals, two at a time, and at their ends."""
     segmenter = Segmenter(WHITE, Sensor(), 100.0)
     segmenter.begin(0)
     durations = np.array([10, 7, 10, 10, 3, 10]) * (SECOND // 10)

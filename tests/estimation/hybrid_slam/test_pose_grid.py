@@ -76,7 +76,6 @@ def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyfr
 @settings(deadline=None, max_examples=60)
 @given(st.floats(1.01, 2.99), st.floats(0.5, 8.0), st.floats(-3.0, 3.0))
 def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing):
-    """The teammate stands; the circle's geometry gives its place seen from the node."""
     grid, segmenter = initial_state()
     observer = arc(at_s)
     point = observer[0] + 1j * observer[1] + distance * np.exp(1j * (observer[2] + bearing))
@@ -147,7 +146,6 @@ def test_a_slam_closes_its_windows_with_their_nodes_and_sightings():
 
 
 def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
-    """Two sensors with different latencies, before odometry covers either time."""
     found = []
     for order in ((1_800_000_000, 2_500_000_000), (2_500_000_000, 1_800_000_000)):
         grid, segmenter = initial_state()

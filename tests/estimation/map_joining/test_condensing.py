@@ -71,7 +71,6 @@ def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
 
 
 def test_a_submap_that_is_condensed_twice_is_not_consistent():
-    """Mutant: a factor counted twice makes the map overconfident."""
     world = team(1, submaps=20)
     full, bounded = both(world, JoinSettings())
     island = bounded.main

@@ -117,10 +117,6 @@ def overconfident(local, shift):
 
 @pytest.mark.parametrize("seed", [2, 4, 7])
 def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(seed):
-    """The gate must not take all later measurements for other landmarks while the prior holds.
-
-    Two windows later the error is within three sigma, and a warning is given.
-    """
     world = team(seed, submaps=10, landmarks=12)
     before, after = later(world, "r0", 5)
     prior = prior_for(joined(before, world.starts), "r0", 0)

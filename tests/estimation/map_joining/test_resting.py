@@ -68,7 +68,6 @@ def test_a_fold_whose_landmarks_rest_and_wake_is_the_fold_in_which_none_rests(se
 
 
 def test_a_landmark_that_another_island_has_does_not_rest_and_ties_it():
-    """A robot without a known initial pose joins by landmarks that the others left long ago."""
     found = world(4)
     late = [
         replace(each, robot="s0", end_ns=each.end_ns + 1)

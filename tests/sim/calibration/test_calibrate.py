@@ -162,7 +162,6 @@ def test_a_team_without_submaps_is_an_error_with_a_text():
 
 
 def test_a_calibration_is_a_scenario_that_loads_with_the_learnt_models(tmp_path):
-    """It changes figures of the motion, the sensor, the centre and the association."""
     motion = (Figure("forward_scale", 1.1, 0.01, ""), Figure("turn.per_m", 0.07, 0.002, "rad/√m"))
     sensor = (
         Figure("range_scale", 0.9, 0.001, ""),
@@ -270,7 +269,6 @@ def slipping():
 def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(
     slipping, tmp_path
 ):
-    """A set of two robots, one without ground truth, the other too short."""
     write_utias(slipping[1], tmp_path / "set")
     (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])

@@ -31,9 +31,7 @@ def places(tmp_path_factory):
 def test_a_late_clock_is_found_without_a_mount_and_is_written_into_the_scenario(
     places, monkeypatch
 ):
-    """The scenario has a part of the offset already; the rest adds to it. The joined map is tested
-    elsewhere.
-    """
+    """The scenario has a part of the offset already; the rest adds to it."""
     monkeypatch.setattr(calibrate, "join_team", lambda *_: SimpleNamespace(fold=None))
     monkeypatch.setattr(calibrate, "central_figures", lambda *_: ())
     late = scenario_in(places[1])

@@ -117,7 +117,6 @@ def test_increments_come_with_their_covariances(tmp_path):
 
 
 def test_odd_but_legal_tables_are_read_as_the_plain_ones(tmp_path):
-    """A byte order mark, CRLF, quotes, spaces, empty rows and columns, numbers as pandas'."""
     plain = only(data_set(tmp_path / "plain", odometry=SPEEDS, observations=SEEN))
     odd = tmp_path / "odd" / "r1"
     odd.mkdir(parents=True)

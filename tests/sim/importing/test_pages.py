@@ -117,7 +117,6 @@ def test_the_topics_of_the_page_are_sound(tmp_path):
 
 
 def test_the_commands_of_a_team_over_wifi_are_sound(tmp_path, monkeypatch):
-    """The page's command makes the certificates; the others find their files and options."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lab.toml").write_text(blocks("your_robot.md", "toml")[0])
     page = (ROOT / "docs" / "machines.md").read_text("utf-8")

@@ -99,7 +99,6 @@ def test_after_meetings_deaths_and_a_torn_disk_the_maps_are_the_central_runs(cen
 
 
 def test_the_fold_of_a_set_that_changed_or_grew_is_the_fold_of_what_it_is_now(central):
-    """A robot that contradicts itself, and one that grows after a final map."""
     team, _ = peers(Air())
     seat = team.seats["r1"]
     before = seat.node.final

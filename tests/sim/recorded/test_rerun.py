@@ -152,7 +152,6 @@ def test_a_missing_measurement_is_named_and_the_windows_behind_it_come_out(sampl
 def test_what_was_made_of_a_map_that_is_lost_can_not_be_judged_and_all_else_is_equal(
     samples, tmp_path
 ):
-    """The centre and the recorder were killed one after the other."""
     (lost, *_) = messages(samples, ch.PRIOR, "r2")
     poses = [x for x in messages(samples, ch.TEAM_POSE, "r2") if x.map_digest == lost.digest]
     assert poses

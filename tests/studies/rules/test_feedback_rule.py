@@ -44,7 +44,6 @@ def estimate(robot, number, at=0.0):
 @settings(deadline=None, max_examples=40)
 @given(st.permutations(ROBOTS * 3))
 def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
-    """A robot's own maps keep their order."""
     found, out, sent = centre(), [], set()
     for i, robot in enumerate(order):
         number = order[: i + 1].count(robot)
