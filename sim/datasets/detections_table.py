@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from teamslam.sim.datasets.csv_table import CsvTable, cells_of, covariances_of, read_table
-from teamslam.sim.datasets.folder_files import name_table
+from teamslam.sim.datasets.folder_files import DETECTIONS, name_table
 from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE, check_polar
 from teamslam.sim.datasets.scans import on_circle
 from teamslam.sim.datasets.tables import File
@@ -27,7 +27,7 @@ USUAL_RIGHT = 0.95
 """Probability that a class is right where the table states none."""
 MOST_CLASSES = 64
 LABELS = ("landmark",)
-FILES = ("detections.csv", "labels.csv")
+FILES = (DETECTIONS, "labels.csv")
 
 
 def detections_of(place: File, robot: str, classes: Sequence[str] = ()) -> Detections | None:

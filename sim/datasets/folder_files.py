@@ -3,7 +3,7 @@
 import re
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from teamslam.sim.datasets.tables import DatasetError, File
@@ -12,6 +12,8 @@ from teamslam.team.keys.roster import ROBOT
 ROBOT_NAME = ROBOT.pattern
 STREAM_FILES = ("odometry.csv", "observations.csv")
 """Files that mark a robot's folder."""
+DETECTIONS = "detections.csv"
+"""A robot's detections without identities."""
 ONE_ROBOT = "r1"
 """Name of a robot with tables in the data set's own folder."""
 SCENARIO = "scenario.toml"
@@ -69,6 +71,17 @@ def has_tables(path: str | Path) -> bool:
         raise
     except OSError:
         return False
+
+
+def has_detections(path: str) -> bool:
+    """Whether a robot has detections without identities; False for a folder that is not readable,
+    which reading it reports.
+    """
+    if not path:
+        return False
+    with suppress(DatasetError, OSError), open_folder(path) as (_, robots):
+        return any((place / DETECTIONS).is_file() for place in robots.values())
+    return False
 
 
 def robots_of(path: str) -> tuple[str, ...]:

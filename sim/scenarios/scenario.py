@@ -42,6 +42,10 @@ __all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads
 
 FAR_M = 10.0
 """Default end of a sensor's range."""
+PASSED = 0.5
+"""Distance, as a share of a sensor's range, from which a robot that drives past a landmark has most
+of its information about it.
+"""
 
 
 class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -119,6 +123,11 @@ def with_options(
         from teamslam.sim.datasets.folder_files import robots_of
 
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
+    if world["kind"] == "folder" and scenario.central.association == DEFAULT_PROFILE:
+        from teamslam.sim.datasets.folder_files import has_detections
+
+        if has_detections(world["path"]):
+            fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario, PASSED))
     if world["kind"] == "graph" and dataset is not None and robots is None:
         from teamslam.sim.datasets.graph import robot_count
 
@@ -131,12 +140,14 @@ def with_options(
     return _convert(fields)
 
 
-def _profile_of(scenario: Scenario) -> AssociationProfile:
-    """Association thresholds, in lengths of the robots' coarsest sensor."""
+def _profile_of(scenario: Scenario, share: float = 1.0) -> AssociationProfile:
+    """Association thresholds, in lengths of the robots' coarsest sensor at a share of its range."""
     world = scenario.world
     seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
     far_m = FAR_M if seen_m is None else seen_m
-    of_each = [profile_for(r.sensor, min(r.sensor.max_range, far_m)) for r in scenario.robots]
+    of_each = [
+        profile_for(r.sensor, share * min(r.sensor.max_range, far_m)) for r in scenario.robots
+    ]
     return max(of_each, key=lambda profile: profile.tight, default=DEFAULT_PROFILE)
 
 

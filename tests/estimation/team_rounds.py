@@ -19,7 +19,9 @@ def wrap(angle):
 
 
 def team_run(seed, starts=STARTS, steps=8, seen=None):
-    """Rounds of (robot, sensor, motion, measurements), and the truth."""
+    """Rounds of (robot, sensor, motion, measurements) and the truth; both robots see all
+    landmarks.
+    """
     random = np.random.default_rng(seed)
     truth, rounds = dict(starts), []
     for _ in range(steps):

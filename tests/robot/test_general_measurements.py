@@ -1,4 +1,6 @@
-"""Teams with every form of measurement: every rule maps them, the log reproduces the run."""
+"""Teams with every form of measurement, in memory: every rule maps them, the log reproduces the
+run.
+"""
 
 from functools import cache
 

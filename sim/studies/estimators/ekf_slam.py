@@ -79,7 +79,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """NIS of the used measurements."""
+    """NIS of the measurements that `filter_step` would use."""
     return joint_innovation(
         landmarks=state.ids,
         mean=state.mean,

@@ -51,7 +51,7 @@ STEPS = 500
 
 
 class MapFigure(NamedTuple):
-    """Maps of methods at some steps of one run, and the error over seeds.
+    """Maps of some methods at some steps: one run drawn, and the error over the seeds.
 
     shown: methods with their reading.
     """
@@ -62,7 +62,7 @@ class MapFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """Drawn methods and the error figures."""
+        """Runs of the drawn methods and of the error figures."""
         return [
             each
             for method, reading in self.shown
@@ -178,7 +178,7 @@ class PathFigure(NamedTuple):
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """The error figure, and one per panel and method."""
+        """Runs of the error figure, and one per panel and method."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels

@@ -155,6 +155,7 @@ class RunningEstimator:
         )
 
     def _took(self) -> int:
+        """Number of associated detections; a scan without a solution adds none."""
         return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
     def _advance(
@@ -192,7 +193,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; return the last keyframe and map, and the unused scans."""
+        """End the stream; return the last keyframe and map, and the scans without odometry."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:

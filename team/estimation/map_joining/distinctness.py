@@ -10,8 +10,9 @@ chance is
 
     E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
-since each pair on a pair defines one motion. The building may also repeat itself: the set does not
-tell.
+since each pair on a pair defines one motion. In wide gates chance explains any number of matches:
+of radii from `same` down to the default profile's, the one with the least E is taken, and E is
+multiplied by their number. The building may also repeat itself: the set does not tell.
 """
 
 import math
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.association import DEFAULT_PROFILE
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.voting import (
     PointSet,
@@ -102,7 +104,7 @@ MOST_SHARED = 0.25
 BY_CHANCE = -14.0
 """Largest ln E: one in a million."""
 FARTHER = 4.0
-"""Least distance of the two places, in distances of matched points."""
+"""Least distance of the two places, in radii."""
 MOST_POINTS = 400
 """Larger maps are not searched: voting would take seconds."""
 TRIED = 4
@@ -170,15 +172,18 @@ def _find_in_stream(
     candidates.sort(key=lambda each: each[:2])
     for _, k, fresh in candidates[:TRIED]:
         others = np.setdiff1d(np.arange(len(ids)), fresh)
-        vote = _align_beyond_chance(points[fresh], points[others], island.settings.association.same)
-        if vote is None:
+        found = _align_beyond_chance(
+            points[fresh], points[others], island.settings.association.same
+        )
+        if found is None:
             continue
+        vote, radius = found
         submap = island.graph.submaps[rows[k]].contribution
         start = island.graph.submaps[rows[k]].nodes[0]
         place = island.state[island.graph.offset[start] :][:2]
         there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
         gone = there - place
-        if math.hypot(*gone.tolist()) < FARTHER * island.settings.association.same:
+        if math.hypot(*gone.tolist()) < FARTHER * radius:
             continue
         before = island.graph.submaps[rows[k - 1]].contribution
         pairs = zip(fresh[vote.first].tolist(), others[vote.second].tolist(), strict=True)
@@ -197,19 +202,34 @@ def _find_in_stream(
 
 def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
-) -> Vote | None:
+) -> tuple[Vote, float] | None:
+    """Align the points with others at the radius whose matches chance explains least; return the
+    alignment and the radius [m].
+    """
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
-    votes = propose_alignments(
-        a, b, same, float(np.ptp(np.concatenate((own, others)), axis=0).max())
-    )
-    if not votes:
-        return None
-    matched = len(votes[0].first)
-    if matched < max(LEAST_PAIRS, LEAST_SHARE * min(len(own), len(others))):
-        return None
-    return votes[0] if log_by_chance(len(own), others, matched, same) < BY_CHANCE else None
+    longest = float(np.ptp(np.concatenate((own, others)), axis=0).max())
+    least = max(LEAST_PAIRS, LEAST_SHARE * min(len(own), len(others)))
+    radii = _list_radii(same)
+    most, found = BY_CHANCE - core.log(float(len(radii))), None
+    for radius in radii:
+        votes = propose_alignments(a, b, radius, longest)
+        matched = len(votes[0].first) if votes else 0
+        if matched < least:
+            continue
+        by_chance = log_by_chance(len(own), others, matched, radius)
+        if by_chance < most:
+            most, found = by_chance, (votes[0], radius)
+    return found
+
+
+def _list_radii(same: float) -> list[float]:
+    """List `same` and its halves down to that of the default profile."""
+    radii = [same]
+    while radii[-1] > DEFAULT_PROFILE.same:
+        radii.append(max(0.5 * radii[-1], DEFAULT_PROFILE.same))
+    return radii
 
 
 def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius: float) -> float:

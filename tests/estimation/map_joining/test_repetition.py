@@ -1,6 +1,7 @@
 """Robots that were carried off: the repeated part of a map, and the cut of its stream."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from teamslam.team.estimation.contribution import (
 )
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.distinctness import (
+    BY_CHANCE,
     find_repetitions,
+    log_by_chance,
 )
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from teamslam.team.estimation.submap import LocalMap
@@ -66,6 +69,19 @@ def test_a_robot_that_was_carried_off_is_named_with_the_time_and_the_way_and_no_
     (text,) = said(fold)
     assert "(t = 140 to 280 s) r1" in text
     assert "either the building repeats" in text
+
+
+@pytest.mark.parametrize("same", [0.5, 2.5])
+def test_a_copy_is_found_where_chance_explains_the_matches_of_wide_lengths(same):
+    rng, world = np.random.default_rng(1), field(1)
+    before, _ = drive("r1", circle((0.0, 0.0), 9.0, ROUND, 1.1), world, rng, reach=7.0)
+    after, _ = drive("r1", circle((1.0, -1.0), 8.0, ROUND, 1.1, 2.5), world, rng, reach=7.0)
+    island = folded(before, after).main
+    wide = replace(island.settings, association=AssociationProfile(recent=4, same=same))
+    (found,) = find_repetitions(replace(island, settings=wide), island.graph.landmarks)
+    assert found.first == ROUND
+    assert len(found.pairs) >= 12
+    assert log_by_chance(len(found.ids), field(1), len(found.ids), 2.5) > BY_CHANCE
 
 
 def test_two_equal_rooms_are_told_as_that_and_as_nothing_else():

@@ -19,6 +19,7 @@ from teamslam.team.association import AssociationProfile
 from teamslam.team.driver.measurement_messages import MeasurementError, observations
 from teamslam.team.pairs import PAIRS
 from tests import build
+from tests.trials.stress_world import StressWorld, write
 
 SMALL = """
 [world]
@@ -228,6 +229,20 @@ def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor():
     assert with_options(load("thesis"), seed=2).central.association == AssociationProfile()
     given = with_options(load("victoria"), identities="hidden").central.association
     assert given == load("victoria").central.association
+
+
+def test_a_folder_of_detections_without_names_takes_thresholds_in_the_lengths_of_its_sensor(
+    tmp_path,
+):
+    lengths = {}
+    for hidden in (True, False):
+        place = write(StressWorld(robots=1, seconds=5.0, hidden=hidden), tmp_path / str(hidden))
+        found = with_options(load(place / "scenario.toml"), dataset=place).central.association
+        lengths[hidden] = found.tight, found.near, found.gate
+    default = AssociationProfile()
+    assert lengths[False] == (default.tight, default.near, default.gate)
+    # 0.05 m and 2 % of the range, and 0.02 rad, at half of 10 m: 0.15 m, five times the default's
+    assert lengths[True] == pytest.approx((5 * default.tight, 5 * default.near, default.gate))
 
 
 def test_a_scenario_of_a_log_with_former_names_is_read_with_todays():
