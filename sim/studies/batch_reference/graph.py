@@ -35,7 +35,7 @@ def load_gtsam() -> Any:
 
 
 def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
-    """Make a Levenberg-Marquardt optimiser that iterates to the last digits of the cost."""
+    """Make a Levenberg-Marquardt optimiser that runs to convergence."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-13)
@@ -44,7 +44,7 @@ def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
 
 
 def newton_step(gtsam: Any, linear: Any) -> tuple[Any, float]:
-    """Newton step of a linear graph, and its length in standard deviations."""
+    """Newton step of a linear graph, with its length in sigmas."""
     step = linear.optimize()
     gain = linear.error(gtsam.VectorValues.Zero(step)) - linear.error(step)
     return step, float(np.sqrt(max(2.0 * gain, 0.0)))
@@ -118,14 +118,14 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
 
 
 def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
-    """Add a Cauchy loss of scale c, if any, to a noise model."""
+    """Add a Cauchy loss of scale c, if any."""
     if c is None:
         return model
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(c), model)
 
 
 def start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
-    """Prior of the initial pose; the (x, y, θ) covariance is rotated into the tangent space."""
+    """Prior of the initial pose; its covariance is rotated into the tangent space."""
     if covariance is None:
         model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
     else:

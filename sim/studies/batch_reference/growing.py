@@ -170,7 +170,7 @@ def add_steps(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
 
 
 def solve(batch: GrowingBatch, iterations: int, least_decrement: float) -> GrowingBatch:
-    """Iterate Levenberg-Marquardt to convergence or the limit; raises `UnsolvableError`."""
+    """Iterate Levenberg-Marquardt; raises `UnsolvableError`."""
     for scale in _scales(batch.robust_c):
         left = iterations
         while left > 0 and not (scale == batch.robust_c and batch.converged(least_decrement)):
@@ -228,7 +228,7 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the robot's newest pose in (x, y, θ); raises ValueError."""
+    """Mean and marginal covariance of the newest pose in (x, y, θ); raises ValueError."""
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))
 

@@ -185,7 +185,6 @@ def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchRef
 def _solve(
     gtsam: Any, graph: Any, initials: Sequence[Any], descend: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, dict[str, float]]:
-    """Best optimum over all initial values, with figures; raises BatchReferenceError."""
     optima = [descend(gtsam, graph, initial) for initial in initials]
     costs = [2.0 * graph.error(optimum) for optimum in optima]
     initial_cost = min(2.0 * graph.error(initial) for initial in initials)
@@ -221,10 +220,7 @@ def _optimise(gtsam: Any, graph: Any, initial: Any) -> Any:
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
-    """Gauss-Newton, halving steps that do not lower the cost.
-
-    Five times faster than GTSAM's Levenberg-Marquardt with Python factors.
-    """
+    """Gauss-Newton with step halving, five times faster than GTSAM's solver with Python factors."""
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):
         step, decrement = newton_step(gtsam, graph.linearize(values))

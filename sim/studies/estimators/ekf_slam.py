@@ -79,7 +79,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """NIS of the measurements that `filter_step` would use."""
+    """NIS of the used measurements."""
     return joint_innovation(
         landmarks=state.ids,
         mean=state.mean,

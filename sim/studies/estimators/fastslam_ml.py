@@ -57,7 +57,7 @@ def filter_step(
     generator: np.random.Generator,
     gate: float = GATE,
 ) -> FastSlamMl:
-    """Move, associate and update each particle; resample if few carry the weight."""
+    """Move, associate, update and resample."""
     values, vectors = np.linalg.eigh(increment.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)

@@ -43,7 +43,7 @@ def absorb_fused_map(
     means: Float[np.ndarray, "K 2"],
     covariance: Float[np.ndarray, "k k"],
 ) -> WholeMap:
-    """Replace the landmarks' marginal by the fused map, new ones added; `carry_along` the rest."""
+    """Replace the landmarks' marginal by the fused map; `carry_along` the rest."""
     _, in_whole, in_new = np.intersect1d(whole.ids, ids, return_indices=True)
     mean, joint = carry_along(
         whole.mean,

@@ -94,7 +94,7 @@ def absorb_map(
     landmarks: Float[np.ndarray, "n 2"],
     covariances: Float[np.ndarray, "n 2 2"],
 ) -> ThesisState:
-    """Replace the landmarks of the same id; add unknown ones (section 5.2)."""
+    """Replace known landmarks; add unknown ones (section 5.2)."""
     others = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[others], ids))
     order = np.argsort(merged)

@@ -94,7 +94,7 @@ def joint_innovation(
 def slots_of(
     known: UInt32[np.ndarray, " L"], observed: UInt32[np.ndarray, " n"]
 ) -> tuple[UInt32[np.ndarray, " K"], Int64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Ids after the measurements, their slots, and a mask of first sights."""
+    """Ids after the measurements, their slots, a mask of first sights."""
     slot = {each: k for k, each in enumerate(known.tolist())}
     slots, first = np.empty(len(observed), np.int64), np.zeros(len(observed), np.bool_)
     for k, each in enumerate(observed.tolist()):

@@ -100,7 +100,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Innovation of the measurements that `filter_step` would use; valid for one mode."""
+    """Innovation of the used measurements; valid for one mode."""
     read = np.isin(state.ids, ids)
     count, known = len(state.cloud.poses), int(read.sum())
     on_map = replace(

@@ -61,7 +61,7 @@ def innovation(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> Innovation:
-    """Innovation of the measurements that `filter_step` would use."""
+    """Innovation of the used measurements."""
     if (ids >= UNNAMED).any():
         _, ids = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, GATE)
     return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)

@@ -50,7 +50,7 @@ def filter_step(
     generator: np.random.Generator,
     own: Own | None = None,
 ) -> PlainFastSlam:
-    """Resample if the particles are thin, move, and update."""
+    """Resample if needed, move, and update."""
     particles, _ = fastslam.propagated_and_updated(
         particles=state.particles,
         increment=increment,
@@ -67,7 +67,7 @@ def filter_step(
 
 
 def pose_gaussian(state: PlainFastSlam) -> PoseGaussian:
-    """Mean and covariance of the particles' poses, the heading on the circle."""
+    """Moments of the particles' poses, the heading on the circle."""
     return pose_moments(state.particles)
 
 
@@ -84,7 +84,7 @@ def pose_moments(particles: Particles) -> PoseGaussian:
 
 
 def landmark_moments(particles: Particles) -> LandmarkGaussian:
-    """Moments of the landmarks, correlated by the spread between particles."""
+    """Moments of the landmarks, correlated by the spread of particles."""
     order = np.argsort(particles.ids)
     mean, P = moments(
         particles.poses,

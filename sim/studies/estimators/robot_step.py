@@ -1,4 +1,4 @@
-"""One robot's input to an estimate over all raw measurements."""
+"""One robot's input to an estimate over raw measurements."""
 
 from typing import NamedTuple
 

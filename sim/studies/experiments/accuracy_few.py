@@ -44,7 +44,7 @@ SHOWN: Shown = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """List the worlds by number of landmarks, and inter-robot measurements."""
+    """Worlds by number of landmarks, and inter-robot measurements."""
     return [task for case in _cases(options).values() for task in case]
 
 
@@ -111,7 +111,7 @@ def _alarmed(run: Figures) -> bool:
 
 
 def is_beyond(run: Figures) -> bool:
-    """Whether the shape or a first pose is beyond its 99.9 % ellipsoid."""
+    """Whether shape or a first pose is beyond its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]
     if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:

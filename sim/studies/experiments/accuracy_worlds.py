@@ -1,4 +1,4 @@
-"""Simulated worlds under every pair of estimator and rule, with the batch MAP."""
+"""Simulated worlds under every estimator and rule, with the batch MAP."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -77,7 +77,7 @@ def tasks(options: Options) -> list[Task]:
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures of every world and rule, and the default rule's goals."""
+    """Figures of all worlds and rules; the default rule's goals."""
     worlds: dict[str, dict[str, Figures]] = {}
     goals: list[Goal] = []
     tables: list[Table] = []
@@ -93,9 +93,8 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
-    """Figures over the seeds of each rule of one world, and of the batch.
-
-    ratio: RMS landmark error over the batch's.
+    """Figures of each rule of one world, and of the batch; ratio: RMS landmark error over the
+    batch's.
     """
     figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
     batches = {

@@ -1,4 +1,4 @@
-"""Accuracy of data association over landmark spacing, clutter and missed detections."""
+"""Data association over landmark spacing, clutter and missed detections."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -70,7 +70,7 @@ FIGURES = (
 
 
 def tasks(options: Options) -> list[Task]:
-    """List each axis, value, system and seed; common runs once."""
+    """Each axis, value, system and seed; common runs once."""
     runs = [
         task
         for axis in AXES

@@ -1,7 +1,4 @@
-"""Compute cases in parallel and store their results, with joblib's workers and memory.
-
-A failed case does not affect others.
-"""
+"""Compute cases in parallel and store their results by joblib; each case fails alone."""
 
 import threading
 import traceback
@@ -35,7 +32,7 @@ class Done:
 
 
 class Cases:
-    """Stored results of a folder, valid for equal parameters and program."""
+    """Stored results of a folder, by parameters and program."""
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
@@ -52,7 +49,7 @@ class Cases:
         return result
 
     def run(self, tasks: Sequence[Task], jobs: int) -> Iterator[Done]:
-        """Compute the cases, `jobs` at a time, the longest first; yield each as it is done.
+        """Compute the cases, `jobs` at a time, the longest first; yield each when done.
 
         Leaving the iterator ends the workers.
         """

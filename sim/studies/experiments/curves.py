@@ -62,7 +62,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """Curves of poses and first landmark, the map's error, and the map at `shots`."""
+    """Curves of poses and first landmark, the map's error, the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -123,7 +123,7 @@ def _a_step_late(stream: RobotStream) -> RobotStream:
 
 
 def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
-    """Keys of a robot's online poses; a later key has precedence."""
+    """Keys of a robot's online poses; later keys have precedence."""
     if PAIRS[scenario.estimator, scenario.fusion] == "measurements":
         return (ch.CENTRAL_POSE.key(robot),)
     return (ch.OWN_POSE.key(robot), ch.TEAM_POSE.key(robot))
@@ -132,7 +132,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """Poses and covariances on these keys; the last key has precedence."""
+    """Poses and covariances on these keys; later keys have precedence."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:
@@ -160,7 +160,7 @@ def _pose_curve(found: PoseErrors) -> Figures:
 
 
 def running_maps(samples: Sequence[Sample], robot: str) -> list[Map]:
-    """Fused maps with landmarks, or else those of the robot."""
+    """Fused maps with landmarks, or else the robot's."""
     for key in (ch.FUSED_MAP.key(), ch.OWN_MAP.key(robot)):
         published = messages(samples, key)
         maps = [
@@ -236,5 +236,5 @@ def _landmark_curve(
 
 
 def short(values: Float[np.ndarray, " K"]) -> list[float]:
-    """Round the values to DIGITS digits, for JSON."""
+    """Round to DIGITS digits, for JSON."""
     return [float(f"{value:.{DIGITS}g}") for value in values.tolist()]

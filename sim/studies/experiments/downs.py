@@ -272,7 +272,6 @@ def _paired(
 
 
 def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
-    """Paired two-sided t-test; p None below two pairs."""
     both = np.array([pair for pairs in pairs_of_sets for pair in pairs]).reshape(-1, 2)
     return {
         "pairs": len(both),

@@ -63,7 +63,7 @@ def final_maps_only(scenario: Scenario) -> Scenario:
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """Set measurements and submaps of one second, exact initial poses, no loss or factor."""
+    """Set his protocol: steps of one second, exact initial poses, no loss or factor."""
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
     if isinstance(scenario.world, UtiasWorld):
@@ -75,12 +75,12 @@ def his_protocol(scenario: Scenario) -> Scenario:
 
 
 def whole_run_task(scenario: Scenario, dataset: Dataset | None = None, note: str = "") -> Task:
-    """Make the task of every robot's own map and path."""
+    """Make the task of every robot's map and path."""
     return _task("whole_run", scenario, dataset, note)
 
 
 def spherical_task(scenario: Scenario, dataset: Dataset | None = None) -> Task:
-    """Make the task of his method under his protocol."""
+    """Make the task of his method."""
     return _task("spherical_run", his_protocol(scenario), dataset, "submaps of a step, identity")
 
 
@@ -92,7 +92,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """Errors of the robots' last own maps and online paths; one map."""
+    """Errors of the robots' last maps and online paths; one map."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -128,9 +128,9 @@ def _thin(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """Errors of each robot's joined map and smoothed path, and of the team.
+    """Errors of robots' joined maps and smoothed paths, and of the team.
 
-    with_covariances: the same submaps joined with their covariances.
+    with_covariances: joined with the submaps' covariances.
     """
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
@@ -187,7 +187,6 @@ def _start(samples: Sequence[Sample], robot: str) -> Float[np.ndarray, "3"]:
 
 
 def _join(robot: str, start: Float[np.ndarray, "3"], submaps: Sequence[m.Submap]) -> SubmapJoining:
-    """Join all submaps at once: the limit of joining one by one."""
     initial_state = svd_joining.initial_state({robot: start})
     contributions = [
         Contribution(robot, 0, k, k, reweight(translate.local_map_of(s).without_nodes, "identity"))
@@ -216,7 +215,7 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """Positions in both maps of two robots that measured each other in one step."""
+    """Positions in both maps of robots that measured each other in one step."""
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
     for a in sorted(paths):

@@ -1,4 +1,4 @@
-"""Curves over many seeds on common times, and the style of the pictures."""
+"""Curves over many seeds on common times, and picture style."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Curves:
         )
 
     def quantile(self, share: float) -> Float[np.ndarray, " K"]:
-        """Quantile over the runs with a value, at each time; NaN without any."""
+        """Quantile over the runs at each time; NaN without a value."""
         values = np.full(len(self.times_s), np.nan)
         there = ~np.isnan(self.errors).all(axis=0)
         values[there] = np.nanquantile(self.errors[:, there], share, axis=0)
@@ -61,7 +61,7 @@ class Curves:
 def sample_curve(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
-    """Sample a curve at these times; stepwise: hold values instead of interpolating."""
+    """Sample a curve at these times; stepwise: hold values, no interpolation."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)
@@ -103,7 +103,7 @@ def draw_map(
 
 
 def as_map(axis: "Axes", **equal: Any) -> None:
-    """Set axes in metres with equal scales; equal: further options of them."""
+    """Set axes in metres with equal scales."""
     axis.set_aspect("equal", **equal)
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")

@@ -16,7 +16,7 @@ UTIAS_SOURCE = (
 
 @dataclass(frozen=True)
 class Dataset:
-    """A given data set; sha256 of its file, or of all files of its folder."""
+    """A data set; sha256 of its file, or of all files of its folder."""
 
     name: str
     path: Path
@@ -44,7 +44,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Results:
-    """Results of the runs by task name, except failed ones."""
+    """Results by task name, without failed runs."""
 
     by_name: Mapping[str, dict[str, Any]]
 
@@ -78,7 +78,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Goal:
-    """Bounds of a figure; value None: it could not be computed."""
+    """Bounds of a figure; value None: not computed."""
 
     figure: str
     value: float | None

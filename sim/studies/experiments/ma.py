@@ -56,7 +56,7 @@ _LINE_POINTS = 1400
 
 
 def ma_task(dataset: Dataset, method: Method, seed: int) -> Task:
-    """Make the run of one method on the first 1400 frames of a set."""
+    """Make the run of one method on a set's first 1400 frames."""
     scenario = _scenario(method, seed)
     pair = pair_name(method.estimator, method.fusion)
     label = f"{dataset.name}, {method.robots} robots, {pair}, seed {seed}"
@@ -87,7 +87,6 @@ def _scenario(method: Method, seed: int) -> Scenario:
 
 
 def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
-    """Set the program's models: separate measurements, resampling and a map at each step."""
     replace = msgspec.structs.replace
     front_end = replace(
         robot.front_end, resample_below=1.0, keyframe_s=0.0, window_s=1.0, window_m=0.0, biases=()
@@ -96,7 +95,7 @@ def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
 
 
 def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
-    """Errors over frames of every robot's path and of the map, the lines and the last map."""
+    """Errors over frames of paths and map, the lines and the last map."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     samples = list(TimedRun().samples(resolved))
     evaluation = evaluate(samples)

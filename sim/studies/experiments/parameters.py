@@ -1,4 +1,4 @@
-"""Describe the parameters of runs by their differences from a built-in scenario."""
+"""Describe runs' parameters by their differences from a built-in scenario."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +16,7 @@ COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central
 
 
 def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
-    """Label, number and parameters of runs that differ in their seed only."""
+    """Label, number and parameters of runs that differ only in seed."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label

@@ -43,7 +43,7 @@ class Solution(NamedTuple):
 
 
 class Whitened(NamedTuple):
-    """Whitened residuals of K terms of one kind, their Jacobians and state indices."""
+    """Whitened residuals of K terms of a kind, Jacobians and state indices."""
 
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
@@ -51,7 +51,7 @@ class Whitened(NamedTuple):
 
 
 class PlainCost:
-    """Cost of a graph's states, without the fixed coordinates."""
+    """Cost of a graph's states, without fixed coordinates."""
 
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
@@ -121,7 +121,6 @@ class PlainCost:
         return self._sum.normal(self._terms(state))
 
     def _terms(self, state: Values) -> list[Whitened]:
-        """Terms at a state; fixed coordinates share a column after the last."""
         return [kind.whitened(state) for kind in self._terms_of]
 
 

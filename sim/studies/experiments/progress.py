@@ -1,4 +1,4 @@
-"""Show the progress of the runs: a bar, or lines outside a terminal."""
+"""Progress of the runs: a bar, or lines outside a terminal."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence

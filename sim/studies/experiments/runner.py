@@ -1,4 +1,4 @@
-"""Run an experiment: load stored results, compute the others, conclude."""
+"""Load stored results of an experiment, compute the others, conclude."""
 
 import hashlib
 import os
@@ -28,9 +28,9 @@ FAILURES = "failures.txt"
 
 @dataclass(frozen=True)
 class Concluded:
-    """An experiment's outcome, and its failed runs with their errors.
+    """An experiment's outcome, and its failed runs with errors.
 
-    kinds: runs that differ in their seed only: label, number, parameters.
+    kinds: label, number and parameters of runs that differ only in seed.
     """
 
     entry: Entry

@@ -47,7 +47,7 @@ def parsed_shard(text: str) -> Shard:
 
 
 def tasks_of(tasks: Mapping[str, Task], shard: Shard) -> dict[str, Task]:
-    """Every N-th task by falling cost, for shards of about equal time."""
+    """Every N-th task by falling cost, for shards of equal time."""
     order = sorted(tasks.values(), key=lambda task: (-task.cost, task.name))
     return {task.name: task for task in order[shard.number - 1 :: shard.of]}
 

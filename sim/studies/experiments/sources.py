@@ -12,7 +12,7 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 
 
 def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
-    """Text of a module and of all modules of these packages that it imports, transitively.
+    """Text of a module and of all that it imports of these packages, transitively.
 
     Names in tables (`teamslam.team.registry`) count as imports.
     """

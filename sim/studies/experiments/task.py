@@ -1,4 +1,4 @@
-"""A run as a task: a function with JSON parameters, and the digest of its program."""
+"""A run as a task: a function with JSON parameters, and its program's digest."""
 
 import hashlib
 import importlib
@@ -51,7 +51,7 @@ class Task:
 
 @lru_cache
 def program_of(module: str) -> str:
-    """Digest of library versions, of imported sources, and of the native core."""
+    """Digest of library versions, imported sources, and the native core."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:

@@ -89,7 +89,7 @@ def scenario_task(
     dataset: Dataset | None = None,
     **parameters: Any,
 ) -> Task:
-    """Make the task of a scenario, on a data set if given. work: `module:function`."""
+    """Make the task of a scenario, on a data set if given."""
     return Task(
         f"teamslam.sim.studies.experiments.{work}",
         {"scenario": msgspec.to_builtins(scenario)}
@@ -108,7 +108,7 @@ def with_world(scenario: Scenario, **changes: Any) -> Scenario:
 
 
 def with_robots(scenario: Scenario, part: str, **changes: Any) -> Scenario:
-    """Change a part of every robot's configuration, as `front_end`."""
+    """Change a part of every robot's configuration."""
     replace = msgspec.structs.replace
     robots = (
         replace(robot, **{part: replace(getattr(robot, part), **changes)})
@@ -130,7 +130,7 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """Figures of one run, with `batch` and `minimum` those of the batch MAP and `true_minimum`."""
+    """Figures of one run, with `batch` and `minimum` as in `team_task`."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     run = TimedRun()
     # Provisional maps and priors are the bulk of a large team's log and not used here.
@@ -217,9 +217,8 @@ class _Watch:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """Figures of a run, averaged over the robots; None without truth.
-
-    Without a fused map those of the robots' own maps.
+    """Figures of a run, averaged over the robots, with a fused map or their own; None without
+    truth.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map
@@ -314,7 +313,7 @@ OVER_SEEDS = (
 
 
 def over_seeds(runs: Sequence[Figures]) -> Figures:
-    """Figures over several runs: errors as root mean square, others as mean."""
+    """Figures over several runs: errors as RMS, others as mean."""
     figures: Figures = {"seeds": len(runs)}
     for name in OVER_SEEDS:
         if any(name in run for run in runs):
@@ -328,7 +327,7 @@ def over_seeds(runs: Sequence[Figures]) -> Figures:
 def table_of(
     title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
 ) -> Table:
-    """Table with a row for each named set of figures; first: heading of names."""
+    """Table with a row for each set of figures; first: heading of names."""
     rows = tuple((name, *cells_of(of_row, shown)) for name, of_row in figures.items())
     return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
 

@@ -76,7 +76,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 def final_fold(
     samples: Iterable[Sample], *, is_robust: bool = False, has_biases: bool = False
 ) -> Fold:
-    """Recompute the centre's final fold, by default with plain squares and no biases."""
+    """Recompute the final fold, by default with plain squares and no biases."""
     log = Recorded()
     for sample in samples:
         log.take(sample)

@@ -235,7 +235,7 @@ def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
 def drawing(
     title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
 ) -> Callable[[Path], None]:
-    """Draw medians with bands, and one run with its bound; unit: of the times."""
+    """Draw medians with bands, and one run with its bound."""
 
     def draw(path: Path) -> None:
         _draw(path, title, panel, found, unit)

@@ -51,9 +51,8 @@ STEPS = 500
 
 
 class MapFigure(NamedTuple):
-    """Maps of some methods at some steps: one run drawn, and the error over the seeds.
-
-    shown: methods with their reading.
+    """Maps of methods at some steps of one run, and the error over seeds; shown: methods with
+    reading.
     """
 
     title: str
@@ -62,7 +61,7 @@ class MapFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of the drawn methods and of the error figures."""
+        """Drawn methods and the error figures."""
         return [
             each
             for method, reading in self.shown
@@ -178,7 +177,7 @@ class PathFigure(NamedTuple):
     errors: ErrorFigure
 
     def tasks(self, options: Options) -> list[Task]:
-        """Runs of the error figure, and one per panel and method."""
+        """The error figure, and one per panel and method."""
         drawn = [
             self._run(panel, method, options)
             for panel in self.errors.panels

@@ -64,13 +64,13 @@ class RobotEstimator(Protocol):
     def innovation(self) -> Innovation: ...  # noqa: D102
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Process a scan of landmarks; return the reason of a rejection."""
+        """Process a scan; return the reason of a rejection."""
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Process one odometry interval, or only its duration (not measured)."""
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; return the last results, and the number of scans without odometry."""
+        """End the stream; return the last results, and the number of unused scans."""
 
     def own_pose(self) -> PoseGaussian:
         """Running pose from own measurements alone."""
@@ -103,6 +103,6 @@ def estimator_of(
     initial: InitialPose = AT_ORIGIN,
     known: KnownMap = NOTHING_KNOWN,
 ) -> RobotEstimator:
-    """Make the configured estimator at the beginning of an incarnation."""
+    """Make the configured estimator of an incarnation."""
     made: Factory = load(ESTIMATORS[config.estimator].made_by, f"the estimator {config.estimator}")
     return made(config, incarnation, initial, known)

@@ -65,7 +65,7 @@ class MapExchange:
         *,
         joint: bool,
     ) -> Outgoing:
-        """Make the message of a map; an exchanged one opens a round."""
+        """Make a map's message; an exchanged one opens a round."""
         if self.exchanges:
             self._sent_ns, self.last = stamp_ns, sequence
             self.awaited = self.answered + 1 if self.lockstep else self.awaited

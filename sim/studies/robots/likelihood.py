@@ -1,4 +1,4 @@
-"""FastSLAM 1.0 with data association from its first detection without identity on."""
+"""FastSLAM 1.0 with data association from the first detection without identity on."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 
 
 def with_association(plain: Filter) -> Filter:
-    """Use identities until the first scan without; ignore them in later scans.
+    """Use identities until the first scan without, none later.
 
     Particles keep their poses; landmarks mapped by identity are dropped.
     """

@@ -10,7 +10,7 @@ from teamslam.team.wire.bus import Outgoing
 
 
 def in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Recompute messages; the robot waits for each round's recorded map, or continues without."""
+    """Recompute messages, waiting for recorded maps."""
     fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
     node = new()
     incarnations = log.incarnations(robot)

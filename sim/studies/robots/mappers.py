@@ -47,16 +47,15 @@ class ExchangingMapper(Mapper):
         self.exchange.last = -1
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether to publish or exchange a map at the end of this window."""
         return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:
-        """Publish the running map for viewers, or in a due exchange."""
+        """Publish the running map, for viewers or a due exchange."""
         if self.exchange.is_sent(stamp_ns):
             self._send_map(stamp_ns)
 
     def publish_last_map(self) -> None:
-        """Publish the last map of the stream, unless an exchange had it."""
+        """Publish the stream's last map, unless an exchange had it."""
         if self.exchange.unsent_ns is not None:
             self._send_map(self.exchange.unsent_ns)
 
@@ -73,7 +72,7 @@ class ExchangingMapper(Mapper):
         return False
 
     def know(self, message: m.KnownMap) -> None:
-        """Ignore a known map: Hybrid-SLAM makes its own."""
+        """Ignore a known map."""
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the own map's landmarks by the fused ones."""
@@ -81,10 +80,7 @@ class ExchangingMapper(Mapper):
 
 
 class StreamMapper(ExchangingMapper):
-    """An estimator with one state over a stream: poses and maps, no submaps.
-
-    After a fault it continues with the state as it is.
-    """
+    """An estimator with one state over a stream, also after a fault; no submaps."""
 
     def __init__(self, config: RobotConfig, *options: Any) -> None:
         self._known: KnownMap | None = None if config.estimator in NEEDS_MAP else NOTHING_KNOWN
@@ -107,7 +103,7 @@ class StreamMapper(ExchangingMapper):
         return self._known is None
 
     def know(self, message: m.KnownMap) -> None:
-        """Store the known map; the newer stamp wins, landmarks beyond the bounds are dropped."""
+        """Store the known map; the newer stamp wins, far landmarks are dropped."""
         if self._known_ns is not None and message.stamp_ns <= self._known_ns:
             return
         self._known_ns = message.stamp_ns
@@ -173,7 +169,7 @@ class StreamMapper(ExchangingMapper):
         """Repeat nothing: there is no window."""
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Process a scan of landmarks; return the reason of a rejection."""
+        """Process a scan; return the reason of a rejection."""
         return self.estimator.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:

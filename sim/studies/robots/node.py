@@ -19,7 +19,7 @@ from teamslam.team.wire import messages as m
 
 
 class ExchangingRobot(RobotNode):
-    """A robot with Hybrid-SLAM whose centre gives no credit for submaps."""
+    """A Hybrid-SLAM robot whose centre gives no credit for submaps."""
 
     listens = (*RobotNode.listens, ch.KNOWN_MAP, ch.FUSED_MAP)
     makes = ExchangingMapper

@@ -155,7 +155,6 @@ class RunningEstimator:
         )
 
     def _took(self) -> int:
-        """Number of associated detections; a scan without a solution adds none."""
         return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
     def _advance(
@@ -193,7 +192,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; return the last keyframe and map, and the scans without odometry."""
+        """End the stream; return the last keyframe and map, and the unused scans."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:

@@ -142,7 +142,7 @@ class BatchCentre(MeasurementCentre):
 
 
 def taken_as_white(robots: Mapping[str, RobotConfig]) -> list[str]:
-    """Persistent errors in the configuration, with their robots."""
+    """Persistent errors in the configuration, by robot."""
     declared = defaultdict(list)
     for name, config in sorted(robots.items()):
         sensor, biases = config.sensor, config.front_end.biases

@@ -31,7 +31,7 @@ class ComparisonCentre(CentralNode):
         return ()
 
     def publish_newest(self) -> list[Outgoing]:
-        """No map: maps follow the method's own clock."""
+        """Do nothing: maps follow the method's clock."""
         return []
 
     def has_received(self, done: m.Done) -> bool:
@@ -45,7 +45,7 @@ class ComparisonCentre(CentralNode):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute the messages of recorded maps from their named inputs."""
+        """Recompute recorded maps from their named inputs."""
         raise NotImplementedError
 
 

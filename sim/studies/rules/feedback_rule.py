@@ -37,10 +37,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 
 
 class RoundsCentre(ComparisonCentre):
-    """Fusion of the maps of each round in the order of the robots' names.
-
-    Stores the robots' submaps for their next processes.
-    """
+    """Fusion of each round's maps in the order of names; stores submaps for restarted robots."""
 
     inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
 
@@ -62,10 +59,7 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """Make the map of every round complete but for robots that send no more.
-
-        A restarted centre continues with the present round.
-        """
+        """Make the map of every complete round; a restarted centre continues with the present one."""
         later = min(self._rounds, default=self._next)
         if self._is_complete(later):
             self._next = later
@@ -83,7 +77,7 @@ class RoundsCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute the rounds in order, each from its named recorded maps."""
+        """Recompute the rounds in order from their recorded maps."""
         for fused in sorted(maps, key=lambda each: each.exchange):
             yield self._fuse(fused.exchange, recorded_maps(log, fused))
         for fused in finals:

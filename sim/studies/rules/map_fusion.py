@@ -81,9 +81,9 @@ def fuse_maps(
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Fuse the robots' maps; return the result and the rejected maps, with reasons.
+    """Fuse the robots' maps; return the result and rejected maps with reasons.
 
-    Maps beyond the bounds, or without a result of the rule, are rejected.
+    Rejected: beyond the bounds, or without a result.
     """
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []

@@ -25,7 +25,7 @@ Starts = Mapping[Stream, m.InitialPose]
 
 
 class NewestMapsCentre(ComparisonCentre):
-    """Newest map of every robot, and the streams' initial poses.
+    """Newest map of every robot, and initial poses.
 
     names_inputs: a map follows from its named maps alone.
     """
@@ -93,10 +93,7 @@ class NewestMapsCentre(ComparisonCentre):
 
 
 class LatestCentre(NewestMapsCentre):
-    """Latest whole map of every robot as one, without feedback (`kalman` of independent maps).
-
-    A robot with an unknown initial pose is left out.
-    """
+    """Latest map of every robot as one, without feedback, for known initial poses."""
 
     names_inputs = False
 
@@ -108,7 +105,7 @@ class LatestCentre(NewestMapsCentre):
         self._published_ns: int | None = None
 
     def publish_due(self) -> list[Outgoing]:
-        """A map broadcast_s of team time after the last, if a robot has a newer one."""
+        """A map every broadcast_s of team time, if a robot has a newer one."""
         last_ns, now_ns = self._published_ns, self.attendance.now_ns
         if last_ns is not None and now_ns - last_ns < self.config.broadcast_s * 1e9:
             return []

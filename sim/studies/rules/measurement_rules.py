@@ -124,7 +124,7 @@ class MeasurementCentre(ComparisonCentre):
     def recomputed(
         self, log: "Recorded", maps: Sequence[m.FusedMap], finals: Sequence[m.FusedMap]
     ) -> Iterator[Outgoing]:
-        """Recompute from the whole stream, since each map changes the next."""
+        """Recompute the whole stream, since each map changes the next."""
         for message in _inputs_in_order(log):
             self.file(message)
         yield from self.publish_due()

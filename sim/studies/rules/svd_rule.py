@@ -43,7 +43,7 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """Submaps of a stream so far: number, map, and digest of the inputs.
+    """Submaps of a stream so far: number, map, digest of the inputs.
 
     refused: the submap that ended the chain, with the reason.
     """
@@ -55,7 +55,7 @@ class _Joined:
 
 
 class SvdFold(SubmapFold):
-    """`svd-join` with the submaps' covariances, `svd-join-spherical` with Downs' identity instead.
+    """`svd-join` with the submaps' covariances, `svd-join-spherical` with the identity.
 
     A later incarnation is a stream in its own frame.
     """
@@ -83,7 +83,7 @@ class SvdFold(SubmapFold):
         ahead: bool = True,
         recorded: RecordedFields | None = None,
     ) -> list[Outgoing]:
-        """Make the map of the stored set: a function of it alone."""
+        """Make the map, a function of the stored set."""
         channel = ch.FINAL_MAP if tail == "final" else ch.FUSED_MAP
         return [Outgoing(channel, "", self._fused(final=tail == "final"))]
 
