@@ -47,6 +47,7 @@ class ExchangingMapper(Mapper):
         self.exchange.last = -1
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
+        """Whether a map is due at the end of this window."""
         return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:

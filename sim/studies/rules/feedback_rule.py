@@ -59,7 +59,7 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """Make the map of every complete round; a restarted centre continues with the present one."""
+        """Make the map of every complete round, after a restart from the present one on."""
         later = min(self._rounds, default=self._next)
         if self._is_complete(later):
             self._next = later
