@@ -48,7 +48,7 @@ def meetings(windows: Sequence[Meeting]) -> Reach:
 
 @dataclass
 class Air:
-    """delay_ns: (least, greatest), so that messages overtake. bytes_per_s: per link."""
+    """loss, duplicates: probabilities. delay_ns: (least, greatest). bytes_per_s: per link."""
 
     reach: Reach = always
     loss: float = 0.0

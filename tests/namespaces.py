@@ -22,8 +22,7 @@ def ip(*words: str) -> None:
 
 @contextmanager
 def network(nodes: Sequence[str]) -> Iterator[dict[str, str]]:
-    """Make a namespace with a bridge for the router, and one on it for each node; yield their
-    names.
+    """Make a namespace with a bridge for the router and one per node; yield the names.
 
     The names resolve in each. Raises subprocess.CalledProcessError where namespaces are not
     permitted.

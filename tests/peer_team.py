@@ -34,7 +34,7 @@ def peer_of(scenario: Scenario, config: RobotConfig) -> PeerRobot:
 
 @dataclass
 class _Seat:
-    """listens, overhears: channels subscribed under its own name (a centre: any), and under every
+    """listens: channels subscribed under its own name (a centre: any); overhears: under every
     name.
     """
 
@@ -92,8 +92,7 @@ class PeerTeam:
     def run(
         self, world: World, steps: Callable[["PeerTeam"], None] | None = None
     ) -> Iterator[Sample]:
-        """Run until all peers have the same final map and no message is in flight; yield the
-        messages.
+        """Run until all peers agree and no message is in flight; yield the messages.
 
         steps: called every round; may remove and add peers.
         """

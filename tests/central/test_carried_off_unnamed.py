@@ -1,6 +1,4 @@
-"""A robot without landmark identities that is carried off: its stream is cut at the seam, earlier
-submaps stay, and later ones join by their shape.
-"""
+"""A robot without landmark identities that is carried off: cut, kept, joined again by shape."""
 
 import math
 from functools import cache

@@ -64,9 +64,7 @@ def test_a_robot_that_halves_its_sigmas_is_named_in_every_seed_of_ten():
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROBUST])
 def test_a_factor_of_two_in_all_covariances_is_told_and_none_is_not(settings):
-    """With any loss; 25 is the factor up to which the bounded cost treats a residual as nearly
-    right.
-    """
+    """With any loss; 25 bounds the factors that the bounded cost treats as nearly right."""
     for seed in range(4):
         for factor in (1.0, 0.5, 2.0):
             found = watched(seed, with_covariance_times(factor, lambda _: True), settings)

@@ -42,9 +42,7 @@ def test_the_scale_of_ranges_is_unbiased_at_joined_ranges_and_at_the_measured_on
 
 
 def test_a_scale_that_only_its_prior_determines_is_not_overconfident():
-    """Without odometry the map's scale is undetermined; a sensitivity along the measured bearings
-    would determine it.
-    """
+    """Without odometry the scale is undetermined: measured bearings must not determine it."""
     errors = scale_errors(range(300, 330), joined_ranges=True, way=1.0)
     assert abs(np.mean(errors)) < 3.3 / np.sqrt(len(errors))
     assert np.mean(errors**2) < chi2_interval(1, 0.999, len(errors))[1]

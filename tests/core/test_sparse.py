@@ -115,9 +115,7 @@ def test_a_big_panel_is_right_at_each_edge_of_a_block(blocks, beyond, seed):
 
 
 def groups_on_a_clique(seed):
-    """Three groups of some 70 unknowns, each tied to some 580 of a clique's 1000: big panels below
-    a big root, and small ones.
-    """
+    """Three groups of some 70 unknowns, each tied to some 580 of a clique's 1000."""
     rng = np.random.default_rng(seed)
     root, group, loose = 500, 35, 30
     n = root + 3 * group + loose

@@ -19,9 +19,7 @@ def wrap(angle):
 
 
 def team_run(seed, starts=STARTS, steps=8, seen=None):
-    """Rounds of (robot, sensor, motion, measurements) and the truth; both robots see all
-    landmarks.
-    """
+    """Rounds of (robot, sensor, motion, measurements), and the truth."""
     random = np.random.default_rng(seed)
     truth, rounds = dict(starts), []
     for _ in range(steps):

@@ -1,6 +1,4 @@
-"""Sets of small members, and peers that exchange in any order, with loss, duplicates and
-partitions.
-"""
+"""Sets of small members, and peers with reordering, loss, duplicates and partitions."""
 
 import random
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,4 @@
-"""Teams with every form of measurement, in memory: every rule maps them, the log reproduces the
-run.
-"""
+"""Teams with every form of measurement: every rule maps them, the log reproduces the run."""
 
 from functools import cache
 

@@ -124,9 +124,7 @@ class Storm:
                 self._order(team)
 
     def _order(self, team: PeerTeam) -> None:
-        """Deliver the operator's order to the first robot, and again by the router after a death,
-        which may have torn it off the disk.
-        """
+        """Deliver the order to the first robot, and again after a death, which may have torn it."""
         for order in self.disks.get("order", ()):
             team.hear(self.names[0], Sample(order.key, order.payload, 0, 0, 0))
 
@@ -151,9 +149,7 @@ def order_of(robot: str) -> Member:
 
 
 def central_map(scenario: Scenario, samples: list[Sample], order: Member | None) -> bytes:
-    """Final map of a central run; an order precedes the streams' end, since a centre does not wait
-    for a withdrawn robot.
-    """
+    """Final map of a central run, with the order before the streams' end."""
     if order is None:
         return encoded(final_map(samples))
     node = CentralNode(scenario.central, [each.id for each in scenario.robots])

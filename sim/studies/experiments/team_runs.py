@@ -217,8 +217,9 @@ class _Watch:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """Figures of a run, averaged over the robots, with a fused map or their own; None without
-    truth.
+    """Figures of a run, averaged over the robots; None without truth.
+
+    Without a fused map those of the robots' own maps.
     """
     robots = list(evaluation.robots.values())
     fused = evaluation.map

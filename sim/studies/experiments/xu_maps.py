@@ -51,8 +51,9 @@ STEPS = 500
 
 
 class MapFigure(NamedTuple):
-    """Maps of methods at some steps of one run, and the error over seeds; shown: methods with
-    reading.
+    """Maps of methods at some steps of one run, and the error over seeds.
+
+    shown: methods with their reading.
     """
 
     title: str

@@ -40,9 +40,7 @@ TWINS = np.array([(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)])
 
 
 def _seen(submaps: list[list[int]], common: float) -> tuple[Joint, list[np.ndarray]]:
-    """Twins as several submaps saw them; standard deviations of each submap's common error and of
-    each landmark's own.
-    """
+    """Twins as several submaps saw them; sigmas of each submap's error and of each landmark's."""
     rng = np.random.default_rng(1)
     owner = np.repeat(np.arange(len(submaps)), [len(each) for each in submaps])
     together: Bool[np.ndarray, "n n"] = owner[:, None] == owner[None]

@@ -25,8 +25,9 @@ def drive(
     named: bool = False,
     pose_sd: tuple[float, float, float] = POSE_SD,
 ) -> tuple[list[Contribution], dict[LocalLandmark, int]]:
-    """A submap between each two poses of a path, of all landmarks within reach in random order,
-    and its truth; named: landmarks keep their numbers.
+    """A submap between each two poses of a path, and its truth.
+
+    Contains all landmarks within reach in random order; named: with their numbers.
     """
     submaps, truth = [], {}
     for k, (start, end) in enumerate(pairwise(path)):

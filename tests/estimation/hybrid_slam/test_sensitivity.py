@@ -171,9 +171,7 @@ def stated(window, motions, points):
 
 
 def measured_later(path, seconds, k, point):
-    """∂(range, bearing)/∂(delay of the stamp), by differences along the motion from a quarter of a
-    second before keyframe k to a quarter after.
-    """
+    """∂(range, bearing)/∂(delay of the stamp), by differences over ± 0.25 s about keyframe k."""
     ends, times = [np.zeros(3), *path], np.append(0.0, np.cumsum(seconds))
     first = max(j for j in range(k + 1) if j == 0 or times[k + 1] - times[j] >= 0.25)
     last = min(

@@ -85,8 +85,9 @@ def bytes_of(window):
 
 
 def batch(run, sensor, ids):
-    """MAP over (noise of every step, landmarks) by scipy's least squares: mean and Laplace
-    covariance of (end pose, landmarks in the order of ids).
+    """MAP over (noise of every step, landmarks) by scipy's least squares.
+
+    Mean and Laplace covariance of (end pose, landmarks in the order of ids).
     """
     steps = len(run.motions)
 

@@ -1,6 +1,4 @@
-"""A final map shows no landmark twice: it leaves out possible duplicates, and landmarks that
-nearly all submaps miss.
-"""
+"""A final map leaves out possible duplicates, and landmarks that nearly all submaps miss."""
 
 import numpy as np
 import pytest
@@ -104,9 +102,7 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(heading_sd, 
 
 
 def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fold:
-    """Two neighbours are seen `times` times, and a third landmark beside them the first `found`
-    times.
-    """
+    """Two neighbours seen `times` times, a third landmark the first `found` times."""
     fold = EMPTY_FOLD
     for k in range(times):
         places = [*PAIR, FALSE] if k < found else PAIR

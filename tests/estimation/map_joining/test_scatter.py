@@ -20,8 +20,9 @@ def _series(rng, fade):
 
 @pytest.mark.parametrize("fade", [0.0, 0.3, 0.6])
 def test_errors_that_last_longer_than_a_window_widen_the_sum(fade):
-    """The result matches the scatter over draws; a sum of squares would be short by √((1 + ρ)/(1 −
-    ρ)), up to a factor of 2. The fit removes the mean of the series.
+    """A sum of squares would be short by √((1 + ρ)/(1 − ρ)), up to a factor of 2.
+
+    The fit removes the mean of the series.
     """
     rng = np.random.default_rng(0)
     sums, found = [], []
