@@ -64,7 +64,7 @@ def _reason_in(fused: m.FusedMap, name: str) -> str:
 
 
 NO_LANDMARK = (
-    "the final map has no landmark: no robot saw any, or what it saw is none of its sensor's range "
+    "the final map has no landmark: no robot measured one within its sensor's range "
     "(sensor.min_range, max_range; of a simulated world visible_from_m, visible_to_m)"
 )
 

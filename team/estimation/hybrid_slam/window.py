@@ -61,7 +61,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def innovation(self) -> Innovation:
-        """Of all measurements so far that were predicted."""
+        """NIS of all measurements that were predicted so far."""
         return Innovation(*self.core.innovated)
 
     @property

@@ -3,8 +3,8 @@
 A tick without a solution as a whole is added one by one in canonical order, without the members
 that make the normal equations unsolvable (law 2).
 
-Of a refused submap the motion alone is tried, the marginal of its end pose. Where that fails too,
-the robot's chain ends. An unsolvable initial pose becomes unknown; an inter-robot measurement is
+A refused submap is reduced to its motion, the marginal of its end pose. Where that fails too, the
+robot's chain ends. An unsolvable initial pose becomes unknown; an inter-robot measurement is
 left out.
 """
 
