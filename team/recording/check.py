@@ -1,21 +1,23 @@
 """Check that a log is whole, complete and valid."""
 
+import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from teamslam.team.recording.counters import Counters
+import numpy as np
+
+from teamslam.team.recording.counters import Counters, match_totals, split_lives
 from teamslam.team.recording.cut import CUT
-from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.inventory import MISSING, Inventory
-from teamslam.team.recording.reader import Log
+from teamslam.team.recording.reader import Declared, Log
 from teamslam.team.recording.records import check_index
 from teamslam.team.recording.repair import REPAIRED, read_undamaged
-from teamslam.team.recording.unannounced_ends import LastWords
+from teamslam.team.recording.schemas import schema_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened, try_open
+from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 
 FILE = "file"
@@ -48,9 +50,8 @@ def check_log(log: Log) -> list[Finding]:
             unsound[sample.key] = (count + 1, first)
         evidence.take(sample)
     found += [Finding(FILE, what) for what in damaged]
-    declarations = read_declarations(log)
-    for key in sorted(declarations):
-        wrong = find_misdeclaration(declarations[key])
+    for key, declared in sorted(log.declared.items()):
+        wrong = find_misdeclaration(key, declared)
         if wrong is not None:
             found.append(Finding(key, wrong))
     found += evidence.findings()
@@ -66,6 +67,53 @@ def holes(log: Log) -> list[Finding]:
     for sample in read_undamaged(log, damaged):
         evidence.take(sample)
     return [*(Finding(FILE, what) for what in damaged), *evidence.findings()]
+
+
+@dataclass
+class LastWords:
+    """Statuses and final totals of each process; 24 bytes a status and more."""
+
+    _statuses: dict[str, list[tuple[int, int, int]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    """By node, in order of arrival: counter, wall clock [ns], team time [ns]."""
+    _totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
+    """By node and process start, the number of statuses in the process's final totals."""
+
+    def take_status(self, node: str, sample: Sample) -> None:
+        """Add a node's status."""
+        if sample.counter != NO_COUNTER:
+            status = sample.counter, min(sample.wall_ns, 2**63 - 1), sample.stamp_ns
+            self._statuses[node].append(status)
+
+    def take_tally(self, tally: m.Tally) -> None:
+        """Add a process's final totals."""
+        totals = dict(zip(tally.keys, tally.counts, strict=True))
+        count = totals.get(ch.STATUS.key(tally.node), 0)
+        self._totals[tally.node][tally.since_ns] = count
+
+    def findings(self) -> Iterator[tuple[str, str]]:
+        """Yield keys and gaps in the record of their processes; none if no process published
+        totals.
+
+        Logs of nodes in memory have no totals.
+        """
+        if not self._totals:
+            return
+        for node, statuses in sorted(self._statuses.items()):
+            counters, walls, stamps_ns = np.array(statuses, np.int64).T
+            lives = split_lives(counters, walls)
+            published = [int(counters[life[-1]]) + 1 for life in lives]
+            totals = tuple(self._totals.get(node, {}).values())
+            ended = {life for _, life in match_totals(published, totals)}
+            for k, life in enumerate(lives):
+                if k not in ended:
+                    last_s = stamps_ns[life[-1]] * 1e-9
+                    yield (
+                        ch.TALLY.key(node),
+                        f"the process with messages until {last_s:.1f} s announced no totals: "
+                        "it was killed or cut off, and its later messages may be missing",
+                    )
 
 
 @dataclass
@@ -170,7 +218,7 @@ def _evidence(log: Log) -> _Evidence:
 
 def _unsound(sample: Sample) -> str | None:
     if ch.channel_of(sample.key) is None:
-        return None  # a viewer's, or reported by `misdeclared`
+        return None  # a viewer's, or reported by `find_misdeclaration`
     try:
         message = opened(sample)[2]
     except WireError as error:
@@ -178,6 +226,33 @@ def _unsound(sample: Sample) -> str | None:
     if message.stamp_ns != sample.stamp_ns:
         return f"message {sample.counter}: logged at {sample.stamp_ns} ns, of {message.stamp_ns} ns"
     return None
+
+
+def find_misdeclaration(key: str, of: Declared) -> str | None:
+    """Return the defect of a key's declaration, or None.
+
+    Later versions may append fields: the shorter field list must be a prefix of the longer.
+    """
+    row = ch.channel_of(key)
+    if row is None:
+        return None if ch.VIEW.owner(key) is not None else "no channel has this key"
+    kind = row[0].kind_of(of.schema)
+    if (of.encoding, of.schema) != ("msgpack", m.tag_of(kind)):
+        stated = f"{of.encoding or 'no encoding'}, {of.schema or 'no schema'}"
+        return f"declared as {stated}; its messages are msgpack, {m.tag_of(kind)}"
+    ours, theirs = _fields(schema_of(kind), kind), _fields(of.text, kind)
+    shared = min(len(ours), len(theirs))
+    if not theirs or ours[:shared] != theirs[:shared]:
+        return f"its schema is not that of {m.tag_of(kind)}"
+    return None
+
+
+def _fields(text: bytes, kind: type[m.Message]) -> list[Any]:
+    try:
+        fields = json.loads(text)["$defs"][kind.__name__]["prefixItems"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return []
+    return fields if isinstance(fields, list) else []
 
 
 def _has_note(log: Log, note: str) -> bool:

@@ -13,6 +13,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
+from mcap.records import Schema
 
 from teamslam.team.recording.opening import LogFile, open_file
 from teamslam.team.recording.part_files import open_part, parts_of
@@ -46,12 +47,33 @@ class Count(NamedTuple):
     bytes: int
 
 
+class Declared(NamedTuple):
+    """Encoding and schema that a log declares for a key; the schema name may be empty."""
+
+    encoding: str
+    schema: str
+    text: bytes
+
+
+@dataclass
+class Channels:
+    """Declarations of one file so far: the key of each channel (None: not read), and schemas.
+
+    names: of the channels to read; None: all.
+    """
+
+    names: set[str] | None = None
+    keys: dict[int, str | None] = field(default_factory=dict)
+    schemas: dict[int, tuple[str, bytes]] = field(default_factory=lambda: {0: ("", b"")})
+
+
 @dataclass(frozen=True)
 class Log:
     """A log on disk.
 
     complete: its last recorder finished; an incomplete file is read up to its last whole chunk.
-    metadata: provenance. files: consecutive parts. reading: receives the share read in every pass.
+    metadata: provenance. files: consecutive parts. declared: the last declaration read of each key.
+    reading: receives the share read in every pass.
     """
 
     path: Path
@@ -59,6 +81,7 @@ class Log:
     complete: bool
     metadata: dict[str, str] = field(repr=False)
     files: tuple[LogFile, ...] = field(repr=False)
+    declared: dict[str, Declared] = field(default_factory=dict, repr=False, compare=False)
     reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
@@ -94,13 +117,15 @@ class Log:
         self, part: LogFile, names: set[str] | None, before: int, whole: int
     ) -> Iterator[list[Sample] | DamagedChunkError]:
         with part.path.open("rb") as file:
+            channels = Channels(names)
             # The index repeats the channels, since a chunk that introduced one may be damaged.
-            keys = self._read_indexed_keys(file, part.path, names) if part.complete else {}
+            if part.complete:
+                self._read_index(file, part.path, channels)
             for frame in read_frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
                     self.reading((before + frame.offset) / whole)
                     try:
-                        yield self.samples_in(frame, keys, names)
+                        yield self.samples_in(frame, channels)
                     except (*MALFORMED, ValueError, zstandard.ZstdError) as error:
                         what = f"damaged chunk at offset {frame.offset}: {error}"
                         yield DamagedChunkError(part.path, what, REPAIR)
@@ -109,26 +134,28 @@ class Log:
         if part.complete:
             raise LogError(part.path, "ends before its own index", REPAIR)
 
-    def _read_indexed_keys(
-        self, file: IO[bytes], path: Path, names: set[str] | None
-    ) -> dict[int, str | None]:
-        keys: dict[int, str | None] = {}
+    def _read_index(self, file: IO[bytes], path: Path, channels: Channels) -> None:
         with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels
             for frame in read_index(file, path):
-                if frame.opcode == Opcode.CHANNEL:
-                    self._introduce(frame.body, names, keys)
-        return keys
+                self._introduce(frame.opcode, frame.body, channels)
 
-    def _introduce(self, body: bytes, names: set[str] | None, keys: dict[int, str | None]) -> None:
-        channel = LogChannel.read(ReadDataStream(BytesIO(body)))
-        keys[channel.id] = self._key(channel.topic, names)
+    def _introduce(self, opcode: int, body: bytes, channels: Channels) -> None:
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(body)))
+            channels.schemas[schema.id] = schema.name, schema.data
+        elif opcode == Opcode.CHANNEL:
+            channel = LogChannel.read(ReadDataStream(BytesIO(body)))
+            key = channel.topic.removeprefix(f"team/{self.team}/")
+            schema = channels.schemas.get(channel.schema_id, ("", b""))
+            self.declared[key] = Declared(channel.message_encoding, *schema)
+            row = None if channels.names is None else row_of(key)
+            is_read = channels.names is None or (row is not None and row.name in channels.names)
+            channels.keys[channel.id] = key if is_read else None
 
-    def samples_in(
-        self, frame: Frame, keys: dict[int, str | None], names: set[str] | None = None
-    ) -> list[Sample]:
-        """Return the samples of a chunk on these channels; add its declarations to `keys`."""
+    def samples_in(self, frame: Frame, channels: Channels) -> list[Sample]:
+        """Return the samples of a chunk on these channels; add its declarations to them."""
         samples, data, size = [], expand_chunk(frame.body), _MESSAGE.size
-        unpack = _MESSAGE.unpack_from
+        unpack, keys = _MESSAGE.unpack_from, channels.keys
         for opcode, start, end in locate_records(data):
             if opcode == _OF_MESSAGE:
                 if start + size > end:
@@ -140,16 +167,9 @@ class Log:
                     payload = data[start + size : end]
                     stamp_ns = log_time or _stamp_in(payload)
                     samples.append(Sample(key, payload, stamp_ns, wall_ns, sequence))
-            elif opcode == Opcode.CHANNEL:
-                self._introduce(data[start:end], names, keys)
+            else:
+                self._introduce(opcode, data[start:end], channels)
         return samples
-
-    def _key(self, topic: str, names: set[str] | None) -> str | None:
-        key = topic.removeprefix(f"team/{self.team}/")
-        if names is None:
-            return key
-        row = row_of(key)
-        return key if row is not None and row.name in names else None
 
 
 def log_file(path: Path) -> Path:

@@ -139,16 +139,10 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
     return None
 
 
-def read_records(data: bytes) -> Iterator[Frame]:
-    """Yield the records of an expanded chunk; raises ValueError if one exceeds it or there are too
-    many.
-    """
-    for opcode, start, end in locate_records(data):
-        yield Frame(start - FRAME_SIZE, opcode, data[start:end])
-
-
 def locate_records(data: bytes) -> list[tuple[int, int, int]]:
-    """Return opcode, first and last byte of each record; raises as `read_records`."""
+    """Return opcode, first and last byte of each record of an expanded chunk; raises ValueError if
+    one exceeds it or there are too many.
+    """
     found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
     unpack, most = _FRAME.unpack_from, MOST_RECORDS

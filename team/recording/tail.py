@@ -6,7 +6,7 @@ from pathlib import Path
 import zstandard
 from mcap.opcode import Opcode
 
-from teamslam.team.recording.reader import Log, LogError, open_log
+from teamslam.team.recording.reader import Channels, Log, LogError, open_log
 from teamslam.team.recording.records import FRAME_SIZE, MALFORMED, read_frames
 from teamslam.team.wire.bus import Sample
 
@@ -26,7 +26,7 @@ class Tail:
     ended: bool = False
     damaged: int = 0
     _offset: int | None = None
-    _keys: dict[int, str | None] = field(default_factory=dict)
+    _channels: Channels = field(default_factory=Channels)
 
     def more(self) -> list[Sample]:
         """Return newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
@@ -44,7 +44,7 @@ class Tail:
                 if frame.opcode != Opcode.CHUNK:
                     continue
                 try:
-                    found += self.log.samples_in(frame, self._keys)
+                    found += self.log.samples_in(frame, self._channels)
                 except (*MALFORMED, ValueError, zstandard.ZstdError):
                     self.damaged += 1
                 if len(found) >= MOST:

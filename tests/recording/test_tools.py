@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from teamslam.team.recording.check import check_log
+from teamslam.team.recording.check import check_log, find_misdeclaration
 from teamslam.team.recording.counters import Counters
 from teamslam.team.recording.cut import cut
-from teamslam.team.recording.declared_channels import find_misdeclaration, read_declarations
 from teamslam.team.recording.merge import MERGED, merge
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder
@@ -310,7 +309,9 @@ OTHER = schema_of(m.Submap).replace(b'"integer"', b'"number"')
     ],
 )
 def test_a_schema_is_held_against_its_channel(path, key, encoding, schema, text, told):
-    found = find_misdeclaration(read_declarations(foreign(path, key, encoding, schema, text))[key])
+    log = foreign(path, key, encoding, schema, text)
+    assert not list(log.samples())
+    found = find_misdeclaration(key, log.declared[key])
     assert found is None if told is None else found is not None and found.startswith(told)
 
 
