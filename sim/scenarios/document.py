@@ -21,6 +21,7 @@ from typing import Any
 import msgspec
 
 from teamslam.central.config import CentralConfig
+from teamslam.central.desk.names import data_set_name
 from teamslam.sim.scenarios.checks import (
     ScenarioError,
     check_fields,
@@ -45,10 +46,17 @@ def builtin_names() -> tuple[str, ...]:
 
 
 def named_document(name: str) -> tuple[Fields, str]:
-    """Document of a built-in scenario or user file, merged over its base; and its short name."""
+    """Document of a built-in scenario or user file, merged over its base; and its short name.
+
+    A data set's `scenario.toml` is named after its folder or zip.
+    """
     if name in builtin_names():
         return _builtin(name), name
-    return _resolve_base(own_document(name)), Path(name).stem
+    document, path = _resolve_base(own_document(name)), Path(name)
+    kind = checked_table(document.get("world", {}), "world").get("kind")
+    if path.name == "scenario.toml" and kind not in ("simulated", "live"):
+        return document, data_set_name(path.resolve().parent) or path.stem
+    return document, path.stem
 
 
 def own_document(name: str) -> Fields:

@@ -164,12 +164,15 @@ def odometry(stamp_ns: int, names: Names, pose: Pose, speeds: tuple[float, float
     )
 
 
+def pose_stamped(stamp_ns: int, frame: str, pose: Pose) -> Any:
+    """geometry_msgs/PoseStamped."""
+    kind = "geometry_msgs/msg/PoseStamped"
+    return _new(kind, header=header(stamp_ns, frame), pose=planar_pose(pose))
+
+
 def path(stamp_ns: int, frame: str, poses: Iterable[tuple[int, Pose]]) -> Any:
     """nav_msgs/Path."""
-    stamped = [
-        _new("geometry_msgs/msg/PoseStamped", header=header(t, frame), pose=planar_pose(pose))
-        for t, pose in poses
-    ]
+    stamped = [pose_stamped(t, frame, pose) for t, pose in poses]
     return _new("nav_msgs/msg/Path", header=header(stamp_ns, frame), poses=stamped)
 
 

@@ -1,5 +1,7 @@
 import math
+from dataclasses import fields
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -14,13 +16,38 @@ from teamslam.team.ros2.keys import of_rmw, of_token
 from teamslam.team.ros2.topics import RobotTopics
 from teamslam.team.ros2_answers import Answers, LiveAnswers, RosPublisher
 from teamslam.team.translate import landmark_blocks_of
+from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
+from tests.ros2 import second_reader
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import example, packed, spd, wait_until
 
 S = 10**9
+PUBLISHED = {
+    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (
+        "26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
+    ),
+    "nav_msgs/msg/Path": "1957a5bb3cee5da65c4e52e52b65a93df227efce4c20f8458b36e73066ca334b",
+    "nav_msgs/msg/Odometry": "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    "visualization_msgs/msg/MarkerArray": (
+        "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"
+    ),
+    "vision_msgs/msg/Detection3DArray": (
+        "793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018"
+    ),
+    "diagnostic_msgs/msg/DiagnosticArray": (
+        "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+    ),
+    "geometry_msgs/msg/PoseStamped": (
+        "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+    ),
+}
+"""Type hashes (REP 2016) that `ros2 topic info --verbose` shows on ROS 2 Jazzy."""
 NAMES = names_of("r1", "/r1/odom", "odom", "base_link")
 
 
@@ -168,6 +195,66 @@ def test_a_late_subscriber_receives_the_newest_path_and_map(network):
 
             wait_until(came)
     assert received[0].startswith("0/r1/team_path/nav_msgs::msg::dds_::Path_/RIHS01_")
+
+
+def plain(value):
+    """A message of rosbags as dictionaries and lists, without its constants."""
+    if hasattr(value, "__msgtype__"):
+        return {
+            f.name: plain(getattr(value, f.name))
+            for f in fields(value)
+            if f.name.islower() and f.name[0] != "_"
+        }
+    if isinstance(value, list):
+        return [plain(each) for each in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def test_type_hashes_are_those_of_ros():
+    assert {kind: types().hash_rihs01(kind) for kind in PUBLISHED} == {
+        kind: f"RIHS01_{of}" for kind, of in PUBLISHED.items()
+    }
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["known start", "arbitrary frame"])
+def test_two_readers_decode_the_same_bag_whose_truth_lies_at_the_paths(tmp_path, is_known):
+    scenario = thesis(45)
+    if not is_known:
+        world = msgspec.structs.replace(scenario.world, unknown_starts=("r1", "r2"))
+        scenario = msgspec.structs.replace(scenario, world=world)
+    bag = tmp_path / "bag"
+    status = example(m.Status, node="r1")
+    state = Sample(ch.STATUS.key("r1"), encoded(status), status.stamp_ns, 0, 0)
+    samples = [*team_samples(scenario), state]
+    export_rosbag2(written(tmp_path / "log.mcap", samples), bag)
+    with AnyReader([bag]) as reader:
+        assert {each.msgtype for each in reader.connections} == PUBLISHED.keys()
+        first = [
+            (each.topic, stamp, plain(reader.deserialize(data, each.msgtype)))
+            for each, stamp, data in reader.messages()
+        ]
+    second = list(second_reader.messages(bag))
+    assert sorted(first, key=str) == sorted(second, key=str)
+
+    def planar(topic: str, *inside: str) -> dict[int, tuple[float, float, float]]:
+        found = {}
+        for _, stamp, message in (each for each in second if each[0] == topic):
+            for part in inside:
+                message = message[part] if part != "transforms" else message[part][0]
+            at, turned = message.values()
+            found[stamp] = at["x"], at["y"], 2.0 * math.atan2(turned["z"], turned["w"])
+        return found
+
+    (world_from_map,) = planar("/tf_static", "transforms", "transform").values()
+    assert (world_from_map == (0.0, 0.0, 0.0)) == is_known
+    true, smoothed = planar("/r1/ground_truth", "pose"), planar("/r1/smoothed_pose", "pose", "pose")
+    both = true.keys() & smoothed.keys()
+    assert len(both) > 40
+    moved = [np.subtract(compose(world_from_map, smoothed[t]), true[t])[:2] for t in both]
+    assert np.sqrt(np.mean(np.square(moved))) < 1.0
+    apart = [np.subtract(smoothed[t], true[t])[:2] for t in both]
+    assert (np.sqrt(np.mean(np.square(apart))) < 1.0) == is_known
+    assert {m["header"]["frame_id"] for t, _, m in second if t == "/r1/ground_truth"} == {"world"}
 
 
 def test_a_log_becomes_a_bag_that_another_reader_opens(tmp_path):

@@ -1,7 +1,7 @@
 """Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
-Dead-reckoned odometry with odom → base, the messages of `teamslam.team.ros2_answers`, and the
-smoothed path as stamped poses. Log times are team time.
+Dead-reckoned odometry with odom → base, the messages of `teamslam.team.ros2_answers`, the smoothed
+path as stamped poses, and the truth, if known, with world → map. Log times are team time.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,7 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
+from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import RerunError, index_log
 from teamslam.team import translate
@@ -22,6 +24,7 @@ from teamslam.team.ros2.encoding import (
     compose,
     encode,
     odometry,
+    pose_stamped,
     pose_with_covariance,
     transform,
     transforms,
@@ -33,6 +36,8 @@ from teamslam.team.wire.bus import try_open
 
 TEAM_SPACE = "/teamslam"
 """Namespace of the team's map and diagnostics."""
+TRUTH_FRAME = "world"
+"""Frame of the true poses, the parent of `map`."""
 ODOMETRY_HZ = 50.0
 """Highest rate of the exported odometry [Hz]."""
 
@@ -68,7 +73,7 @@ class _Robot:
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
-    """Convert a log to ROS 2 messages, in log order; then the smoothed poses."""
+    """Convert a log to ROS 2 messages, in log order; then the smoothed and the true poses."""
     robots: dict[str, _Robot] = {}
     team = Answers(Names(TEAM_SPACE))
     final = False
@@ -91,6 +96,7 @@ def answers_of(log: Log) -> Iterator[Answer]:
             yield from team.convert(message)
     with suppress(RerunError):  # a log without an input of the recomputation
         yield from _smoothed(log)
+    yield from _true(log)
 
 
 def _smoothed(log: Log) -> Iterator[Answer]:
@@ -102,6 +108,27 @@ def _smoothed(log: Log) -> Iterator[Answer]:
             pose = pose_with_covariance(stamp_ns, names.map_frame, (x, y, theta), P)
             kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
             yield Answer(names.topic("smoothed_pose"), kind, stamp_ns, encode(pose))
+
+
+def _true(log: Log) -> Iterator[Answer]:
+    """True poses in `world`, and world → map: where the map's frame is arbitrary, by alignment."""
+    evaluation = evaluate(log.samples())
+    starts_ns = list[int]()
+    for robot, result in evaluation.robots.items():
+        topic = f"/{robot}/ground_truth"
+        for stamp_ns, (x, y, theta) in zip(
+            result.truth.stamps_ns.tolist(), result.truth.poses.tolist(), strict=True
+        ):
+            data = encode(pose_stamped(stamp_ns, TRUTH_FRAME, (x, y, theta)))
+            yield Answer(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, data)
+        starts_ns += result.truth.stamps_ns[:1].tolist()
+    motion = evaluation.truth_from_map if evaluation.arbitrary_frame else np.zeros(3)
+    if starts_ns and motion is not None:
+        x, y, theta = motion.tolist()
+        stamp_ns = min(starts_ns)
+        one = transform(stamp_ns, TRUTH_FRAME, Names(TEAM_SPACE).map_frame, (x, y, theta))
+        kind = "tf2_msgs/msg/TFMessage"
+        yield Answer("/tf_static", kind, stamp_ns, encode(transforms(one)), latched=True)
 
 
 def export_rosbag2(

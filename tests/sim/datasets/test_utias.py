@@ -105,6 +105,7 @@ def test_a_set_of_another_rig_brings_its_own_models(folder):
     assert within == str(zipped / folder.name / "scenario.toml")
     for each in (own, within):
         loaded = with_options(load(str(each)), dataset=zipped)
+        assert loaded.team == folder.name
         assert [robot.sensor.range_is_depth for robot in loaded.robots] == [False] * 5
     streams, scenario, _ = open_data_set(folder)
     assert [robot.sensor.range_is_depth for robot in scenario.robots] == [False] * 3
