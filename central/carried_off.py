@@ -5,7 +5,7 @@ was carried off, and the diagnosis (`hypotheses`) names the jump.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -17,39 +17,21 @@ from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float
+from teamslam.team.wire import messages as m
 
 SEAM_DOF = 3.0
 """Degrees of freedom of a seam."""
 
 Pose = Float[np.ndarray, "3"]
+REMEDY = "leave the robot on the ground, or restart its process where it is put down"
 
 
-class CarriedOff(NamedTuple):
-    """A motion of a robot that its odometry did not measure.
-
-    before, after: the submaps around it. begin_ns, end_ns: end of the former, beginning of the
-    latter. by: the motion in the map's frame (x [m], y [m], turn [rad]), once the later part has a
-    place there. in_all: `by` includes the robot's own motion in a spoilt submap. evidence:
-    log-likelihood ratio. place: (x, y) [m].
-    """
-
-    robot: str
-    before: int
-    after: int
-    begin_ns: int
-    end_ns: int
-    by: tuple[float, ...]
-    in_all: bool
-    evidence: float
-    place: tuple[float, ...] = ()
-
-
-def cuts_of(fold: Fold) -> list[CarriedOff]:
-    """Describe the cuts of a fold, and the motion where both parts are in one island.
+def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
+    """Describe the cuts of a fold, with the motion in the map's frame (x [m], y [m], turn [rad])
+    where both parts are in one island.
 
     A part that lies where the odometry puts it was not carried off.
     """
-    found = []
     for cut in fold.cuts:
         later = part_of(cut.stream, cut.after)
         island = fold.island(*cut.stream)
@@ -61,20 +43,15 @@ def cuts_of(fold: Fold) -> list[CarriedOff]:
                 continue
             if fold.island(*later).graph.first_sequence(later) == cut.after:
                 by = (float(gap[0]), float(gap[1]), wrapped(gap[2]))
-        found.append(
-            CarriedOff(
-                robot=cut.stream[0],
-                before=cut.before,
-                after=cut.after,
-                begin_ns=cut.begin_ns,
-                end_ns=cut.end_ns,
-                by=by,
-                in_all=cut.after > cut.before + 1,
-                evidence=cut.evidence,
-                place=(float(place[0]), float(place[1])),
-            )
+        yield m.Diagnosis(
+            cause="carried_off",
+            robot=cut.stream[0],
+            value=by,
+            evidence=cut.evidence,
+            remedy=REMEDY,
+            at_ns=cut.begin_ns,
+            place=(float(place[0]), float(place[1])),
         )
-    return found
 
 
 def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:

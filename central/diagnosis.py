@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from teamslam.central.carried_off import CarriedOff
+from teamslam.central.carried_off import REMEDY, cuts_of
 from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
@@ -103,7 +103,6 @@ _ERRORS: Mapping[str, _SharedError] = {
 def diagnose(
     fold: Fold,
     biases: Sequence[BiasEstimate],
-    carried: Sequence[CarriedOff],
     withdrawn: Mapping[str, Sequence[Contribution]],
     normal: float,
     scale: float,
@@ -112,14 +111,13 @@ def diagnose(
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
-    carried: where streams were cut. withdrawn: submaps of withdrawn robots. normal: the right
-    covariance scale; scale: the team's, or its cost per degree of freedom. final: see
-    `monitor.finding`.
+    withdrawn: submaps of withdrawn robots. normal: the right covariance scale; scale: the team's,
+    or its cost per degree of freedom. final: see `monitor.finding`.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
     shared = list(_shared_errors(fold, biases, scale))
-    found = [*shared, *_mirrored(fold, withdrawn), *map(_of_cut, carried)]
+    found = [*shared, *_mirrored(fold, withdrawn), *cuts_of(fold)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
     try:
@@ -163,7 +161,7 @@ def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
 _REMEDIES: Mapping[str, str] = {
     MOVED: "remove the landmark, or give it another number from that time on",
     SHARED: "give each of the two landmarks a number of its own",
-    CARRIED_OFF: "leave the robot on the ground, or restart its process where it is put down",
+    CARRIED_OFF: REMEDY,
 }
 
 
@@ -210,18 +208,6 @@ def _student(sigmas: float, freedom: float) -> float:
 def clock_remedy(late_s: float) -> str:
     """Describe the remedy for late stamps of detections."""
     return _CLOCK.format(value=late_s)
-
-
-def _of_cut(each: CarriedOff) -> m.Diagnosis:
-    return m.Diagnosis(
-        cause=CARRIED_OFF,
-        robot=each.robot,
-        value=each.by,
-        evidence=each.evidence,
-        remedy=_REMEDIES[CARRIED_OFF],
-        at_ns=each.begin_ns,
-        place=each.place,
-    )
 
 
 def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> Iterator[m.Diagnosis]:

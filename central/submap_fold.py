@@ -7,7 +7,6 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
-from teamslam.central.carried_off import cuts_of
 from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose, widening
 from teamslam.central.fused_map import receivable
@@ -244,13 +243,7 @@ class SubmapFold:
         shown = shown_landmarks(fold, self.config, tail)
         withdrawn = ticks.submaps_of_withdrawn()
         self.diagnosis = diagnose(
-            fold,
-            biases,
-            cuts_of(fold) if fold.cuts else (),
-            withdrawn,
-            self.config.normal_scale,
-            scale,
-            final=final,
+            fold, biases, withdrawn, self.config.normal_scale, scale, final=final
         )
         self.reasons = reasons(
             fold,

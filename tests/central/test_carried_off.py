@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.carried_off import cuts_of
 from teamslam.central.diagnosis import describe, diagnose
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
@@ -74,7 +73,7 @@ def jumps(ticks: TickFold) -> list[m.Diagnosis]:
     fold = ticks.solve()
     biases = bias_estimates(fold)
     left_out = ticks.submaps_of_withdrawn()
-    found = diagnose(fold, biases, cuts_of(fold), left_out, 1.0, 1.0, final=True)
+    found = diagnose(fold, biases, left_out, 1.0, 1.0, final=True)
     return [each for each in found if each.cause == "carried_off"]
 
 

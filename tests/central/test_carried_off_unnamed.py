@@ -117,7 +117,7 @@ def test_the_cut_depends_on_no_order_of_arrival():
         assert ticks.members(folds[-1])["r2", 1] == 21
     one, two = folds
     assert one.cuts == two.cuts
-    assert cuts_of(one) == cuts_of(two)
+    assert list(cuts_of(one)) == list(cuts_of(two))
     assert (one.main.state == two.main.state).all()
 
 
