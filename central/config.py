@@ -14,7 +14,7 @@ from teamslam.team.config import (
     NonNegative,
     Positive,
 )
-from teamslam.team.geodesy import Datum
+from teamslam.team.datum import Datum
 
 ClassName = Annotated[str, Meta(pattern="^[A-Za-z][A-Za-z0-9_ -]{0,31}$")]
 

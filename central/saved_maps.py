@@ -8,6 +8,7 @@ import numpy as np
 
 from teamslam.team import core, translate
 from teamslam.team.config import BIASES, UNNAMED
+from teamslam.team.datum import Datum
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import RobotBias, is_absolute, is_map, named, whole_of
@@ -25,7 +26,6 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     replaced_sensors,
 )
 from teamslam.team.estimation.map_joining.submap_graph import DRIFT
-from teamslam.team.geodesy import Datum
 from teamslam.team.saved_map import datum_bytes
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m

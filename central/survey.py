@@ -11,6 +11,7 @@ import numpy as np
 
 from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.team.config import GNSS, SURVEY, SURVEY_FRAME
+from teamslam.team.datum import Datum
 from teamslam.team.estimation.contribution import (
     STATION,
     SURVEYED,
@@ -22,7 +23,6 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.inter_robot import STATION_POSE
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
-from teamslam.team.geodesy import Datum
 from teamslam.team.saved_map import datum_in, member_of
 from teamslam.team.wire.arrays import floats, from_ids
 from teamslam.team.wire.messages import FusedMap, SavedMap, Submap

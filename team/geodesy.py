@@ -8,12 +8,9 @@ All points have the datum's height h above the ellipsoid; an error of 100 m scal
 1.6·10⁻⁵. The plane shortens a distance d by d³ / 6a²: 4 mm at 10 km.
 """
 
-from typing import Annotated
-
-import msgspec
 import numpy as np
-from msgspec import Meta
 
+from teamslam.team.datum import Datum
 from teamslam.team.shapes import Float
 
 A_M = 6_378_137.0
@@ -22,17 +19,6 @@ E2 = 0.00669437999014131699613723
 """Squared eccentricity e² of WGS84."""
 ROUNDS = 20
 CONVERGED_M = 1e-6
-
-
-class Datum(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Origin of a local tangent plane on WGS84: x points east, y north.
-
-    height_m: above the ellipsoid.
-    """
-
-    latitude_deg: Annotated[float, Meta(ge=-89.0, le=89.0)]
-    longitude_deg: Annotated[float, Meta(ge=-180.0, le=180.0)]
-    height_m: Annotated[float, Meta(ge=-1e4, le=1e5)] = 0.0
 
 
 def _earth_centred(angles: Float[np.ndarray, "n 2"], height_m: float) -> Float[np.ndarray, "n 3"]:

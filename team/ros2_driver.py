@@ -12,9 +12,9 @@ from decimal import Decimal
 import numpy as np
 
 from teamslam.team.containment import place_of
+from teamslam.team.datum import Datum
 from teamslam.team.driver.driver import Driver
 from teamslam.team.driver.measurement_messages import MeasurementError
-from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.arrivals import MOST_WAITING, Backlog, Lost
 from teamslam.team.ros2.decoding import (
     READERS,

@@ -316,10 +316,12 @@ def scenario_of(name: str) -> Scenario:
 
 def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
     """Read saved maps; exit with 2 for an unusable file, or two maps of one name."""
-    from teamslam.team.saved_map import SavedMapError, read_map
+    if not paths:
+        return []
+    from teamslam.team.saved_map import SavedMapError, read_map  # a log's reader comes with it
 
     with failing(WRONG_USE, SavedMapError):
-        found = [read_map(path) for path in paths or ()]
+        found = [read_map(path) for path in paths]
     names = sorted(each.name for each in found)
     twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:

@@ -13,7 +13,7 @@ import tomli_w
 from teamslam.sim.datasets.folder_files import SCENARIO, robots_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.source import Report, Request, import_data, robot_entry
-from teamslam.team.geodesy import Datum
+from teamslam.team.datum import Datum
 
 LANDMARKS = "landmarks.csv"
 

@@ -9,7 +9,7 @@ import msgspec
 
 from teamslam.sim.importing.bag_topics import UndecidedError, decide_topics, listing
 from teamslam.sim.importing.tables import RobotTables
-from teamslam.team.geodesy import Datum
+from teamslam.team.datum import Datum
 from teamslam.team.ros2.bags import Bag, opened_bag
 from teamslam.team.ros2.decoding import (
     DamagedError,

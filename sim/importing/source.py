@@ -28,7 +28,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import open_data_set
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.streams import StartPose, WorldStreams
-from teamslam.team.geodesy import Datum
+from teamslam.team.datum import Datum
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.ros2.bags import BagError, is_bag

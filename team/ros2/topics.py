@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from teamslam.team.geodesy import Datum
+from teamslam.team.datum import Datum
 
 RobotName = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from teamslam.team.geodesy import Datum, local_from_geodetic
+from teamslam.team.datum import Datum
+from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.ros2.decoding import (
     FixRecord,
     OdometryRecord,

@@ -14,8 +14,8 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.config import GNSS, SURVEY_FRAME, Bounds, Gnss
+from teamslam.team.datum import Datum
 from teamslam.team.estimation.plausibility import sighting_beyond
-from teamslam.team.geodesy import Datum
 from teamslam.team.saved_map import datum_in, map_figures
 from teamslam.team.translate import sighting_of
 from teamslam.team.wire import channels as ch

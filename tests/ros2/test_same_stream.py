@@ -8,8 +8,8 @@ from teamslam.sim.importing.bag import import_bag
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.world.config import FolderWorld
 from teamslam.team.config import RobotConfig
+from teamslam.team.datum import Datum
 from teamslam.team.driver.driver import Driver
-from teamslam.team.geodesy import Datum
 from teamslam.team.ros2.topics import RobotTopics, Topics
 from teamslam.team.ros2_driver import Ros2Driver
 from teamslam.team.wire import messages as m

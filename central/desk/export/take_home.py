@@ -25,7 +25,8 @@ from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.survey import datum_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
-from teamslam.team.geodesy import Datum, geodetic_from_local
+from teamslam.team.datum import Datum
+from teamslam.team.geodesy import geodetic_from_local
 from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

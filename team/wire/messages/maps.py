@@ -3,7 +3,6 @@
 from typing import Annotated, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from teamslam.team.config import MAP, SURVEY, UNNAMED
@@ -378,9 +377,10 @@ class SavedMap(Message, frozen=True, kw_only=True, tag="saved_map/1"):
         if not K:
             return
         check_packed_covariance(self.evidence, E, "evidence")
-        joint = np.zeros((K + n, K + n))
-        joint[:K, :K][np.triu_indices(K)] = floats(self.own_covariance, "own_covariance")
-        joint[:K, K:] = floats(self.own_cross, "own_cross").reshape(K, n)
-        joint[K:, K:][np.triu_indices(n)] = floats(self.covariance, "covariance")
-        upper = joint[np.triu_indices(K + n)].astype("<f8").tobytes()
+        rows, at = [], 0
+        for i in range(K):  # rows of the joint upper triangle
+            rows += [self.own_covariance[at : at + 8 * (K - i)]]
+            rows += [self.own_cross[8 * n * i : 8 * n * (i + 1)]]
+            at += 8 * (K - i)
+        upper = b"".join([*rows, self.covariance])
         check_packed_covariance(upper, K + n, "own_covariance with covariance")

@@ -17,7 +17,8 @@ from teamslam.central.desk.export.take_home import (
 from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.sim.in_memory.team import run_team
-from teamslam.team.geodesy import Datum, local_from_geodetic
+from teamslam.team.datum import Datum
+from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.wire.bus import Sample
 from tests.sim.logs import scenario, streams
 

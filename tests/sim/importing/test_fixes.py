@@ -8,7 +8,8 @@ import pytest
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import scenario_beside
-from teamslam.team.geodesy import Datum, geodetic_from_local, local_from_geodetic
+from teamslam.team.datum import Datum
+from teamslam.team.geodesy import geodetic_from_local, local_from_geodetic
 from tests.ros2 import messages as ros
 from tests.sim.importing.test_bag_topics import LEVEL, static
 from tests.sim.importing.test_import import S, drive, read, run
