@@ -6,7 +6,7 @@ before any is created.
 """
 
 from functools import cache
-from typing import Any, NoReturn, TypeVar, Union
+from typing import Any, TypeVar, Union
 
 import msgspec
 
@@ -58,8 +58,8 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
         if len(payload) > SMALL:
             check_structure(payload)
         message: M = _decoder(expected).decode(payload)
-    except (WireError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        _refuse(payload, expected, error)
+    except (WireError, *_UNREADABLE) as error:
+        raise _refusal(payload, expected, error) from None
     try:
         message.check()
     except ValueError as error:
@@ -68,24 +68,40 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
     return message
 
 
-def _refuse(payload: bytes, expected: tuple[type[Message], ...], error: Exception) -> NoReturn:
-    """Raise the `WireError` of a payload that could not be decoded; a wrong tag comes first."""
-    kind = _kind(read_tag(payload), expected)
+class _Head(msgspec.Struct, array_like=True):
+    """The tag of a message; further fields are skipped."""
+
+    tag: str
+
+
+_HEAD = msgspec.msgpack.Decoder(_Head)
+_UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+
+
+def _refusal(payload: bytes, expected: tuple[type[Message], ...], error: Exception) -> WireError:
+    """Return the `WireError` of a payload that could not be decoded; a wrong tag comes first."""
+    kind: type[Message] = Message
+    try:
+        kind = _kind(_HEAD.decode(payload).tag, expected)
+    except msgspec.ValidationError:
+        return WireError("wrong tag", "a message is an array that begins with its tag")
+    except _UNREADABLE as unreadable:
+        error = error if isinstance(error, WireError) else unreadable
     match error:
         case WireError():
-            raise error
+            return error
         case RecursionError():
-            raise WireError("too deep", "nested beyond any message's structure") from None
+            return WireError("too deep", "nested beyond any message's structure")
         case msgspec.ValidationError():
-            raise WireError("wrong field", f"{kind.__name__}: {error}") from None
+            return WireError("wrong field", f"{kind.__name__}: {error}")
         case UnicodeDecodeError():
-            raise WireError("damaged", "a text is not UTF-8") from None
+            return WireError("damaged", "a text is not UTF-8")
     text = str(error)
     if "truncated" in text:
-        raise WireError("truncated", "the payload ends inside the message") from None
+        return _truncated()
     if "trailing" in text:
-        raise WireError("trailing bytes", "the message ends before its payload does") from None
-    raise WireError("damaged", text) from None
+        return WireError("trailing bytes", "the message ends before its payload does")
+    return WireError("damaged", text)
 
 
 def find_error(message: Message) -> WireError | None:
@@ -103,10 +119,10 @@ def _decoder(kinds: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder[Any]:
 
 
 def tag_in(payload: bytes) -> str:
-    """Return the tag of a payload; empty if it has none."""
+    """Return the tag of a payload; empty if it has none, or is damaged."""
     try:
-        return read_tag(payload)
-    except WireError:
+        return _HEAD.decode(payload).tag
+    except _UNREADABLE:
         return ""
 
 
@@ -131,8 +147,6 @@ MOST_VALUES = 250_000
 """Most values in a message; an array of numbers is one value."""
 DEEPEST = 16
 """Deepest nesting of a message; the known ones have four levels."""
-_LONGEST_TAG = 100
-_INVALID = 0xC1
 _SCALARS = {0xC0: 0, 0xC2: 0, 0xC3: 0, 0xCA: 4, 0xCB: 8,
             0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}  # fmt: skip
 """Number of bytes after the code of a scalar."""
@@ -140,28 +154,6 @@ _TEXTS = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}
 """Number of bytes of the length of a `bin` or `str`, by code."""
 _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
 """Number of bytes of the length of an array or map, and of values per entry, by code."""
-
-
-def read_tag(payload: bytes) -> str:
-    """Return the tag of a message; raises `WireError` where there is none."""
-    count, at = _group_at(payload)
-    if count > MOST_VALUES:
-        raise WireError("too large", f"an array of {count} values, {MOST_VALUES} at most")
-    if not count:
-        raise _no_tag()
-    code = _byte(payload, at)
-    if code >> 5 == 0b101:
-        size, at = code & 31, at + 1
-    elif code in (0xD9, 0xDA, 0xDB):
-        size, at = _length(payload, at + 1, _TEXTS[code])
-    else:
-        raise _no_tag(code)
-    if len(payload) < at + size:
-        raise _truncated()
-    try:
-        return payload[at : at + min(size, _LONGEST_TAG)].decode()
-    except UnicodeDecodeError:
-        raise WireError("damaged", "a text is not UTF-8") from None
 
 
 def check_structure(payload: bytes) -> None:
@@ -209,15 +201,6 @@ def _value_at(payload: bytes, at: int) -> tuple[int, int]:
     raise WireError("damaged", "a value of no message")
 
 
-def _group_at(payload: bytes) -> tuple[int, int]:
-    code = _byte(payload, 0)
-    if code >> 4 == 0b1001:
-        return code & 15, 1
-    if code in (0xDC, 0xDD):
-        return _length(payload, 1, _GROUPS[code][0])
-    raise _no_tag(code)
-
-
 def _length(payload: bytes, at: int, width: int) -> tuple[int, int]:
     if len(payload) < at + width:
         raise _truncated()
@@ -232,9 +215,3 @@ def _byte(payload: bytes, at: int) -> int:
 
 def _truncated() -> WireError:
     return WireError("truncated", "the payload ends inside the message")
-
-
-def _no_tag(code: int = 0) -> WireError:
-    if code == _INVALID:
-        return WireError("damaged", "not MessagePack")
-    return WireError("wrong tag", "a message is an array that begins with its tag")

@@ -229,7 +229,7 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
         ("not ascending", with_fields(MET, measurements=[]), None),
         ("not ascending", with_fields(MET, measurements=[5, 5]), None),
         ("not positive definite", with_fields(MET, covariance=indefinite(2)), None),
-        ("too large", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
+        ("wrong tag", b"\xdd\x7f\xff\xff\xff" + b"\x00" * 100, None),
         ("too large", with_fields(SUBMAP, ids=from_ids(range(4096)), mean=bytes(8 * 8198)), None),
         ("wrong tag", b"\x91" * 100_000, None),
         ("too deep", longer(SUBMAP, b"\x91" * 100_000 + b"\xc0"), None),
