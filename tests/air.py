@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from teamslam.sim.radio.bus import reach_of
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.sim.world.radio import reach_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.estimation.randomness import generator
 

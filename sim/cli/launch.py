@@ -45,8 +45,7 @@ from teamslam.sim.cli.options import (
     set_aside,
     write_json,
 )
-from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
-from teamslam.sim.cli.steps import Steps
+from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.view import FoxglovePort, Open, Port, show_on_page
 from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 from teamslam.team.extras import install_command

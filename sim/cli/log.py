@@ -189,8 +189,7 @@ def export(
     """Write a log as tables, its paths for evo, or its measurements as a data set or graph."""
     from teamslam.central.desk.export.rosbag2 import export_rosbag2
     from teamslam.central.desk.export.tum import export_tum
-    from teamslam.sim.recorded.graph_files import FORMATS, export_graph
-    from teamslam.sim.recorded.utias_set import export_utias
+    from teamslam.sim.recorded.export import FORMATS, export_graph, export_utias
     from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)

@@ -1,23 +1,30 @@
-"""Commands that order a running team: withdraw, verdict, end."""
+"""Commands on a running team: withdraw, verdict, end, status, keys."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from teamslam.sim.cli.help import Command
+from teamslam.central.desk.names import in_order
+from teamslam.sim.cli.help import Command, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
     WRONG_USE,
     Connect,
+    JsonFile,
     Keys,
+    Robots,
     TeamOption,
     check_names,
     connect_bus,
     fail,
     failing,
+    scenario_of,
     signer_of,
+    write_json,
 )
+from teamslam.sim.scenarios.scenario import with_options
 from teamslam.team.wire.arrays import ids
 
 Reason = Annotated[str, typer.Option(help="Why, for the log.")]
@@ -145,3 +152,143 @@ def end(
         else:
             give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
     typer.echo(f"the team no longer waits for {without}" if without else "the team ends")
+
+
+@app.command(cls=Command, epilog="teamslam status --team waypoints")
+def status(
+    team: TeamOption,
+    connect: Connect = LOOPBACK,
+    keys: Keys = None,
+    seconds: Annotated[
+        float, typer.Option(help="Seconds for which the team is observed.", min=0.5)
+    ] = 3.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from teamslam.central.desk.presence import Presence
+
+    check_names(team)
+    presence = Presence()
+    with connect_bus(team, connect, keys, "operator") as bus:
+        presence.take(bus, seconds)
+        others = [] if presence.members else bus.other_teams()
+    if not presence.members:
+        but = f", but of {', '.join(others)}" if others else ""
+        fail(f"no node of the team {team} is at {connect}{but}: see --team, --connect", FAILED)
+    rows = _rows(presence)
+    table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
+    for row in rows:
+        table.add_row(*(_cell(row[name]) for name in row if name != "warnings"))
+    console = Console()
+    console.print(table)
+    advice = presence.advice()
+    for line in advice:
+        console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
+    write_json(json_file, {"nodes": rows, "advice": advice})
+
+
+def _rows(presence: Any) -> list[dict[str, Any]]:
+    clocks = presence.clocks()
+    rows = []
+    for node in in_order(presence.members):
+        member = presence.members[node]
+        figures = {} if member.status is None else member.status.figures
+        rows.append(
+            {
+                "node": node,
+                "there": member.alive,
+                "state": None if member.status is None else member.status.state,
+                "measured": figures.get("measurements"),
+                "per_s": member.rate if "measurements" in figures else None,
+                "taken": figures.get("delivered"),
+                "clock_s": clocks.get(node),
+                "warnings": [] if member.status is None else list(member.status.warnings),
+            }
+        )
+    return rows
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,.1f}".removesuffix(".0") if isinstance(value, float) else str(value)
+
+
+@app.command(
+    cls=Command,
+    epilog="teamslam keys waypoints -o keys --scenario waypoints --router 192.168.1.5",
+)
+def keys(
+    team: Annotated[str, typer.Argument(help="The team's name, as its scenario has it.")],
+    output: Annotated[Path, output_option("The folder; it holds the authority, too.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="For every robot of a scenario.", metavar="SCENARIO")
+    ] = None,
+    robots: Robots = None,
+    robot: Annotated[
+        list[str] | None, typer.Option(help="For a robot by name, too; again and again.")
+    ] = None,
+    router: Annotated[
+        list[str] | None,
+        typer.Option(help="Name or address by which robots reach the router.", metavar="HOST"),
+    ] = None,
+    days: Annotated[float, typer.Option(help="How long new certificates are good.")] = 90.0,
+    renew: Annotated[
+        list[str] | None,
+        typer.Option(help="A new certificate for a node, as robot-r1, or all.", metavar="NODE"),
+    ] = None,
+    revoke: Annotated[
+        list[str] | None, typer.Option(help="Revoke this node's certificate.", metavar="NODE")
+    ] = None,
+    replay: Annotated[
+        bool,
+        typer.Option("--replay", help="One for `teamslam replay`, which may publish on all keys."),
+    ] = False,
+) -> None:
+    """Make a team's certificates: an authority, and one for each process and robot.
+
+    Existing certificates are kept, so a robot is added by naming it.
+    docs/security.md lists which files go where.
+    """
+    from teamslam.team.keys.authority import make_keys
+    from teamslam.team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of
+
+    if not TEAM.fullmatch(team):
+        fail(f"{team!r} is no team's name: letters, digits, dot, dash and underscore", WRONG_USE)
+    if not days > 0.0:
+        fail(f"--days {days:g}: give a positive number", WRONG_USE)
+    names = list(robot or ())
+    if scenario is not None:
+        resolved = with_options(scenario_of(scenario), robots=robots)
+        names += [each.id for each in resolved.robots]
+        if resolved.team != team:
+            typer.echo(
+                f"warning: {scenario} is of the team {resolved.team!r}, these keys of {team!r}",
+                err=True,
+            )
+    for name in names:
+        if not ROBOT.fullmatch(name):
+            fail(f"{name!r} is no robot's name", WRONG_USE)
+    made = make_keys(
+        output,
+        team,
+        [*nodes_of(dict.fromkeys(names)), *([REPLAY] if replay else [])],
+        hosts=router or (),
+        days=days,
+        renew=renew or (),
+        revoke=revoke or (),
+    )
+    for what, nodes in (("made", made.made), ("kept", made.unchanged), ("revoked", made.revoked)):
+        if nodes:
+            typer.echo(f"{what:8} {', '.join(nodes)}")
+    if made.made:
+        typer.echo(f"good until {made.ends:%Y-%m-%d %H:%M} UTC")
+        typer.echo("copy to each computer ca.pem and NODE.pem, NODE.key of its processes;")
+        typer.echo("to the router's, roster.json too; ca.key stays here")
+    if made.revoked or made.made:
+        typer.echo("a router that runs takes the roster when it is started again")

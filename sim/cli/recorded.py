@@ -1,4 +1,4 @@
-"""Commands on a recorded run: replay, report, repair."""
+"""Commands on recorded runs: replay, report, repair, compare."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +26,7 @@ from teamslam.sim.cli.options import (
     warn_of_holes,
     write_json,
 )
-from teamslam.sim.cli.results import print_evaluation, print_nis, print_written, read_run
-from teamslam.sim.cli.steps import Steps
+from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 
 if TYPE_CHECKING:
     from teamslam.team.recording.reader import Log
@@ -232,3 +231,55 @@ def _hint_if_cut(log: "Log") -> None:
     if not log.complete:
         remedy = f"`teamslam repair {log.path} -o FIXED.mcap` completes it"
         typer.echo(f"{log.path} is cut: {remedy}", err=True)
+
+
+FEWEST = 2
+
+
+@app.command(cls=Command, epilog="teamslam compare runs/first runs/second -o both.png")
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or their logs; two or more.")],
+    output: Annotated[Path | None, output_option("Write the picture here (png, svg, pdf).")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare runs side by side: a column for each in a table, and a picture with -o."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from teamslam.central.desk.compare import compare_figures, compare_picture, compare_rows
+    from teamslam.central.desk.evaluation.evaluation import evaluate
+    from teamslam.team.recording.reader import open_log
+
+    if len(runs) < FEWEST:
+        fail("one run alone is compared with nothing: give two or more", WRONG_USE)
+    if output is not None:
+        _check_picture(output)
+    evaluated = {}
+    for path in runs:
+        name = path.name if path.is_dir() else path.stem if path.stem != "log" else path.parent.name
+        while name in evaluated:
+            name += "'"
+        opened = open_log(path)
+        warn_of_holes(opened)
+        evaluated[name] = evaluate(opened.samples())
+    table = Table(box=box.SIMPLE)
+    table.add_column("", no_wrap=True)
+    for name in evaluated:
+        table.add_column(Text(name), justify="right")
+    for figure, cells in compare_rows(evaluated):
+        table.add_row(Text(figure), *(Text(cell) for cell in cells))
+    Console().print(table)
+    if output is not None and compare_picture(evaluated, output):
+        typer.echo(f"wrote {output}")
+    write_json(json_file, compare_figures(evaluated))
+
+
+def _check_picture(path: Path) -> None:
+    forms = [form.value for form in Form]
+    if path.suffix.removeprefix(".") not in forms:
+        names = ", ".join(f".{form}" for form in forms)
+        fail(f"-o {path}: a picture's name ends in one of {names}", WRONG_USE)
+    if not path.parent.is_dir():
+        fail(f"-o {path}: there is no folder {path.parent}; make it first", WRONG_USE)

@@ -28,7 +28,6 @@ from teamslam.sim.cli.options import (
     warn_of_holes,
     write_json,
 )
-from teamslam.sim.recorded.changes import Changes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from teamslam.central.desk.evaluation.history import History
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.verification.verification import Verification
+    from teamslam.sim.recorded.changed_run import Changes
 
 app = typer.Typer()
 
@@ -124,6 +124,8 @@ def rerun(
     status 0 only if the log is complete and every robot that is not left out is in
     the final map, with --verify only if all is equal; else 1. 2: wrong use.
     """
+    from teamslam.sim.recorded.changed_run import Changes
+
     saved_maps(map_)
     if localise:
         check_localises(map_)
@@ -204,7 +206,7 @@ def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
     return tuple(factors.items())
 
 
-def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path | None) -> None:
+def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Path | None) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -220,8 +222,8 @@ def _compare(path: Path, changes: Changes, json_file: Path | None, output: Path 
     from teamslam.central.desk.evaluation.history import history
     from teamslam.central.desk.verification.recorded import RerunError
     from teamslam.sim.cli.importing import readable
-    from teamslam.sim.recorded.changed_run import changed_run
-    from teamslam.sim.recorded.data_set import DataSetRun, log_or_run
+    from teamslam.sim.recorded.changed_run import Changes, changed_run
+    from teamslam.sim.recorded.world import DataSetRun, log_or_run
     from teamslam.team.recording.reader import Log
 
     with readable(path) as source:

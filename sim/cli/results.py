@@ -2,11 +2,12 @@
 
 import shlex
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teamslam.sim.cli.steps import Steps
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -14,6 +15,37 @@ if TYPE_CHECKING:
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.report.run import Run
     from teamslam.team.recording.reader import Log
+
+PATIENCE_S = 3.0
+"""Time [s] between lines and before the first, so short work prints none."""
+
+
+class Steps:
+    """Print the current step and its progress, at most once in PATIENCE_S."""
+
+    def __init__(self) -> None:
+        self._what = ""
+        self._due = time.monotonic() + PATIENCE_S
+
+    def begin(self, what: str) -> None:
+        """Begin the next step."""
+        self._what = what
+        self.print_if_due("")
+
+    def share(self, done: float) -> None:
+        """Report the completed share of the step, 0 to 1."""
+        self.print_if_due(f": {done:.0%}")
+
+    def robot(self, name: str) -> None:
+        """Report the robot that the step has reached."""
+        self.print_if_due(f": {name}")
+
+    def print_if_due(self, words: str) -> None:
+        """Print the step with this text, if a line is due."""
+        now = time.monotonic()
+        if now >= self._due:
+            self._due = now + PATIENCE_S
+            typer.echo(f"{self._what}{words}", err=True)
 
 
 def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":

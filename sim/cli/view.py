@@ -59,7 +59,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 
     The recorder stores them beside the team's messages. Ends after the final map.
     """
-    from teamslam.central.desk.view.viewer import run_viewer
+    from teamslam.central.desk.view.export import run_viewer
     from teamslam.team.shell import process
 
     resolved = scenario_of(scenario)

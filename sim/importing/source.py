@@ -1,9 +1,11 @@
 """Import a user's files, bag, log or data set."""
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+import tomllib
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -11,8 +13,17 @@ import numpy as np
 import tomli_w
 
 from teamslam.sim.datasets.csv_table import CsvTable
-from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO
-from teamslam.sim.datasets.folder_tables import POSES
+from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO, robots_of
+from teamslam.sim.datasets.folder_odometry import intervals_of
+from teamslam.sim.datasets.folder_tables import (
+    POLAR,
+    POSES,
+    check_polar,
+    fixes_of,
+    measurements_of,
+    start_of,
+    truth_of,
+)
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
@@ -382,3 +393,109 @@ def robot_entry(robot: Mapping[str, Any]) -> str:
         for name, place in robot.get(part, {}).items()
     ]
     return f'\n[[robots]]\nid = "{robot["id"]}"\n{"".join(places)}'
+
+
+LANDMARKS = "landmarks.csv"
+
+
+def takes_robot(folder: Path, robot: str) -> bool:
+    """Whether a folder is a data set of sub-folders, and none for this robot."""
+    try:
+        robots = robots_of(str(folder))
+    except DatasetError:
+        return False
+    return robot not in robots and all((folder / each).is_dir() for each in robots)
+
+
+def add_robot(request: Request, folder: Path) -> Report:
+    """Import one robot into a data set, whose other files and datum stay; raises DatasetError."""
+    assert request.robot is not None
+    with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as place:
+        added = Path(place)
+        datum = _datum_in(folder / SCENARIO)
+        report = import_data(replace(request, datum=datum), added)
+        if report.robots != [request.robot]:
+            raise DatasetError(
+                f"--robot {request.robot}: {request.sources[0]} has the robots "
+                f"{', '.join(report.robots)}; one robot at a time is added to {folder}"
+            )
+        own = _datum_in(added / SCENARIO)
+        if own not in (None, datum) and (folder / SCENARIO).exists():
+            raise DatasetError(
+                f"{folder / SCENARIO}: its [central.datum] is not that of {request.robot}'s fixes, "
+                f"{own.latitude_deg}, {own.longitude_deg}: state one datum for both, here and as "
+                "[datum] in the file of topics"
+            )
+        scenario = _with_robot(folder, added, request.robot)
+        if (added / LANDMARKS).exists():
+            if (folder / LANDMARKS).exists():
+                report.notes.append(f"{LANDMARKS}: that of {folder} is kept")
+            else:
+                (added / LANDMARKS).rename(folder / LANDMARKS)
+        (added / request.robot).rename(folder / request.robot)
+        if scenario:
+            (folder / SCENARIO).write_text(scenario, "utf-8")
+            report.notes.append(f"{SCENARIO}: {request.robot} is added to its robots")
+    return report
+
+
+def _with_robot(folder: Path, added: Path, robot: str) -> str:
+    """Text of the data set's scenario with the added robot; empty if it needs no change.
+
+    Raises DatasetError.
+    """
+    own = _document(added / SCENARIO)
+    text = (folder / SCENARIO).read_text("utf-8") if (folder / SCENARIO).exists() else ""
+    base = _document(folder / SCENARIO)
+    entries = own.get("robots", [{"id": robot}])
+    if "robots" not in base:
+        if "robots" not in own:
+            return ""
+        entries = [*({"id": each} for each in robots_of(str(folder))), *entries]
+    changed = text or tomli_w.dumps({key: own[key] for key in own if key != "robots"})
+    changed += "".join(map(robot_entry, entries))
+    try:
+        tomllib.loads(changed)
+    except tomllib.TOMLDecodeError:
+        raise DatasetError(
+            f"{folder / SCENARIO}: its robots are written as an array: add {robot} to it, "
+            "after that the files by a folder of its name"
+        ) from None
+    return changed
+
+
+def _datum_in(path: Path) -> Datum | None:
+    found = _document(path).get("central", {}).get("datum")
+    return None if found is None else msgspec.convert(found, Datum)
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    return tomllib.loads(path.read_text("utf-8")) if path.exists() else {}
+
+
+def check_sources(robots: Iterable[RobotTables]) -> None:
+    """Convert the users' tables as a data set's are; raises the DatasetError of the first fault,
+    with the user's file, its line and the entry of the map of columns.
+    """
+    for robot in robots:
+        tables = {kind: table for kind, table in robot.sources.items() if len(table)}
+        intervals, _ = intervals_of(tables.get("odometry"), 0)
+        driven = None
+        if len(intervals.end_ns):
+            driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
+        measurements_of(tables.get("observations"), "measurement", None, driven)
+        sighted = tables.get("sightings")
+        if sighted is not None:
+            mates = list(dict.fromkeys(sighted.columns["teammate"]))
+            measurements_of(sighted, "sighting", (robot.robot, mates), driven)
+        fixes_of(tables.get("fixes"), driven)
+        truth_of(tables.get("truth"), driven)
+        if (start := tables.get("start")) is not None:
+            start_of(start)
+        _check_detections(tables.get("detections"))
+
+
+def _check_detections(table: CsvTable | None) -> None:
+    if table is not None and table.has(*POLAR):
+        ranges, bearings = table.numbers(*POLAR).T
+        check_polar(table, ranges, bearings)

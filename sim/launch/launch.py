@@ -9,8 +9,15 @@ from pathlib import Path
 
 from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre
 from teamslam.sim.launch.processes import Starter, Used
-from teamslam.sim.launch.supervision import failure, lacking_in, names_only, supervise
-from teamslam.sim.launch.supervisor import Ended, Supervised, end_all
+from teamslam.sim.launch.supervision import (
+    Ended,
+    Supervised,
+    end_all,
+    failure,
+    lacking_in,
+    names_only,
+    supervise,
+)
 from teamslam.sim.launch.watch import Watch
 from teamslam.sim.scenarios.scenario import Scenario, dumps
 from teamslam.team.keys.credentials import Credentials, credentials_of

@@ -1,5 +1,6 @@
 """Show a running team: a live table in a terminal, plain lines elsewhere."""
 
+import math
 import re
 import sys
 import time
@@ -15,13 +16,119 @@ from rich.table import Table
 from rich.text import Text
 
 from teamslam.central.desk.evaluation.events import without_decimals
-from teamslam.central.desk.names import in_order, short
-from teamslam.sim.launch import progress
-from teamslam.sim.launch.watch import DRIVERS, Watch
+from teamslam.central.desk.names import in_order, not_joined, short
+from teamslam.sim.launch.watch import DRIVERS, Watch, team_time
 from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:
     from teamslam.sim.launch.truth import LiveErrors
+
+AHEAD_S = 10.0
+"""Smallest reported lead of the world over the map [s]."""
+NAMED = 5
+"""Most missing robots that are named."""
+PATIENCE_S = 8.0
+"""Time [s] before absent nodes are reported."""
+
+
+def _count_consumed(watch: Watch) -> tuple[float, float]:
+    total = 0.0 if watch.world is None else watch.world.figures.get("of", 0.0)
+    robots = (s for node, s in watch.statuses.items() if node.startswith("robot/"))
+    taken = sum(robot.figures.get("measurements", 0.0) for robot in robots)
+    return min(taken, total), total
+
+
+def done(watch: Watch) -> float:
+    """Share of the measurements that the robots consumed."""
+    taken, total = _count_consumed(watch)
+    return taken / total if total else 0.0
+
+
+def is_live(watch: Watch) -> bool:
+    """Whether drivers measure instead of a world."""
+    return watch.world is not None and watch.world.node == DRIVERS
+
+
+def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
+    """Failures and node warnings; absent nodes after PATIENCE_S only.
+
+    During the start only the world's warning is given. silent_s: age [s] beyond which a node's
+    warning is dropped, as it may no longer hold; 0: never.
+    """
+    if time.monotonic() - watch.began <= PATIENCE_S:
+        return list(watch.failures)
+    world = watch.world
+    statuses = [(node, watch.statuses[node]) for node in in_order(watch.statuses)]
+    if world is None:
+        statuses = (
+            [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
+        )
+        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in statuses if s.warnings]
+    elif world.state == "waiting":
+        texts = [f"{world.node}: {w}" for w in world.warnings]
+    else:
+        statuses += [(world.node, world)] if watch.drivers else []
+        oldest = time.monotonic() - silent_s if silent_s else -math.inf
+        fresh = [s for s in statuses if watch.last_message.get(s[0], math.inf) >= oldest]
+        texts = [f"{node}: {w}" for node, status in fresh for w in status.warnings]
+    return [*watch.failures, *(each for each in texts if not any(not_joined([each])))]
+
+
+def starting(watch: Watch) -> str:
+    """Number of started robots and names of the others."""
+    missing = watch.missing_robots
+    started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
+    if not missing:
+        return f"{started}; waiting for the first measurements"
+    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+    return f"{started}; waiting for {', '.join(missing[:NAMED])}{more}"
+
+
+def share(watch: Watch) -> str:
+    """Progress as text; the total is unknown for drivers."""
+    if not is_live(watch):
+        return f"{done(watch):.0%}"
+    taken, total = _count_consumed(watch)
+    return f"{taken:,.0f} of {total:,.0f} measurements mapped"
+
+
+def times(watch: Watch, world: m.Status) -> str:
+    """Describe the team time of the map, and of a world far ahead."""
+    ahead_s = _behind_s(watch, world)
+    if is_live(watch) or ahead_s < AHEAD_S:
+        return team_time(world)
+    at_s = max(0.0, world.figures.get("team_time_s", 0.0) - ahead_s)
+    return f"team time {at_s:,.0f} s (the world is {ahead_s:,.0f} s ahead of the map)"
+
+
+def _behind_s(watch: Watch, world: m.Status) -> float:
+    if watch.fused is None or not watch.fused.stamp_ns:
+        return world.figures.get("team_time_s", 0.0)
+    return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
+
+
+def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
+    """Unjoined robots, each with its failed test."""
+    return [] if watch.fused is None else list(not_joined(watch.fused.reasons))
+
+
+def consistency(watch: Watch) -> str:
+    """Describe the consistency monitor's figures; with truth, NEES and coverage."""
+    central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
+    figures = {} if central is None else central.figures
+    parts = [
+        f"{words} {figures[name]:.2f}"
+        for name, words in (
+            ("joint_cost_per_dof", "joint cost per dof"),
+            ("covariance_scale", "covariance scale"),
+        )
+        if name in figures
+    ]
+    if landmarks.count:
+        parts.append(f"landmark NEES per dof {landmarks.mean:.2f}")
+        parts.append(f"{landmarks.coverage:.0%} within 95 %")
+    return ", ".join(parts)
+
 
 LINE_S = 5.0
 """Wall time between plain lines."""
@@ -91,19 +198,19 @@ class _Lines:
         robots = [s for n, s in watch.statuses.items() if n.startswith("robot/")]
         if world.state == "waiting":
             missing = watch.missing_robots
-            lacking = world.warnings if progress.is_live(watch) and not missing else ()
+            lacking = world.warnings if is_live(watch) and not missing else ()
             self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
-            return "; ".join(lacking) or progress.starting(watch)
+            return "; ".join(lacking) or starting(watch)
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        waiting = ", ".join(who for who, _ in progress.unjoined_robots(watch))
+        waiting = ", ".join(who for who, _ in unjoined_robots(watch))
         apart = f"; not joined yet: {waiting}" if waiting else ""
-        consistency = progress.consistency(watch)
+        consistent = consistency(watch)
         return (
-            f"{progress.share(watch):>4}  {progress.times(watch, world)}, "
+            f"{share(watch):>4}  {times(watch, world)}, "
             f"{len(robots)} robots, {submaps} submaps, {landmarks} landmarks in the team's map"
-            f"{apart}{'; ' if consistency else ''}{consistency}"
+            f"{apart}{'; ' if consistent else ''}{consistent}"
         )
 
     def end(self) -> None:
@@ -114,9 +221,9 @@ class _Lines:
             self._warn(self._last, 0.0)
 
     def _warn(self, watch: Watch, settled_s: float) -> None:
-        now, warnings = time.monotonic(), progress.warnings(watch, silent_s=settled_s)
-        self._since = {w: self._since.get(w, now) for w in map(without_decimals, warnings)}
-        for warning in warnings:
+        now, found = time.monotonic(), warnings(watch, silent_s=settled_s)
+        self._since = {w: self._since.get(w, now) for w in map(without_decimals, found)}
+        for warning in found:
             key = without_decimals(warning)
             lasting = warning in watch.failures or now - self._since[key] >= settled_s
             if not lasting or key in self._shown:
@@ -143,13 +250,13 @@ def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
         parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
     robots = {n: watch.statuses[n] for n in in_order(watch.statuses) if n.startswith("robot/")}
     if world is None or world.state == "waiting":
-        parts.append(Text(progress.starting(watch)))
+        parts.append(Text(starting(watch)))
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(
-            ProgressBar(total=1.0, completed=progress.done(watch), width=36),
-            progress.share(watch),
-            f"{progress.times(watch, world)}, {world.node} {world.state}",
+            ProgressBar(total=1.0, completed=done(watch), width=36),
+            share(watch),
+            f"{times(watch, world)}, {world.node} {world.state}",
         )
         parts.append(bar)
     if robots:
@@ -157,7 +264,7 @@ def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
     parts += [Text(line) for line in _map_lines(watch)]
     parts += [Text(short(words)) for words in (() if watch.fused is None else watch.fused.joined)]
     parts += [Text(note) for note in watch.notes[-4:]]
-    parts += [Text(w, style="yellow") for w in progress.warnings(watch)[-4:]]
+    parts += [Text(w, style="yellow") for w in warnings(watch)[-4:]]
     return Group(*parts)
 
 
@@ -229,9 +336,8 @@ def _map_lines(watch: Watch) -> list[str]:
         f"team map by {fused.rule}: {len(fused.ids) // 4} landmarks from "
         f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     ]
-    consistency = progress.consistency(watch)
-    lines += [consistency] if consistency else []
-    return lines + [f"not joined yet: {who}: {why}" for who, why in progress.unjoined_robots(watch)]
+    lines += filter(None, [consistency(watch)])
+    return lines + [f"not joined yet: {who}: {why}" for who, why in unjoined_robots(watch)]
 
 
 def _number(value: float | None, form: str) -> str:

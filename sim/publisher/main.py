@@ -4,12 +4,10 @@ import logging
 import threading
 import time
 
-from teamslam.sim.publisher.configurations import Configurations
-from teamslam.sim.publisher.node import WorldNode, expected_nodes
-from teamslam.sim.radio.bus import plan_of
+from teamslam.sim.publisher.node import Configurations, WorldNode, expected_nodes
+from teamslam.sim.radio.bus import plan_of, reach_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import tells_map
-from teamslam.sim.world.radio import reach_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as ch

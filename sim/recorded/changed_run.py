@@ -1,15 +1,14 @@
 """Run the recorded team's nodes in memory, on the same measurements with changes."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
 import msgspec
 
-from teamslam.sim.in_memory.links import Conditions, Partition
-from teamslam.sim.in_memory.team import run_nodes
-from teamslam.sim.recorded.changes import Changes, Span
+from teamslam.sim.in_memory.team import Conditions, Partition, run_nodes
 from teamslam.sim.recorded.world import RecordedWorld, Samples
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, with_options
@@ -24,6 +23,34 @@ from teamslam.team.config import (
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.saved_map import read_map
 from teamslam.team.wire.bus import Sample
+
+Span = tuple[float, float]
+"""Begin and end in seconds since the log's first measurement."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """Changes of a run on the log's measurements.
+
+    without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
+    centre. partitions: robots that the centre cannot reach, and when. noise: factors on assumed
+    standard deviations, by kind. maps: saved maps, by path. localise: robots are localised in the
+    map, which stays as it is.
+    """
+
+    without: tuple[str, ...] = ()
+    fusion: str | None = None
+    estimator: str | None = None
+    particles: int | None = None
+    window_s: float | None = None
+    seed: int | None = None
+    loss: float = 0.0
+    delay_s: float = 0.0
+    no_centre: Span | None = None
+    partitions: tuple[tuple[tuple[str, ...], Span], ...] = ()
+    noise: tuple[tuple[str, float], ...] = ()
+    maps: tuple[str, ...] = ()
+    localise: bool = False
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:

@@ -1,18 +1,23 @@
 """A world from a log: its measurements and its truth, second by second of team time."""
 
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
 import msgspec
 
 from teamslam.central.desk.verification.recorded import RerunError
+from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, loads
+from teamslam.sim.scenarios.source import open_data_set
 from teamslam.team.pairs import NEEDS_MAP
+from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats
 from teamslam.team.wire.bus import Outgoing, Sample, opened
+from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.digest import announce_configuration
 
@@ -160,3 +165,29 @@ def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...
     for (robot, incarnation), count in sorted(counts.items()):
         last[robot] = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
     return tuple(last.values())
+
+
+class DataSetRun:
+    """All messages of a team on a data set, with the data set's own scenario.
+
+    Raises DatasetError, ScenarioError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        streams, scenario, _ = open_data_set(path)
+        self.path = path
+        self._samples = list(run_team(scenario, streams))
+
+    def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
+        """Samples of these channels; None: all."""
+        for sample in self._samples:
+            found = channel_of(sample.key)
+            if channels is None or (found is not None and found[0] in channels):
+                yield sample
+
+
+def log_or_run(path: Path) -> Samples:
+    """A log, or the run on a data set; raises LogError, DatasetError, ScenarioError."""
+    if path.suffix == ".mcap" or (path.is_file() and path.suffix != ".zip"):
+        return open_log(path)
+    return DataSetRun(path)

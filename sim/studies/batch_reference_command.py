@@ -30,7 +30,7 @@ def batch_reference(
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.recorded.chains import BatchReferenceError
-    from teamslam.sim.recorded.data_set import log_or_run
+    from teamslam.sim.recorded.world import log_or_run
     from teamslam.sim.studies.batch_reference.reference import batch_map
     from teamslam.team.recording.reader import Log
 

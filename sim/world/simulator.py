@@ -14,11 +14,12 @@ from teamslam.sim.world.config import SimulatedWorld, starts_unknown
 from teamslam.sim.world.forms import (
     draw_covariances,
     measured_increments,
+    measured_speeds,
     measured_steering,
     seen_from,
+    slip,
     with_errors,
 )
-from teamslam.sim.world.odometry import measured_speeds, slip
 from teamslam.sim.world.paths import (
     Drive,
     Limits,

@@ -5,7 +5,7 @@ import os
 import signal
 from pathlib import Path
 
-from teamslam.sim.launch.supervisor import FRUITLESS
+from teamslam.sim.launch.supervision import FRUITLESS
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

@@ -9,15 +9,15 @@ and Zeger 1986), which allows for correlation within a stretch.
 import math
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 import numpy as np
 
 from teamslam.central.desk.names import in_order
-from teamslam.central.diagnosis import clock_remedy
+from teamslam.central.diagnosis import MIRRORED_REMEDY, clock_remedy
 from teamslam.team import translate
-from teamslam.team.config import RobotConfig, Sensor
+from teamslam.team.config import GATE, RobotConfig, Sensor
 from teamslam.team.estimation.odometry import moved, steered
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
@@ -366,3 +366,47 @@ def _first_of_fit(
     if not float(share @ share) * LEAST_STRETCHES < 1.0:
         return math.nan, math.nan
     return float(p[0] / norms[0]), math.sqrt(float(sums @ sums)) / float(norms[0])
+
+
+MIRRORED = 0.9
+"""Least share of the deciding stretches that fit reflected: 11 of 12."""
+
+
+def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis | None:
+    """Diagnose a robot whose measurements fit its odometry reflected, or None.
+
+    A stretch decides if the χ² of its measured points less that of the reflected ones is beyond
+    GATE; evidence is the mean of these. A pair counts GATE at most.
+    """
+    gains = _gains(timed, config)
+    deciding = gains[np.abs(gains) > GATE]
+    right = int((deciding > 0.0).sum())
+    if len(deciding) < LEAST_STRETCHES or right < MIRRORED * len(deciding):
+        return None
+    return m.Diagnosis(
+        cause="mirrored",
+        robot=robot,
+        value=(-1.0,),
+        sigma=(0.0,),
+        evidence=float(deciding.mean()),
+        remedy=MIRRORED_REMEDY,
+    )
+
+
+def _gains(timed: Timed, config: RobotConfig) -> Float[np.ndarray, " n"]:
+    """χ² that a reflection removes from each stretch of time."""
+    none = np.zeros(0)
+    if not timed.ends_ns or not timed.ids:
+        return none
+    seen = np.array(timed.seen).reshape(-1, 2) * (1.0, -1.0)
+    with np.errstate(all="ignore"):
+        own = pairs_of(timed, config)
+        other = pairs_of(replace(timed, seen=array("d", seen.ravel().tolist())), config)
+        if own is None or other is None:
+            return none
+        unit = min(float(np.median(each.gaps)) for each in (own, other))
+        chi2, reflected = (
+            np.minimum(2.0 * math.log(2.0) * (each.gaps / unit) ** 2, GATE) for each in (own, other)
+        )
+        sums = np.bincount(own.stretch, chi2 - reflected)
+    return sums if np.isfinite(sums).all() else none

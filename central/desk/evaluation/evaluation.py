@@ -1,5 +1,6 @@
 """Evaluate a run from its log, against the recorded truth."""
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -14,6 +15,7 @@ from teamslam.central.desk.evaluation.clocks import (
     Late,
     Timed,
     lateness,
+    mirrored_cause,
     separate_times_warning,
 )
 from teamslam.central.desk.evaluation.errors import (
@@ -21,31 +23,37 @@ from teamslam.central.desk.evaluation.errors import (
     Path,
     distance_rmse,
     interpolate_truth,
+    map_errors,
     pose_errors,
     rigid_alignment,
     transform_points,
 )
-from teamslam.central.desk.evaluation.gps import gps_median
 from teamslam.central.desk.evaluation.log import Collected, collect_log
-from teamslam.central.desk.evaluation.map_result import map_result, own_map
-from teamslam.central.desk.evaluation.mirrored import mirrored_cause
-from teamslam.central.desk.evaluation.peers import peer_results
+from teamslam.central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
-from teamslam.central.desk.evaluation.robot import Consumption, RobotLog, consumption, robot_log
+from teamslam.central.desk.evaluation.robot import (
+    Consumption,
+    RobotLog,
+    consumption,
+    peer_results,
+    robot_log,
+)
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.evaluation.states import robot_states
 from teamslam.central.desk.evaluation.verdicts import verdicts_given
 from teamslam.central.desk.names import data_set_name, in_order
 from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
-from teamslam.team.config import SURVEY_FRAME, RobotConfig
+from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import Log
-from teamslam.team.shapes import Float
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, stamps
 from teamslam.team.wire.bus import Sample
 
 UPLINK = {
@@ -314,3 +322,179 @@ def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
         true_places.append(truth[known, :2])
         places.append(log.smoothed.poses[known, :2])
     return rigid_alignment(np.concatenate(true_places), np.concatenate(places))
+
+
+LEAST = 10
+GAP_NS = 1_500_000_000
+"""Largest gap between fixes that is interpolated."""
+SHIFTS_S = np.arange(-1.0, 1.01, 0.25)
+ROUNDS = 20
+NEAREST_M = 0.1
+"""Least distance [m] in the weights 1/d."""
+
+Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
+
+
+def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
+    """Median distance [m] of smoothed poses from the other sensor's positions, or None.
+
+    Fits one rigid motion, lever arm and time shift per team by least absolute distances.
+    """
+    fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
+    if not fixes:
+        return None
+    medians = [_median(fixes, paths, float(shift)) for shift in SHIFTS_S]
+    return min((each for each in medians if each is not None), default=None)
+
+
+def _fixes(log: Collected, robot: str) -> Fixes | None:
+    message = next(iter(log.messages(ch.TRUTH_POSITIONS, m.TruthPositions, robot)), None)
+    if message is None:
+        return None
+    places = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
+    at_ns = stamps(message.stamps, "stamps").astype(np.int64)
+    return (at_ns, places) if len(at_ns) > 1 else None
+
+
+def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: float) -> float | None:
+    poses, there = [], []
+    for robot, (at_ns, places) in fixes.items():
+        path = paths[robot]
+        shifted_ns = path.stamps_ns + round(shift_s * 1e9)
+        after = np.searchsorted(at_ns, shifted_ns)
+        inside = (after > 0) & (after < len(at_ns))
+        after = np.clip(after, 1, len(at_ns) - 1)
+        inside &= at_ns[after] - at_ns[after - 1] <= GAP_NS
+        columns = [np.interp(shifted_ns[inside], at_ns, places[:, i]) for i in range(2)]
+        there.append(np.column_stack(columns))
+        poses.append(path.poses[inside])
+    if sum(map(len, poses)) < LEAST:
+        return None
+    return float(np.median(distances(np.concatenate(poses), np.concatenate(there))))
+
+
+def distances(
+    poses: Float[np.ndarray, "n 3"], there: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, " n"]:
+    """‖there − (A (t + R(θ) lever) + b)‖ after the best rigid motion (A, b) and lever.
+
+    With A = [[u, −v], [v, u]] the model is linear in (u, v, b, A lever); then u² + v² = 1 is
+    restored.
+    """
+    n = len(poses)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    one, none = np.ones(n), np.zeros(n)
+    J = np.zeros((n, 2, 6))
+    J[:, 0] = np.column_stack((poses[:, 0], -poses[:, 1], one, none, c, -s))
+    J[:, 1] = np.column_stack((poses[:, 1], poses[:, 0], none, one, s, c))
+    weights, found = np.ones(n), np.zeros(n)
+    for _ in range(ROUNDS):
+        root = np.sqrt(weights)[:, None]
+        A = (J * root[:, :, None]).reshape(2 * n, 6)
+        solved = np.linalg.lstsq(A, (there * root).ravel(), rcond=None)[0]
+        turn = solved[:2] / max(float(np.hypot(*solved[:2])), 1e-9)
+        rest = there - J[:, :, :2] @ turn
+        solved = np.linalg.lstsq(A[:, 2:], (rest * root).ravel(), rcond=None)[0]
+        found = np.hypot(*(rest - J[:, :, 2:] @ solved).T)
+        weights = 1.0 / np.maximum(found, NEAREST_M)
+    return found
+
+
+def map_result(
+    log: Collected,
+    message: m.FusedMap,
+    true: TrueLandmarks,
+    label_of: Mapping[int, int],
+    truth_from_map: Float[np.ndarray, "3"] | None,
+) -> MapResult:
+    """Evaluate the final map.
+
+    truth_from_map: motion by which unnamed landmarks are matched to true ones; None: unknown.
+    """
+    ids, means = translate.landmarks_of(message)
+    covariance = translate.landmark_covariance_of(message)
+    labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
+    truth, known = true.match(labels)
+    matching = None
+    if not label_of and truth_from_map is not None:
+        at = transform_points(truth_from_map, means)
+        matching = _match_unnamed(ids, at, true, truth, known)
+    errors = _errors(means, covariance, truth, known)
+    return MapResult(
+        rule=message.rule,
+        digest=message.digest.hex(),
+        payload_sha256=hashlib.sha256(log.latest[ch.FINAL_MAP.key()].payload).hexdigest(),
+        frame=message.frame,
+        ids=ids,
+        means=means,
+        covariance=covariance,
+        joint=message.joint,
+        truth=truth,
+        known=known,
+        errors=errors,
+        cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
+        reasons=message.reasons,
+        diagnosis=tuple(each for each in message.diagnosis if not _is_refuted(each, errors)),
+        joined=message.joined,
+        withdrawn=message.withdrawn,
+        covariance_scale=message.covariance_scale or None,
+        lost=message.lost,
+        gospa=_gospa(means, errors, true.positions),
+        matching=matching,
+        changes=message.changes,
+    )
+
+
+def _is_refuted(found: m.Diagnosis, errors: MapErrors | None) -> bool:
+    is_small = found.cause == "noise_overestimated"
+    return is_small and errors is not None and errors.nees_per_dof > 1.0
+
+
+def _match_unnamed(
+    ids: UInt32[np.ndarray, " L"],
+    means: Float[np.ndarray, "L 2"],
+    true: TrueLandmarks,
+    truth: Float[np.ndarray, "L 2"],
+    known: Bool[np.ndarray, " L"],
+) -> Matching | None:
+    unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
+    free = true.positions[~np.isin(true.ids, ids)]
+    found = nearest(means[unnamed], free) if len(unnamed) else None
+    if found is None:
+        return None
+    rows, matching = found
+    near = rows >= 0
+    truth[unnamed[near]] = free[rows[near]]
+    known[unnamed[near]] = True
+    return matching
+
+
+def _gospa(
+    means: Float[np.ndarray, "L 2"], errors: MapErrors | None, positions: Float[np.ndarray, "T 2"]
+) -> Gospa | None:
+    cut_off_m = half_spacing(positions)
+    if errors is None or errors.truth_from_map is None or not cut_off_m:
+        return None
+    return gospa(transform_points(errors.truth_from_map, means), positions, cut_off_m)
+
+
+def own_map(log: Collected, robot: str, true: TrueLandmarks) -> MapErrors | None:
+    """Evaluate a robot's last own map; None without one or without truth."""
+    message = log.newest(ch.OWN_MAP, m.MapEstimate, robot)
+    if message is None:
+        return None
+    ids, means = translate.landmarks_of(message)
+    truth, known = true.match(ids)
+    return _errors(means, translate.landmark_covariance_of(message), truth, known)
+
+
+def _errors(
+    means: Float[np.ndarray, "L 2"],
+    covariance: Matrix,
+    truth: Float[np.ndarray, "L 2"],
+    known: Bool[np.ndarray, " L"],
+) -> MapErrors | None:
+    rows = np.flatnonzero(np.repeat(known, 2))
+    if not known.any():
+        return None
+    return map_errors(means[known], covariance[np.ix_(rows, rows)], truth[known])

@@ -11,10 +11,9 @@ from typing import TypeVar
 
 import msgspec
 
-from teamslam.central.desk.agreement import as_centre_final
 from teamslam.central.desk.evaluation.clocks import Timed
 from teamslam.central.desk.names import in_order
-from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.central.desk.peers_as_centre import PeersAsCentre, as_centre_final
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, open_printable

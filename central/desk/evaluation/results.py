@@ -14,8 +14,7 @@ from teamslam.central.desk.evaluation.clocks import Late, clock_cause, is_refute
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
 from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
-from teamslam.central.desk.evaluation.peers import PeerResult
-from teamslam.central.desk.evaluation.robot import Consumption
+from teamslam.central.desk.evaluation.robot import Consumption, PeerResult
 from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import describe

@@ -4,10 +4,9 @@ import json
 import msgspec
 import pytest
 
-from teamslam.central.desk.agreement import Agreement
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
-from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.central.desk.peers_as_centre import Agreement, PeersAsCentre
 from teamslam.central.desk.view.server import Feed
 from teamslam.central.team_config import TeamConfig
 from teamslam.sim.launch.watch import Watch

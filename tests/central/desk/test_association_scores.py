@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from teamslam.central.desk.evaluation.association import association_result
+from teamslam.central.desk.evaluation.evaluation import distances
 from teamslam.central.desk.evaluation.figures import association_json
-from teamslam.central.desk.evaluation.gps import distances
 from teamslam.central.desk.evaluation.log import collect_log
 from teamslam.central.desk.evaluation.matching import assign, gospa, half_spacing
 from teamslam.team.config import UNNAMED

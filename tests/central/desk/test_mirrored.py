@@ -4,10 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.clocks import Timed
+from teamslam.central.desk.evaluation.clocks import Timed, mirrored_cause
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
-from teamslam.central.desk.evaluation.mirrored import mirrored_cause
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.wire import messages as m
 from tests.central.desk.test_clocks import published, timed_of

@@ -3,7 +3,7 @@ import threading
 import msgspec
 import pytest
 
-from teamslam.central.desk.view.viewer import run_viewer
+from teamslam.central.desk.view.export import run_viewer
 from teamslam.team import end_query
 from teamslam.team.shell import FaultyRunError
 from teamslam.team.wire import channels as ch

@@ -5,12 +5,12 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from teamslam.sim.cli import nodes, steps
+from teamslam.sim.cli import nodes, results
 from teamslam.sim.cli.entry import PROCESSES
 from teamslam.sim.cli.help import SECTIONS
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.plain import parse_plainly
-from teamslam.sim.cli.steps import Steps
+from teamslam.sim.cli.results import Steps
 from teamslam.team.recording.recorder import Recorder
 from tests.sim.logs import joined_log, scenario
 from tests.test_architecture import unknown
@@ -85,7 +85,7 @@ def test_help_mistakes_and_numbers_are_left_to_typer(words):
 
 def test_short_work_says_nothing_and_long_work_what_it_does_and_how_far_it_is(monkeypatch, capsys):
     at_s = [0.0]
-    monkeypatch.setattr(steps.time, "monotonic", lambda: at_s[0])
+    monkeypatch.setattr(results.time, "monotonic", lambda: at_s[0])
     told = Steps()
     told.begin("scoring the run")
     told.share(0.3)

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import app
-from teamslam.sim.datasets import errata
+from teamslam.sim.datasets import utias as errata
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias import utias
 from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias

@@ -2,7 +2,7 @@ from io import StringIO
 
 from rich.console import Console
 
-from teamslam.sim.launch import live, progress
+from teamslam.sim.launch import live
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
@@ -102,16 +102,16 @@ def test_without_truth_there_are_the_monitor_and_nis_alone():
 
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE_S", -1.0)
+    monkeypatch.setattr(live, "PATIENCE_S", -1.0)
     watch = Watch(robots=("r1", "r2"))
     missing = ("world has not appeared yet", "robot/r2 has not appeared yet")
     watch.statuses["recorder"] = status("recorder", "recording", *missing)
     late = status("robot/r1", "waiting", "no measurements of this team yet")
     watch.statuses["robot/r1"] = late
-    assert progress.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
+    assert live.warnings(watch) == [f"recorder: {'; '.join(missing)}"]
     watch.statuses["world"] = status("world", "waiting", "waiting for robot/r2")
-    assert progress.warnings(watch) == ["world: waiting for robot/r2"]
+    assert live.warnings(watch) == ["world: waiting for robot/r2"]
     watch.statuses["world"] = status("world", "publishing")
-    assert "robot/r1: no measurements of this team yet" in progress.warnings(watch)
+    assert "robot/r1: no measurements of this team yet" in live.warnings(watch)
     watch.failures.append("robot-r2 (pid 7) was killed")
-    assert progress.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
+    assert live.warnings(watch)[0] == "robot-r2 (pid 7) was killed"

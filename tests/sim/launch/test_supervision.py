@@ -7,8 +7,7 @@ import pytest
 from teamslam.sim.launch import launch as launching
 from teamslam.sim.launch.launch import enter_team
 from teamslam.sim.launch.processes import Starter
-from teamslam.sim.launch.supervision import Silence, supervise
-from teamslam.sim.launch.supervisor import Child, Supervised, end_all
+from teamslam.sim.launch.supervision import Child, Silence, Supervised, end_all, supervise
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
 from teamslam.team.wire.zenoh.bus import ZenohBus

@@ -2,9 +2,8 @@ import msgspec
 import pytest
 
 from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.publisher.configurations import Configurations
 from teamslam.sim.publisher.main import expected_configurations
-from teamslam.sim.publisher.node import WorldNode, expected_nodes
+from teamslam.sim.publisher.node import Configurations, WorldNode, expected_nodes
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import channels as ch

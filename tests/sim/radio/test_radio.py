@@ -3,9 +3,8 @@
 import msgspec
 import numpy as np
 
-from teamslam.sim.radio.bus import behind_radio, plan_of, reach_in
+from teamslam.sim.radio.bus import behind_radio, plan_of, reach_in, reach_of
 from teamslam.sim.world.config import Radio, RadioWindow
-from teamslam.sim.world.radio import reach_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats

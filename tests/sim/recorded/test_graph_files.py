@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder_writer import write_folder
+from teamslam.sim.datasets.graph import read_pyfg
 from teamslam.sim.datasets.graph_lines import read_graph
-from teamslam.sim.datasets.pyfg import read_pyfg
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.scenarios.toml import folder_scenario

@@ -1,11 +1,12 @@
-"""Export a log's measurements as a landmark graph: g2o, isam, pyfg.
+"""Export a log's measurements: a landmark graph (g2o, isam, pyfg) or a UTIAS data set.
 
-Poses are the sensor's at keyframes, from the final map and the odometry between; without a map, by
-odometry alone. Edges are the odometry, and each accepted measurement as a point with the
+Poses of a graph are the sensor's at keyframes, from the final map and the odometry between; without
+a map, by odometry alone. Edges are the odometry, and each accepted measurement as a point with the
 first-order covariance of range and bearing.
 """
 
-from pathlib import Path as FilePath
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from teamslam.sim.datasets.factor_graph import (
     place_by_odometry,
 )
 from teamslam.sim.datasets.graph_writer import LETTERS, g2o_lines, isam_lines, pyfg_lines
+from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
@@ -27,10 +29,16 @@ from teamslam.sim.recorded.chains import (
     chains_of,
     place_chains,
 )
+from teamslam.sim.recorded.streams import recorded_streams
 from teamslam.team.config import UNNAMED
+from teamslam.team.driver.source import FIRST_INCARNATION
 from teamslam.team.estimation.models import predicted
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import opened
+from teamslam.team.wire.codec import WireError
 
 FLOOR = np.diag((1e-4, 2e-3, 1e-4)) ** 2
 """Added to a singular covariance of a motion: without slip, or without motion."""
@@ -38,7 +46,7 @@ SINGULAR = 1e-12
 FORMATS = ("g2o", "isam", "pyfg")
 
 
-def export_graph(log: Log, folder: FilePath, form: str) -> list[FilePath]:
+def export_graph(log: Log, folder: Path, form: str) -> list[Path]:
     """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; return the files.
 
     Raises `LogError` for a log without the measurements.
@@ -138,3 +146,48 @@ def _place_truly(graph: FactorGraph, run: Evaluation) -> None:
         rows = np.flatnonzero(run.map.known).tolist()
         truth = {int(run.map.ids[k]): run.map.truth[k] for k in rows}
         graph.landmarks |= {i: truth[i] for i in graph.landmarks if i in truth}
+
+
+CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
+
+
+def export_utias(log: Log, folder: Path) -> list[str]:
+    """Write the data set into `folder`, robots in the order of their numbers 1, 2, …
+
+    The format has one stream per robot: the first incarnation. Raises LogError for missing
+    measurements.
+    """
+    messages = list(_sound(log))
+    measurements = [each for each in messages if isinstance(each, m.Measurement)]
+    robots = {each.robot for each in measurements if each.incarnation == FIRST_INCARNATION}
+    if not robots:
+        raise LogError(
+            log.path, "no sensor measurements in it", "`--format csv` writes what there is"
+        )
+    sighted = {n for each in measurements if isinstance(each, m.Sightings) for n in each.teammates}
+    if sighted - robots:
+        what = (
+            f"it has sightings of {', '.join(sorted(sighted - robots))} but not their measurements"
+        )
+        raise LogError(log.path, what, "`teamslam log merge` puts the robots' logs together")
+    try:
+        world = recorded_streams(messages, log.path.name)
+    except ValueError as error:
+        remedy = "the format needs measurements without gaps: `teamslam log cut` to a part without"
+        raise LogError(log.path, str(error), remedy) from None
+    lost = beyond_utias(world)
+    if lost:
+        what = f"it has {', '.join(lost)}, which the format does not have"
+        raise LogError(
+            log.path, what, f"`teamslam import {log.path} -o FOLDER` writes tables of it"
+        )
+    write_utias(world, folder)
+    return [stream.robot for stream in world.streams]
+
+
+def _sound(log: Log) -> Iterator[m.Message]:
+    for sample in log.samples(CHANNELS):
+        try:
+            yield opened(sample)[2]
+        except WireError:
+            continue  # every node rejects it, too; `teamslam log check` counts it
