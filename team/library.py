@@ -261,7 +261,7 @@ def batch_map(
 
     Dellaert and Kaess 2006, Square root SAM.
     """
-    solve = load("teamslam.sim.studies.batch_map:solved_map", "batch_map")
+    solve = load("teamslam.sim.studies.batch_reference.growing:solved_map", "batch_map")
     return cast("BatchMap", solve(keyframes, sensors, initial_poses, robust_c))
 
 

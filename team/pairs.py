@@ -37,7 +37,7 @@ COMPARISON_ROBOT = "teamslam.sim.studies.robots.node:comparison_robot"
 """Makes the robot's node of a pair whose rule does not fuse submaps."""
 _RUNNING = "teamslam.sim.studies.robots.running:running_estimator"
 _WHOLE = ("latest", "alone")
-_ROUNDS = "teamslam.sim.studies.rules.feedback_rule:RoundsCentre"
+_ROUNDS = "teamslam.sim.studies.rules.map_rules:RoundsCentre"
 _SVD = "teamslam.sim.studies.rules.svd_rule:SvdCentre"
 _CHEAP = ("hybrid", "dead-reckoning")
 _PER_AXIS = ("hybrid", "hybrid-thesis", "hybrid-thesis-coded")

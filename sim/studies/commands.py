@@ -1,12 +1,52 @@
 """Commands that the studies add to `teamslam`."""
 
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
 import typer
 
-from teamslam.sim.studies.batch_reference_command import app as batch_reference_commands
+from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.options import FAILED, failing, warn_of_holes, write_json
 from teamslam.sim.studies.experiment_command import app as experiment_commands
 
+Noise = Annotated[
+    Literal["white", "profile"],
+    typer.Option(
+        help="white: independent errors, no inter-robot measurements; profile: the scenario's "
+        "persistent errors, biases, and inter-robot measurements."
+    ),
+]
+Source = Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures.")]
+app = typer.Typer()
 
-def register(app: typer.Typer) -> None:
+
+@app.command(name="batch-reference", cls=Command, epilog="teamslam batch-reference runs/first")
+def batch_reference(
+    log: Source,
+    noise: Noise = "white",
+    json_file: JsonFile = None,
+) -> None:
+    """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
+    from teamslam.sim.cli.importing import readable
+    from teamslam.sim.recorded.chains import BatchReferenceError
+    from teamslam.sim.recorded.world import log_or_run
+    from teamslam.sim.studies.batch_reference.reference import batch_map
+    from teamslam.team.recording.reader import Log
+
+    with readable(log) as source:
+        run = log_or_run(source)
+    if isinstance(run, Log):
+        warn_of_holes(run)
+    with failing(FAILED, BatchReferenceError):
+        result = batch_map(run.samples(), noise)
+    figures = result.to_json()
+    typer.echo(json.dumps(figures, indent=2))
+    write_json(json_file, figures)
+
+
+def register(teamslam: typer.Typer) -> None:
     """Add `experiment` and `batch-reference`."""
-    app.add_typer(experiment_commands)
-    app.add_typer(batch_reference_commands)
+    teamslam.add_typer(experiment_commands)
+    teamslam.add_typer(app)

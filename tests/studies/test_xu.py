@@ -10,7 +10,7 @@ from teamslam.sim.studies.experiments import xu, xu_localisation
 from teamslam.sim.studies.experiments.curves import curves_run
 from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.sim.studies.experiments.xu_errors import FIGURE_4_4, FIGURE_5_2
+from teamslam.sim.studies.experiments.xu import FIGURE_4_4, FIGURE_5_2
 
 STEPS = 40
 

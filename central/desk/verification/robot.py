@@ -21,7 +21,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
-LOCKSTEP = "teamslam.sim.studies.robots.lockstep:in_lockstep"
+LOCKSTEP = "teamslam.sim.studies.robots.node:in_lockstep"
 """Recomputes a robot under a rule with feedback."""
 PriorsNamed = Mapping[tuple[int, int], Sequence[m.Prior | None]]
 """Priors of the recorded poses, by (incarnation, stamp); None: a pose without prior."""

@@ -8,6 +8,7 @@ robot and keyframe and all landmarks (Dellaert & Kaess 2006). ρ: identity, or C
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,11 @@ from teamslam.sim.studies.batch_reference.graph import (
     under_loss,
 )
 from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.models import located, predicted
 from teamslam.team.estimation.se2 import Pose, compose, tangent
+from teamslam.team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory
 from teamslam.team.shapes import Float, UInt32
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
@@ -246,3 +249,34 @@ def _covariance(batch: GrowingBatch, place: int) -> Matrix:
     covariance = G @ np.asarray(batch.marginals.marginalCovariance(_POSES + place)) @ G.T
     symmetric: Matrix = 0.5 * (covariance + covariance.T)
     return symmetric
+
+
+_BATCH_ITERATIONS, _BATCH_DECREMENT = 200, 1e-5
+
+
+def solved_map(
+    keyframes: Mapping[str, Sequence[Keyframe]],
+    sensors: Mapping[str, Sensor],
+    initial_poses: Mapping[str, InitialPose],
+    robust_c: float | None,
+) -> BatchMap:
+    """Solve for all poses and landmarks, as `teamslam.team.library.batch_map`."""
+    starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
+    robots = sorted(keyframes)
+    steps = [
+        RobotStep(robot, at.increment, sensors[robot], at.ids, at.ranges, at.bearings)
+        for row in zip_longest(*(keyframes[robot] for robot in robots))
+        for robot, keyframe in zip(robots, row, strict=True)
+        if keyframe is not None
+        for at in (keyframe.calibrated(sensors[robot]),)
+    ]
+    grown = add_steps(initial_state(starts, robust_c), steps)
+    solution = solve(grown, _BATCH_ITERATIONS, _BATCH_DECREMENT)
+    landmarks = landmark_gaussian(solution)
+    return BatchMap(
+        landmarks=LandmarkMap(landmarks.ids, landmarks.means, landmarks.covariance),
+        trajectories={robot: Trajectory(*trajectory(solution, robot)) for robot in sorted(starts)},
+        chi2=solution.cost,
+        dof=solution.dof,
+        converged=solution.converged(_BATCH_DECREMENT),
+    )

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from teamslam.sim.studies.estimators import innovation as innovations
+from teamslam.sim.studies.estimators.ekf_slam import see
 from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
 from teamslam.sim.studies.estimators.robot_step import variances
-from teamslam.sim.studies.estimators.sight import see
 from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian

@@ -14,7 +14,6 @@ from scipy.stats import ttest_rel
 
 from teamslam.central.desk.drawing import BLUE, ORANGE, RED, SKY, TRUTH_COLOUR, VERMILION
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.studies.experiments import downs_printed
 from teamslam.sim.studies.experiments.accuracy_utias import team_on
 from teamslam.sim.studies.experiments.downs_joined import (
     his_protocol,
@@ -33,6 +32,67 @@ from teamslam.sim.studies.experiments.experiment import (
 )
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, table_of, team_task, with_world
+
+Robots = tuple[float, float, float, float, float]
+
+EKF_MAPS: Mapping[str, Robots] = {
+    "1": (0.3304, 0.4240, 0.2255, 0.3733, 0.2437),
+    "2": (0.3990, 0.1655, 0.6744, 0.3071, 0.5666),
+    "3": (0.0599, 0.4383, 0.7593, 0.5151, 0.4371),
+    "4": (0.2483, 0.3933, 0.5499, 0.3501, 0.2237),
+    "5": (0.1555, 0.3135, 0.3689, 0.5330, 0.3344),
+    "6": (0.6738, 0.5618, 0.5167, 0.5235, 0.5974),
+    "7": (0.4676, 0.1768, 0.2946, 0.5613, 0.3348),
+    "8": (0.2980, 0.2922, 0.1912, 0.7909, 0.1180),
+    "9": (0.1874, 0.7517, 0.5520, 0.5976, 0.1405),
+}
+"""Table 5.1: maps of the EKF, one robot."""
+EKF_PATHS: Mapping[str, Robots] = {
+    "1": (0.0393, 0.0353, 0.0399, 0.0450, 0.0419),
+    "2": (0.0526, 0.0352, 0.0467, 0.0362, 0.0455),
+    "3": (0.0391, 0.0381, 0.0620, 0.0602, 0.0347),
+    "4": (0.0437, 0.0412, 0.0412, 0.0516, 0.0479),
+    "5": (0.0281, 0.0300, 0.0327, 0.0318, 0.0368),
+    "6": (0.0563, 0.0557, 0.0634, 0.0609, 0.0474),
+    "7": (0.0563, 0.0452, 0.0418, 0.0755, 0.0466),
+    "8": (0.0391, 0.0381, 0.0620, 0.0602, 0.0347),
+    "9": (0.0415, 0.0672, 0.0471, 0.0595, 0.0420),
+}
+"""Table 5.2: paths of the EKF, one robot."""
+JOINED_MAPS: Mapping[str, Robots] = {
+    "1": (0.0501, 0.0055, 0.0110, 0.0164, 0.0146),
+    "2": (0.0268, 0.0031, 0.1410, 0.0312, 0.1102),
+    "3": (0.0044, 0.0296, 0.0647, 0.1097, 0.0123),
+    "4": (0.0345, 0.0212, 0.0046, 0.0008, 0.0302),
+    "5": (0.0308, 0.0497, 0.0680, 0.0140, 0.0609),
+    "6": (0.0337, 0.0220, 0.0054, 0.0000, 0.0310),
+    "7": (0.0337, 0.0220, 0.0054, 0.0000, 0.0310),
+    "8": (0.0419, 0.0484, 0.0004, 0.1284, 0.0114),
+    "9": (0.0246, 0.0723, 0.0910, 0.0049, 0.0088),
+}
+"""Table 5.3: joined maps, one robot."""
+SMOOTHED_PATHS: Mapping[str, Robots] = {
+    "1": (1.3e-4, 2.8e-5, 3.5e-5, 1.4e-4, 6.1e-6),
+    "2": (1.1e-4, 5.1e-5, 7.1e-6, 1.2e-4, 3.7e-5),
+    "3": (1.4e-4, 6.2e-6, 2.0e-5, 2.1e-4, 2.4e-5),
+    "4": (1.5e-4, 1.5e-5, 7.0e-5, 1.6e-4, 2.2e-5),
+    "5": (5.8e-6, 9.1e-6, 6.2e-6, 2.3e-5, 2.6e-5),
+    "6": (3.6e-5, 7.5e-5, 1.8e-4, 3.0e-5, 1.8e-4),
+    "7": (2.0e-5, 9.4e-5, 1.7e-5, 1.5e-4, 6.0e-6),
+    "8": (6.8e-7, 1.5e-5, 2.2e-5, 2.8e-6, 2.3e-5),
+    "9": (1.6e-6, 1.4e-5, 1.0e-4, 1.3e-5, 7.6e-5),
+}
+"""Table 5.4: smoothed paths, one robot."""
+TEAM_MAPS: Mapping[str, float] = {
+    "1": 0.0480, "2": 0.0617, "3": 0.0254, "4": 0.0392, "5": 0.0726,
+    "6": 0.0103, "7": 0.0335, "8": 0.0423, "9": 0.0877,
+}  # fmt: skip
+"""Table 5.5: joined maps of five robots."""
+P_EKF_JOINED = 3.04e-4
+"""Chapter 5: paired t-test of tables 5.1 and 5.3."""
+P_JOINED_TEAM = 0.1018
+"""Chapter 5: paired t-test of tables 5.3 and 5.5."""
+
 
 Row = tuple[float | None, ...]
 """Errors [m] of robots 1 … 5, or of the team."""
@@ -351,7 +411,7 @@ _MAPS = ("rmse", "rmse_aligned")
 TABLE_5_1 = PrintedTable(
     "Downs, table 5.1: maps of the EKF, one robot",
     _ROBOTS,
-    downs_printed.EKF_MAPS,
+    EKF_MAPS,
     _pair(
         [_each(task) for task in _EKFS],
         lambda k, name: _of_robots(_EKFS[k], name),
@@ -369,7 +429,7 @@ TABLE_5_1 = PrintedTable(
 TABLE_5_2 = PrintedTable(
     "Downs, table 5.2: paths of the EKF, one robot",
     _ROBOTS,
-    downs_printed.EKF_PATHS,
+    EKF_PATHS,
     _pair(
         [_each(task) for task in _EKFS],
         lambda k, _: _of_robots(_EKFS[k], "position_rmse"),
@@ -396,7 +456,7 @@ def _joined_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]
 TABLE_5_3 = PrintedTable(
     "Downs, table 5.3: joined maps, one robot",
     _ROBOTS,
-    downs_printed.JOINED_MAPS,
+    JOINED_MAPS,
     _pair(_JOINED, _joined_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
@@ -406,16 +466,16 @@ TABLE_5_3 = PrintedTable(
     ),
     Compared(
         "EKF maps (table 5.1) against joined maps (table 5.3)",
-        downs_printed.P_EKF_JOINED,
+        P_EKF_JOINED,
         {HIS: _of_robots(_HIS_EKF, "rmse"), OURS: _of_robots(_OUR_EKF, "rmse")},
-        downs_printed.EKF_MAPS,
+        EKF_MAPS,
         lambda options, dataset: [task(options, dataset) for task in _EKFS],
     ),
 )
 TABLE_5_4 = PrintedTable(
     "Downs, table 5.4: smoothed paths, one robot",
     _ROBOTS,
-    downs_printed.SMOOTHED_PATHS,
+    SMOOTHED_PATHS,
     _pair(_JOINED, lambda k, _: _joined_row(k, "position_rmse"), (HIS, OURS), ("position_rmse",)),
     (
         _DIFFERS,
@@ -432,7 +492,7 @@ def _team_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]:
 TABLE_5_5 = PrintedTable(
     "Downs, table 5.5: joined maps of five robots",
     (TEAM,),
-    {number: (error,) for number, error in downs_printed.TEAM_MAPS.items()},
+    {number: (error,) for number, error in TEAM_MAPS.items()},
     _pair((_each(_spherical), _each(_team)), _team_row, (HIS, OURS), _MAPS),
     (
         _DIFFERS,
@@ -442,9 +502,9 @@ TABLE_5_5 = PrintedTable(
     ),
     Compared(
         "the mean of single joined maps (table 5.3) against the team's (table 5.5)",
-        downs_printed.P_JOINED_TEAM,
+        P_JOINED_TEAM,
         {HIS: _joined_row(0, "rmse"), OURS: _joined_row(1, "rmse")},
-        downs_printed.JOINED_MAPS,
+        JOINED_MAPS,
         lambda options, dataset: [_spherical(options, dataset), *_singles(options, dataset)],
     ),
 )

@@ -1,17 +1,21 @@
 """Load stored results of an experiment, compute the others, conclude."""
 
 import hashlib
+import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import cast
+from typing import Any, NamedTuple, cast
+
+import msgspec
 
 from teamslam.sim.datasets.tables import open_data_set
+from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments.cases import Cases, Done
-from teamslam.sim.studies.experiments.catalogue import Entry
 from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Experiment,
@@ -19,8 +23,119 @@ from teamslam.sim.studies.experiments.experiment import (
     Outcome,
     Results,
 )
-from teamslam.sim.studies.experiments.parameters import kinds_of
 from teamslam.sim.studies.experiments.task import Task
+
+IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
+"""Parameters in the run's label, or different for every robot."""
+COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central.fusion"})
+
+
+def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
+    """Label, number and parameters of runs that differ only in seed."""
+    found: dict[tuple[str, str], int] = {}
+    for task in tasks:
+        label = task.label.rpartition(", seed ")[0] or task.label
+        kind = label, "; ".join(_parameters(task))
+        found[kind] = found.get(kind, 0) + 1
+    return [(label, count, parameters) for (label, parameters), count in found.items()]
+
+
+def _parameters(task: Task) -> Iterator[str]:
+    yield task.work.rpartition(".")[2]
+    for name, value in task.parameters.items():
+        if isinstance(value, Mapping) and "robots" in value:
+            changes = ", ".join(_differences(value)) or "as it is"
+            yield f"{name}: {value['name']}, {changes}"
+        else:
+            yield f"{name} = {json.dumps(value, ensure_ascii=False)}"
+
+
+def _differences(scenario: Mapping[str, Any]) -> Iterator[str]:
+    before = _built_in(scenario["name"], len(scenario["robots"]))
+    for path, value in _flat(scenario, ""):
+        if path not in IN_THE_LABEL | COPIES and before.get(path) != value:
+            yield f"{path} = {value}"
+
+
+@cache
+def _built_in(name: str, robots: int) -> Mapping[str, str]:
+    return dict(_flat(msgspec.to_builtins(with_options(load(name), robots=robots)), ""))
+
+
+def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    if isinstance(value, Mapping):
+        for name, each in value.items():
+            yield from _flat(each, f"{path}.{name}" if path else name)
+    elif path == "robots":
+        leaves: dict[str, list[str]] = {}
+        for robot in value:
+            for name, leaf in _flat(robot, path):
+                leaves.setdefault(name, []).append(leaf)
+        for name, of_robots in leaves.items():
+            yield name, " | ".join(dict.fromkeys(of_robots))
+    else:
+        yield path, f"{value:.6g}" if isinstance(value, float) else json.dumps(value)
+
+
+class Entry(NamedTuple):
+    """Command, module, summary.
+
+    module: has `tasks` and `outcome`, or `module:object`. seeds: by default, with --quick, and at
+    most in `all`.
+    """
+
+    name: str
+    module: str
+    summary: str
+    seeds: int = 30
+    quick_seeds: int = 5
+    seeds_in_all: int = 30
+
+
+ENTRIES = (
+    Entry(
+        "accuracy",
+        "accuracy",
+        "The team against the batch optimiser: simulated worlds of all sizes, UTIAS sets, goals.",
+        seeds=50,
+        seeds_in_all=4,
+    ),
+    Entry(
+        "association",
+        "association",
+        "Landmarks without names over spacing, clutter and misses; EKF and FastSLAM beside.",
+        seeds=8,
+        quick_seeds=1,
+        seeds_in_all=2,
+    ),
+    Entry("ma-3", "ma_maps:FIGURE_3", "Ma & Ma: dead reckoning and FastSLAM on UTIAS.", 1, 1),
+    Entry(
+        "ma-4a", "ma_errors:FIGURE_4A", "Ma & Ma: path, dead reckoning against FastSLAM.", 10, 1, 5
+    ),
+    Entry(
+        "ma-4b", "ma_errors:FIGURE_4B", "Ma & Ma: path error of FastSLAM, 1400 frames.", 10, 1, 5
+    ),
+    Entry("ma-4c", "ma_errors:FIGURE_4C", "Ma & Ma: landmark error of FastSLAM.", 10, 1, 5),
+    Entry("ma-5", "ma_maps:FIGURE_5", "Ma & Ma: paths of three and of five robots.", 1, 1),
+    Entry("ma-6a", "ma_errors:FIGURE_6A", "Ma & Ma: path, one robot against many.", 10, 1, 5),
+    Entry("ma-6b", "ma_errors:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 10, 1, 5),
+    Entry("xu-3.5", "xu_localisation", "Thesis: particle-filter localisation on a known map."),
+    Entry("xu-4.1", "xu_maps:FIGURE_4_1", "Thesis: the map of EKF-SLAM."),
+    Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM."),
+    Entry("xu-4.3", "xu_maps:FIGURE_4_3", "Thesis: the map of Hybrid-SLAM."),
+    Entry("xu-4.4", "xu:FIGURE_4_4", "Thesis: pose error of EKF, FastSLAM, Hybrid."),
+    Entry("xu-4.5", "xu_maps:FIGURE_4_5", "Thesis: paths under low and high odometry noise."),
+    Entry("xu-4.6", "xu:FIGURE_4_6", "Thesis: error of the first landmark over time."),
+    Entry("xu-5.1", "xu_maps:FIGURE_5_1", "Thesis: the two robots' map at four steps."),
+    Entry("xu-5.2", "xu:FIGURE_5_2", "Thesis: pose error, one robot against two."),
+    Entry("xu-5.3", "xu:FIGURE_5_3", "Thesis: first landmark, one robot against two."),
+    Entry("downs-5.1", "downs:TABLE_5_1", "Downs: maps of the EKF, each robot and set."),
+    Entry("downs-5.2", "downs:TABLE_5_2", "Downs: paths of the EKF, each robot and set."),
+    Entry("downs-5.3", "downs:TABLE_5_3", "Downs: joined maps of one robot, t-test."),
+    Entry("downs-5.4", "downs:TABLE_5_4", "Downs: smoothed paths of one robot."),
+    Entry("downs-5.5", "downs:TABLE_5_5", "Downs: joined maps of five robots, t-test."),
+)
+
 
 FAILURES = "failures.txt"
 """File with the tracebacks of the last command's failed runs."""

@@ -5,25 +5,284 @@ likely, and the rise of the cost with the truth fixed (likelihood ratio, χ² of
 coordinates).
 """
 
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from scipy import sparse
+from scipy.linalg import solve_triangular
+from scipy.sparse.linalg import splu
 
 from teamslam.central.desk.evaluation.errors import Path, interpolate_truth
 from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.tick_fold import TickFold
-from teamslam.sim.studies.experiments.plain_cost import PlainCost
 from teamslam.team import translate
 from teamslam.team.estimation.consistency import chi2_quantile
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold, solve_fold
-from teamslam.team.shapes import Float
+from teamslam.team.estimation.map_joining.submap_graph import Graph
+from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
+
+Values = Float[np.ndarray, " _"]
+Rows = Float[np.ndarray, "_ _"]
+Blocks = Float[np.ndarray, "K r m"]
+Indices = Int64[np.ndarray, " _"]
+
+AT_REST = 1e-9
+"""Expected decrease of χ² by an undamped step of a converged state."""
+SMALL = 1e-5
+"""Expected decrease of χ² by a damped step before a test of convergence."""
+STEPS = 2000
+"""Most steps of a solution."""
+UNDAMPED = 1e-12
+"""Least damping: undetermined coordinates keep their values."""
+DAMPING = 1e-3
+"""First damping, relative to the diagonal of the normal equations."""
+
+
+class Solution(NamedTuple):
+    """A state, its cost, and whether it converged."""
+
+    state: Values
+    cost: float
+    at_rest: bool
+
+
+class Whitened(NamedTuple):
+    """Whitened residuals of K terms of a kind, Jacobians and state indices."""
+
+    residuals: Float[np.ndarray, "K r"]
+    jacobians: Float[np.ndarray, "K r m"]
+    at: Int64[np.ndarray, "K m"]
+
+
+class PlainCost:
+    """Cost of a graph's states, without fixed coordinates."""
+
+    def __init__(
+        self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
+    ) -> None:
+        if graph.biases:
+            raise NotImplementedError("this cost has no biases: front_end.biases must be []")
+        self.free: Indices = np.flatnonzero(~fixed)
+        self._terms_of: Kinds = [
+            *_submaps(graph, covariance_factor), *_sightings(graph), *_priors(graph)
+        ]  # fmt: skip
+        self._column = np.full(len(fixed), len(self.free))
+        self._column[self.free] = np.arange(len(self.free))
+        self._sum = _Sum([self._column[kind.at] for kind in self._terms_of], len(self.free))
+
+    def of(self, state: Values) -> float:
+        """The χ² of a state."""
+        r = self.residuals(state)
+        return float(r @ r)
+
+    def residuals(self, state: Values) -> Values:
+        """Whitened residuals, kind by kind."""
+        found = [each.residuals.ravel() for each in self._terms(state)]
+        return np.concatenate([np.zeros(0), *found])
+
+    def jacobian(self, state: Values) -> sparse.csr_array:
+        """Jacobian of the residuals by the free coordinates."""
+        entries, rows, columns, begin = [np.zeros(0)], [np.zeros(0, int)], [np.zeros(0, int)], 0
+        for each in self._terms(state):
+            row = begin + np.arange(each.residuals.size).reshape(*each.residuals.shape, 1)
+            column = self._column[each.at][:, None, :]
+            shape = each.jacobians.shape
+            entries.append(each.jacobians.ravel())
+            rows.append(np.broadcast_to(row, shape).ravel())
+            columns.append(np.broadcast_to(column, shape).ravel())
+            begin += each.residuals.size
+        where = (np.concatenate(rows), np.concatenate(columns))
+        free = len(self.free)
+        whole = sparse.csc_array((np.concatenate(entries), where), shape=(begin, free + 1))
+        return whole[:, :free].tocsr()
+
+    def solved(self, state: Values) -> Solution:
+        """Minimise from a state.
+
+        Steps δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, are taken if they lower the cost.
+        """
+        state, cost, damping, growth = state.copy(), self.of(state), DAMPING, 2.0
+        N, gradient = self._normal(state)
+        for _ in range(STEPS):
+            step, foreseen = _step(N, damping, gradient)
+            if foreseen < SMALL and _step(N, UNDAMPED, gradient)[1] < AT_REST:
+                return Solution(state, cost, at_rest=True)
+            tried = state.copy()
+            tried[self.free] -= step
+            gained = cost - self.of(tried)
+            if gained > 0.0:
+                state, cost = tried, cost - gained
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gained / foreseen - 1.0) ** 3)
+                damping, growth = max(damping, UNDAMPED), 2.0
+                N, gradient = self._normal(state)
+            else:
+                damping, growth = damping * growth, 2.0 * growth
+                if damping > 1.0 / UNDAMPED:
+                    break
+        return Solution(state, cost, at_rest=False)
+
+    def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
+        return self._sum.normal(self._terms(state))
+
+    def _terms(self, state: Values) -> list[Whitened]:
+        return [kind.whitened(state) for kind in self._terms_of]
+
+
+class _Sum:
+    def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
+        keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
+        diagonal = np.arange(free) * (free + 2)
+        here, self._entry = np.unique(np.concatenate([diagonal, *keys]), return_inverse=True)
+        column, self._row = np.divmod(here, free + 1)
+        self._is_free = (column < free) & (self._row < free)
+        self._begin = np.searchsorted(column[self._is_free], np.arange(free + 1))
+        self._columns, self._free = columns, free
+
+    def normal(self, terms: Sequence[Whitened]) -> tuple[sparse.csc_array, Values]:
+        """Σ JᵀJ and Σ Jᵀ r over the free coordinates."""
+        gradient, entries = np.zeros(self._free + 1), [np.zeros(self._free)]
+        for (r, J, _), column in zip(terms, self._columns, strict=True):
+            transposed = J.transpose(0, 2, 1)
+            np.add.at(gradient, column, (transposed @ r[:, :, None])[:, :, 0])
+            entries.append((transposed @ J).ravel())
+        summed = np.bincount(self._entry, np.concatenate(entries), len(self._row))
+        parts = (summed[self._is_free], self._row[self._is_free], self._begin)
+        return sparse.csc_array(parts, shape=(self._free, self._free)), gradient[:-1]
+
+
+class _Submaps(NamedTuple):
+    """K submaps of equal size.
+
+    at: state indices of each start, poses and landmarks; points: the first ones of the latter two.
+    """
+
+    whitening: Float[np.ndarray, "K n n"]
+    means: Float[np.ndarray, "K n"]
+    at: Int64[np.ndarray, "K m"]
+    points: Int64[np.ndarray, "K p"]
+    poses: int
+
+    def whitened(self, state: Values) -> Whitened:
+        poses, count = self.poses, self.points.shape[1]
+        x = np.concatenate([3 * np.arange(poses), 3 * poses + 2 * np.arange(count - poses)])
+        y, heading = x + 1, 3 * np.arange(poses) + 2
+        start, turned = state[self.at[:, 0]] + 1j * state[self.at[:, 1]], state[self.at[:, 2]]
+        turn = np.exp(-1j * turned)[:, None]
+        local = turn * (state[self.points] + 1j * state[self.points + 1] - start[:, None])
+        h, J = np.zeros(self.means.shape), np.zeros((*self.means.shape, self.at.shape[1]))
+        h[:, x], h[:, y] = local.real, local.imag
+        for part, of in ((turn, 0), (1j * turn, 1)):
+            J[:, x, 3 + x + of], J[:, y, 3 + x + of] = part.real, part.imag
+            J[:, x, of], J[:, y, of] = -part.real, -part.imag
+        J[:, x, 2], J[:, y, 2] = (-1j * local).real, (-1j * local).imag
+        h[:, heading] = state[self.points[:, :poses] + 2] - turned[:, None]
+        J[:, heading, 3 + heading], J[:, heading, 2] = 1.0, -1.0
+        r = h - self.means
+        r[:, heading] = _around(r[:, heading])
+        return _whiten(self, r, J)
+
+
+class _Sightings(NamedTuple):
+    """K inter-robot measurements. at: coordinates of the two poses, observer first."""
+
+    whitening: Float[np.ndarray, "K 2 2"]
+    means: Float[np.ndarray, "K 2"]
+    at: Int64[np.ndarray, "K 6"]
+
+    def whitened(self, state: Values) -> Whitened:
+        pose = state[self.at]
+        x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
+        distance = np.hypot(x, y)
+        r = np.stack([distance, np.arctan2(y, x) - pose[:, 2]], axis=1) - self.means
+        r[:, 1] = _around(r[:, 1])
+        to = np.array([[x, y], [-y / distance, x / distance]]) / distance
+        J = np.zeros((len(x), 2, 6))
+        J[:, :, 3:5] = np.moveaxis(to, 2, 0)
+        J[:, :, :2], J[:, 1, 2] = -J[:, :, 3:5], -1.0
+        return _whiten(self, r, J)
+
+
+class _Priors(NamedTuple):
+    """K Gaussians of coordinates; the third, if any, is a heading."""
+
+    whitening: Float[np.ndarray, "K n n"]
+    means: Float[np.ndarray, "K n"]
+    at: Int64[np.ndarray, "K n"]
+
+    def whitened(self, state: Values) -> Whitened:
+        r = state[self.at] - self.means
+        r[:, 2:] = _around(r[:, 2:])
+        return _whiten(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
+
+
+Kinds = list[_Submaps | _Sightings | _Priors]
+
+
+def _submaps(graph: Graph, covariance_factor: float) -> Iterator[_Submaps]:
+    kinds = defaultdict(list)
+    for contribution, nodes, *_ in graph.submaps:
+        kinds[1 + len(contribution.local.node_stamps), len(nodes) - 1].append((contribution, nodes))
+    for (poses, count), submaps in kinds.items():
+        first = graph.offset[np.array([nodes for _, nodes in submaps])]
+        sizes = np.array([3] * (1 + poses) + [2] * (count - poses))
+        own = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        yield _Submaps(
+            np.array(
+                [_whitening_matrix(covariance_factor * c.local.covariance) for c, _ in submaps]
+            ),
+            np.array([c.local.mean for c, _ in submaps]),
+            np.repeat(first, sizes, axis=1) + own,
+            first[:, 1:],
+            poses,
+        )
+
+
+def _sightings(graph: Graph) -> Iterator[_Sightings]:
+    if graph.sightings:
+        sightings = [each for each, *_ in graph.sightings]
+        first = graph.offset[np.array([nodes for _, *nodes in graph.sightings])]
+        yield _Sightings(
+            np.array([_whitening_matrix(each.covariance) for each in sightings]),
+            np.array([each.measurement for each in sightings]),
+            (first[:, :, None] + np.arange(3)).reshape(-1, 6),
+        )
+
+
+def _priors(graph: Graph) -> Iterator[_Priors]:
+    for each in graph.priors:
+        whitening = np.linalg.cholesky(each.information).T
+        at = graph.offset[each.nodes[0]] + np.arange(len(each.mean))
+        yield _Priors(whitening[None], each.mean[None], at[None])
+
+
+def _whiten(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:
+    return Whitened((kind.whitening @ r[:, :, None])[:, :, 0], kind.whitening @ J, kind.at)
+
+
+def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values, float]:
+    """δ = (N + μ diag N)⁻¹ g, and the decrease of a quadratic cost by −δ."""
+    D = damping * N.diagonal()
+    step = np.asarray(splu((N + sparse.diags_array(D)).tocsc()).solve(gradient))
+    return step, float(step @ (gradient + D * step))
+
+
+def _whitening_matrix(covariance: Rows) -> Rows:
+    """L⁻¹ with L Lᵀ = P."""
+    L = np.linalg.cholesky(covariance)
+    return np.asarray(solve_triangular(L, np.eye(len(L)), lower=True))
+
+
+def _around(angles: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
+    return np.asarray(np.angle(np.exp(1j * angles)))
+
 
 LOWER = 1.0
 """Decrease of the cost that indicates another minimum."""
@@ -33,7 +292,6 @@ NEARBY = 3
 """Number of initial states near the truth, besides the truth."""
 NEARBY_RAD = 0.1
 """Standard deviation [rad] of these states' headings about the truth."""
-Values = Float[np.ndarray, " _"]
 
 
 class TrueMinimum(NamedTuple):

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from teamslam.central.desk.drawing import RED, TRUTH_COLOUR, colour_of
-from teamslam.sim.studies.experiments import xu_errors
 from teamslam.sim.studies.experiments.drawing import (
     as_map,
     draw_map,
@@ -28,6 +27,7 @@ from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import (
     EKF,
+    ERRORS_4_5,
     FASTSLAM,
     HYBRID,
     HYBRID_CODED,
@@ -264,4 +264,4 @@ FIGURE_5_1 = MapFigure(
         "counts every measurement again.",
     ),
 )
-FIGURE_4_5 = PathFigure(xu_errors.FIGURE_4_5)
+FIGURE_4_5 = PathFigure(ERRORS_4_5)

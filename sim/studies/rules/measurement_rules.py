@@ -11,7 +11,7 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.central.fused_map import START_POSES, fused_message
 from teamslam.sim.studies.estimators.robot_step import RobotStep
-from teamslam.sim.studies.rules.centre import ComparisonCentre
+from teamslam.sim.studies.rules.map_rules import ComparisonCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.central.config import CentralConfig
-from teamslam.sim.studies.rules.feedback_rule import RULES, RoundsCentre
+from teamslam.sim.studies.rules.map_rules import RULES, RoundsCentre
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
