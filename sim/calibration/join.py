@@ -1,6 +1,6 @@
 """Team map and paths from measurements: the reference without truth."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -32,9 +32,6 @@ from teamslam.team.estimation.map_joining.joining import (
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
-
-LONGEST_NS = 250_000_000
-"""Longest merged arc interval, since windows close at interval ends."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +129,10 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
     tracks: list[_Track] = []
     stamps: list[int] = []
     window = slam.window
-    longest_ns = LONGEST_NS if config.motion.kind != "turn-then-drive" else 0
-    for message in _merge(stream, longest_ns):
-        if not isinstance(message, m.AnyOdometry):
+    for message in messages_of(stream):
+        if isinstance(message, m.AnyScan | m.Detections):
             slam.observe(message.stamp_ns, translate.scan_of(message))
+        if not isinstance(message, m.AnyOdometry):
             continue
         closed = slam.drive(translate.interval_of(message, config))
         if closed is not None:
@@ -146,42 +143,6 @@ def _tracks(config: RobotConfig, stream: RobotStream) -> list[_Track]:
             stamps += [slam.last_keyframe_ns] * (len(window.paths) - len(stamps))
     last, _ = slam.finish()
     return tracks if last is None else [*tracks, _track(last, stamps, window)]
-
-
-def _merge(
-    stream: RobotStream, longest_ns: int
-) -> Iterator[m.AnyScan | m.Detections | m.AnyOdometry]:
-    """A stream's scans and odometry, with intervals of one command between scans merged up to
-    longest_ns.
-    """
-    pending: m.AnyOdometry | None = None
-    for message in messages_of(stream):
-        if isinstance(message, m.AnyOdometry):
-            if pending is not None and _goes_on(pending, message, longest_ns):
-                length_ns = pending.duration_ns + message.duration_ns
-                message = msgspec.structs.replace(message, duration_ns=length_ns)
-            elif pending is not None:
-                yield pending
-            pending = message
-        elif isinstance(message, m.AnyScan | m.Detections):
-            if pending is not None:
-                yield pending
-            pending = None
-            yield message
-    if pending is not None:
-        yield pending
-
-
-def _goes_on(one: m.AnyOdometry, then: m.AnyOdometry, longest_ns: int) -> bool:
-    match one, then:
-        case m.Odometry(), m.Odometry():
-            same = (then.forward, then.yaw_rate) == (one.forward, one.yaw_rate)
-        case m.Steering(), m.Steering():
-            same = (then.wheel_speed, then.steering) == (one.wheel_speed, one.steering)
-        case _:
-            return False
-    is_next = then.stamp_ns - then.duration_ns == one.stamp_ns
-    return same and is_next and one.duration_ns + then.duration_ns <= longest_ns
 
 
 def _track(closed: ClosedWindow, stamps: Sequence[int], window: Window) -> _Track:

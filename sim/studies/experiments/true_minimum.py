@@ -6,7 +6,7 @@ coordinates).
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -76,7 +76,6 @@ class PlainCost:
         ]  # fmt: skip
         self._column = np.full(len(fixed), len(self.free))
         self._column[self.free] = np.arange(len(self.free))
-        self._sum = _Sum([self._column[kind.at] for kind in self._terms_of], len(self.free))
 
     def of(self, state: Values) -> float:
         """The χ² of a state."""
@@ -130,32 +129,11 @@ class PlainCost:
         return Solution(state, cost, at_rest=False)
 
     def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
-        return self._sum.normal(self._terms(state))
+        J = self.jacobian(state)
+        return (J.T @ J).tocsc(), J.T @ self.residuals(state)
 
     def _terms(self, state: Values) -> list[Whitened]:
         return [kind.whitened(state) for kind in self._terms_of]
-
-
-class _Sum:
-    def __init__(self, columns: Sequence[Int64[np.ndarray, "_ _"]], free: int) -> None:
-        keys = [(c[:, None, :] * (free + 1) + c[:, :, None]).ravel() for c in columns]
-        diagonal = np.arange(free) * (free + 2)
-        here, self._entry = np.unique(np.concatenate([diagonal, *keys]), return_inverse=True)
-        column, self._row = np.divmod(here, free + 1)
-        self._is_free = (column < free) & (self._row < free)
-        self._begin = np.searchsorted(column[self._is_free], np.arange(free + 1))
-        self._columns, self._free = columns, free
-
-    def normal(self, terms: Sequence[Whitened]) -> tuple[sparse.csc_array, Values]:
-        """Σ JᵀJ and Σ Jᵀ r over the free coordinates."""
-        gradient, entries = np.zeros(self._free + 1), [np.zeros(self._free)]
-        for (r, J, _), column in zip(terms, self._columns, strict=True):
-            transposed = J.transpose(0, 2, 1)
-            np.add.at(gradient, column, (transposed @ r[:, :, None])[:, :, 0])
-            entries.append((transposed @ J).ravel())
-        summed = np.bincount(self._entry, np.concatenate(entries), len(self._row))
-        parts = (summed[self._is_free], self._row[self._is_free], self._begin)
-        return sparse.csc_array(parts, shape=(self._free, self._free)), gradient[:-1]
 
 
 class _Submaps(NamedTuple):
