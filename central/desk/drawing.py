@@ -38,13 +38,13 @@ def robot_colours(names: Iterable[str]) -> dict[str, str]:
     return {name: colour_of(number) for number, name in enumerate(in_order(names))}
 
 
-def robot_labels(names: Collection[str], most: int = len(ROBOT_COLOURS)) -> dict[str, str]:
-    """Legend entry of each robot; one common entry for more than `most` robots.
+def robot_labels(names: Collection[str]) -> dict[str, str]:
+    """Legend entry of each robot; one common entry for more robots than colours.
 
     An entry with an underscore is omitted by Matplotlib.
     """
     ordered = in_order(names)
-    if len(ordered) <= most:
+    if len(ordered) <= len(ROBOT_COLOURS):
         return {name: name for name in ordered}
     return {
         name: "_" if number else f"{len(ordered)} robots" for number, name in enumerate(ordered)

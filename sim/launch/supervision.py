@@ -171,12 +171,12 @@ class Supervised:
             self.child = Child(self.name, self.arguments, self.folder, self.starter, self.restarts)
 
 
-def end_all(children: Sequence[Child], *, last: str = "recorder") -> list[Ended]:
-    """Request all to stop and end the rest; `last` is asked after the others."""
+def end_all(children: Sequence[Child]) -> list[Ended]:
+    """Request all to stop and end the rest: nodes, then the recorder, then the router."""
     ended = {}
     for group in (
-        [c for c in children if c.name not in (last, "router")],
-        [c for c in children if c.name == last],
+        [c for c in children if c.name not in ("recorder", "router")],
+        [c for c in children if c.name == "recorder"],
         [c for c in children if c.name == "router"],
     ):
         for child in group:

@@ -92,11 +92,11 @@ _RADIO = {
 class RadioBus:
     """Bus of one robot behind a simulated radio."""
 
-    def __init__(self, bus: Bus, robot: str, radio: Radio, reach: Reach | None = None) -> None:
+    def __init__(self, bus: Bus, robot: str, radio: Radio) -> None:
         self._bus = bus
         self._robot = robot
         self._radio = radio
-        self._reach = reach
+        self._reach: Reach | None = None
         self._done = False
         self._in_flight: list[tuple[float, int, Sample]] = []
         self._count = 0

@@ -4,7 +4,7 @@ Dead-reckoned odometry with odom → base, the messages of `teamslam.team.ros2_a
 path as stamped poses, and the truth, if known, with world → map. Log times are team time.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -131,9 +131,7 @@ def _true(log: Log) -> Iterator[Answer]:
         yield Answer("/tf_static", kind, stamp_ns, encode(transforms(one)), latched=True)
 
 
-def export_rosbag2(
-    log: Log, folder: Path, progress: Callable[[int], None] = lambda _: None
-) -> dict[str, int]:
+def export_rosbag2(log: Log, folder: Path) -> dict[str, int]:
     """Write a bag (MCAP) into a new folder; return message counts by topic.
 
     Raises LogError for a log without odometry or poses.
@@ -143,7 +141,6 @@ def export_rosbag2(
         for answer in answers_of(log):
             bag.write(answer.topic, answer.kind, answer.stamp_ns, answer.data, answer.latched)
             counts[answer.topic] = counts.get(answer.topic, 0) + 1
-            progress(sum(counts.values()))
     if not counts:
         raise LogError(log.path, "no odometry, pose or map in it", "`log info` lists what there is")
     return counts

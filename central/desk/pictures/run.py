@@ -138,18 +138,15 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
 
 
 def new_figure(
-    width: float, height: float, rows: int, columns: int, heights: Sequence[float] | None = None
+    width: float, height: float, rows: int, columns: int
 ) -> "tuple[Figure, list[list[Axes]]]":
-    """Create an Agg figure without pyplot's global state, and its axes by row and column.
-
-    heights: relative row heights; None: equal.
-    """
+    """Create an Agg figure without pyplot's global state, and its axes by row and column."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1, height_ratios=heights)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=columns > 1)
     return figure, [list(row) for row in grid]
 
 

@@ -121,8 +121,7 @@ class ViewerNode:
         ch.STATUS,
     )  # fmt: skip
 
-    def __init__(self, period_ns: int = PERIOD_NS) -> None:
-        self._period_ns = period_ns
+    def __init__(self) -> None:
         self._robots: dict[str, _Robot] = {}
         self._maps: deque[m.FusedMap] = deque()
         self._landmarks: Landmarks | None = None
@@ -149,9 +148,9 @@ class ViewerNode:
         reached = self._reached_ns()
         if reached is None:
             return out
-        begin = reached if self._now_ns is None else self._now_ns + self._period_ns
-        begin = max(begin, reached - MOST_PERIODS * self._period_ns)
-        for now_ns in range(begin, reached + 1, self._period_ns):
+        begin = reached if self._now_ns is None else self._now_ns + PERIOD_NS
+        begin = max(begin, reached - MOST_PERIODS * PERIOD_NS)
+        for now_ns in range(begin, reached + 1, PERIOD_NS):
             out += self._views(now_ns)
         if channel is ch.FINAL_MAP and not self.finished:
             self.finished = True

@@ -5,7 +5,6 @@ intersection is consistent for any correlation.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -49,19 +48,13 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     return _one_by_one(_per_axis_pair, maps)
 
 
-def covariance_intersection(
-    maps: Sequence[LandmarkGaussian], criterion: Literal["trace", "det"] = "det"
-) -> LandmarkGaussian:
+def covariance_intersection(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
     """Fusion that is consistent for any correlation of the maps (Julier & Uhlmann 1997).
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
-    of the least trace or determinant of C. The others follow by regression in their own map.
+    of the least determinant of C. The others follow by regression in their own map.
     """
-
-    def pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
-        return _intersect_pair(a, b, criterion)
-
-    return _one_by_one(pair, maps)
+    return _one_by_one(_intersect_pair, maps)
 
 
 def _one_by_one(
@@ -169,13 +162,13 @@ def _per_axis_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian
     return LandmarkGaussian(ids, means, np.diag(variances.ravel()))
 
 
-def _intersect_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) -> LandmarkGaussian:
+def _intersect_pair(a: LandmarkGaussian, b: LandmarkGaussian) -> LandmarkGaussian:
     in_a, in_b = _find_shared(a, b)
     common = NO_LANDMARKS
     if len(in_a):
         info_a = information(a.covariance[np.ix_(in_a, in_a)], "a map's common landmarks")
         info_b = information(b.covariance[np.ix_(in_b, in_b)], "a map's common landmarks")
-        omega = _least(lambda w: _size(w * info_a + (1.0 - w) * info_b, criterion))
+        omega = _least(lambda w: _size(w * info_a + (1.0 - w) * info_b))
         spread = information(omega * info_a + (1.0 - omega) * info_b, "the intersection")
         mean = dense.product(
             spread,
@@ -186,10 +179,8 @@ def _intersect_pair(a: LandmarkGaussian, b: LandmarkGaussian, criterion: str) ->
     return _carry(b, _carry(a, common))
 
 
-def _size(metric: Float[np.ndarray, "n n"], criterion: str) -> float:
-    """Trace of C, or ln det C, of the covariance C = metric⁻¹."""
-    if criterion == "trace":
-        return float(np.trace(information(metric, "the intersection")))
+def _size(metric: Float[np.ndarray, "n n"]) -> float:
+    """Ln det C of the covariance C = metric⁻¹."""
     factor = cholesky_factor(metric, "the intersection")
     return float(-2.0 * core.log(np.diag(factor)).sum())
 

@@ -27,7 +27,7 @@ def random_map(ids, seed, sigma=1.0):
 def test_the_intersection_of_crossed_ellipses_meets_in_the_middle():
     a = LandmarkGaussian(np.array([1], np.uint32), np.array([[1.0, 0.0]]), np.diag([1.0, 4.0]))
     b = LandmarkGaussian(np.array([1], np.uint32), np.array([[0.0, 1.0]]), np.diag([4.0, 1.0]))
-    fused = covariance_intersection([a, b], "trace")
+    fused = covariance_intersection([a, b])
     np.testing.assert_allclose(fused.covariance, 1.6 * np.eye(2), atol=1e-6)
     np.testing.assert_allclose(fused.means, [[0.8, 0.8]], atol=1e-6)
 
