@@ -33,6 +33,7 @@ def main() -> None:
 
 def _run(words: list[str]) -> None:
     if words and words[0] in PROCESSES:
+        sys.modules["_hashlib"] = None  # type: ignore[assignment] # OpenSSL in hashlib: 3.5 MB
         from teamslam.sim.cli import nodes
 
         function = getattr(nodes, words[0])

@@ -3,7 +3,6 @@
 import re
 import shutil
 import textwrap
-from importlib.resources import files
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +20,7 @@ from teamslam.sim.cli.options import (
     fail,
     scenario_of,
 )
+from teamslam.sim.scenarios.document import builtin_text
 from teamslam.sim.scenarios.scenario import builtin_names, load, with_options
 
 app = typer.Typer()
@@ -39,7 +39,7 @@ def scenarios(
         if show not in builtin_names():
             known = ", ".join(builtin_names())
             fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        typer.echo(_text(show), nl=False)
+        typer.echo(builtin_text(show), nl=False)
         return
     width = shutil.get_terminal_size().columns
     for name in builtin_names():
@@ -50,15 +50,11 @@ def scenarios(
 
 def _summary(name: str) -> str:
     """The first clause of a scenario's opening comment, without parentheses."""
-    lines = takewhile(lambda line: line.startswith("#"), _text(name).splitlines())
+    lines = takewhile(lambda line: line.startswith("#"), builtin_text(name).splitlines())
     comment = " ".join(line.lstrip("# ") for line in lines)
     while comment != (comment := _PARENTHESES.sub("", comment)):
         pass
     return _CLAUSE_END.split(comment)[0]
-
-
-def _text(name: str) -> str:
-    return files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8")
 
 
 @app.command(cls=Command, epilog="teamslam simulate waypoints -o my_world")

@@ -14,7 +14,6 @@ import re
 import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,8 @@ from teamslam.sim.scenarios.checks import (
 )
 from teamslam.team.config import RobotConfig
 
+BUILTIN = Path(__file__).with_name("builtin")
+"""Folder of the installed scenarios."""
 MAX_ROBOTS = 1_000
 UTIAS_ROBOTS = 5
 ANY_ROBOT = "any_robot"
@@ -41,8 +42,12 @@ Fields = dict[str, Any]
 
 def builtin_names() -> tuple[str, ...]:
     """Names of the installed scenarios."""
-    found = (entry.name for entry in files("teamslam.sim.scenarios.builtin").iterdir())
-    return tuple(sorted(name[:-5] for name in found if name.endswith(".toml")))
+    return tuple(sorted(path.stem for path in BUILTIN.glob("*.toml")))
+
+
+def builtin_text(name: str) -> str:
+    """TOML text of an installed scenario."""
+    return (BUILTIN / f"{name}.toml").read_text("utf-8")
 
 
 def named_document(name: str) -> tuple[Fields, str]:
@@ -155,9 +160,7 @@ def checked_count(count: object) -> int:
 
 
 def _builtin(name: str) -> Fields:
-    return _resolve_base(
-        _parse(files("teamslam.sim.scenarios.builtin").joinpath(f"{name}.toml").read_text("utf-8"))
-    )
+    return _resolve_base(_parse(builtin_text(name)))
 
 
 def _parse(text: str) -> Fields:

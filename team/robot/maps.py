@@ -34,7 +34,6 @@ from teamslam.team.estimation.map_joining.conditioning import (
     join_submap,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
-from teamslam.team.estimation.map_joining.localising import locate_robot
 from teamslam.team.estimation.plausibility import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float
@@ -151,6 +150,8 @@ class TeamMap:
         """Estimate the pose in the team's frame by a prior of landmarks alone; None where
         undetermined.
         """
+        from teamslam.team.estimation.map_joining.localising import locate_robot  # rarely needed
+
         given, self.doubt = self.decode(prior), ""
         team = LandmarkGaussian(given.ids, given.means, given.covariance[3:, 3:])
         local = None
