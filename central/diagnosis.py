@@ -18,7 +18,7 @@ from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
 from teamslam.team.estimation.contribution import Contribution, moment
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.hypotheses import (
     CARRIED_OFF,
     MOVED,

@@ -1,6 +1,5 @@
 """Check scenarios: errors name field path, known values and remedy."""
 
-import difflib
 import math
 from collections.abc import Iterable
 from functools import cache
@@ -85,6 +84,8 @@ def check_known(name: str, known: list[str], at: str) -> None:
 
 def close(name: object, known: Iterable[str]) -> str:
     """Suggestion of the closest known name, or empty."""
+    import difflib  # of errors only
+
     found = difflib.get_close_matches(str(name), list(known), n=1)
     return f"; did you mean `{found[0]}`?" if found else ""
 

@@ -12,10 +12,9 @@ name, team, seed, estimator, fusion, exchange, peers, centre
 
 import re
 import tomllib
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -29,6 +28,9 @@ from teamslam.sim.scenarios.checks import (
     plain_error,
 )
 from teamslam.team.config import RobotConfig
+
+if TYPE_CHECKING:
+    import zipfile
 
 BUILTIN = Path(__file__).with_name("builtin")
 """Folder of the installed scenarios."""
@@ -93,9 +95,11 @@ def own_document(name: str) -> Fields:
     return document
 
 
-def _file_at(path: Path) -> tuple[Path | None, Path | zipfile.Path]:
-    for above in path.parents:
-        if above.is_file() and zipfile.is_zipfile(above):
+def _file_at(path: Path) -> "tuple[Path | None, Path | zipfile.Path]":
+    for above in filter(Path.is_file, path.parents):
+        import zipfile
+
+        if zipfile.is_zipfile(above):
             return above, zipfile.Path(above, path.relative_to(above).as_posix())
     return None, path
 

@@ -44,6 +44,18 @@ class NotACovarianceError(ValueError):
         self.why = why
 
 
+class NotDeterminedError(ValueError):
+    """The submaps leave a node of the graph undetermined."""
+
+    def __init__(self, node: str) -> None:
+        super().__init__(f"{node} is not determined by the submaps")
+        self.node = node
+
+
+UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
+"""Exceptions of a solve without a solution: a case to decide on, not a defect."""
+
+
 class CoreErrors:
     """A context that raises the core's errors as NotACovarianceError."""
 

@@ -14,6 +14,7 @@ from teamslam.team import core, translate
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation import se2
 from teamslam.team.estimation.gaussian import (
+    UNSOLVABLE,
     LandmarkGaussian,
     Matrix,
     NotACovarianceError,
@@ -33,7 +34,6 @@ from teamslam.team.estimation.map_joining.conditioning import (
     join_pending,
     join_submap,
 )
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.plausibility import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float

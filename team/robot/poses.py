@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.gaussian import UNSOLVABLE, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import RunningWindow
-from teamslam.team.estimation.map_joining.gauss_newton import NotDeterminedError
 from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.maps import OwnMap, TeamMap
 from teamslam.team.robot.statements import MessageWriter
@@ -156,7 +155,7 @@ class RunningPoses:
                     if placed is None:
                         return out
                     posed = placed
-        except (NotACovarianceError, NotDeterminedError, np.linalg.LinAlgError) as error:
+        except UNSOLVABLE as error:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out
         self.sigma_m = math.sqrt(max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0))

@@ -6,9 +6,8 @@ import pytest
 
 from teamslam.team import translate
 from teamslam.team.config import Bounds
-from teamslam.team.estimation.gaussian import PoseGaussian, curved
+from teamslam.team.estimation.gaussian import UNSOLVABLE, PoseGaussian, curved
 from teamslam.team.estimation.map_joining.conditioning import join_pending
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
 from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.maps import CONDENSED, TeamMap
 from teamslam.team.wire import messages as m

@@ -26,8 +26,7 @@ from teamslam.sim.studies.estimators.svd_joining import (
 from teamslam.team import core, translate
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import named
-from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE
+from teamslam.team.estimation.gaussian import NO_LANDMARKS, UNSOLVABLE, LandmarkGaussian
 from teamslam.team.estimation.plausibility import start_beyond, submap_beyond
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap

@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.condensed_factor import (
     NOBODY,
     Condensed,
@@ -24,7 +25,7 @@ from teamslam.team.estimation.map_joining.condensed_factor import (
     places,
     select_newest,
 )
-from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, UNSOLVABLE, Island
+from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed

@@ -23,17 +23,11 @@ from teamslam.team import core
 from teamslam.team.config import Bias
 from teamslam.team.core import WholeMap
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.contribution import Contribution
-from teamslam.team.estimation.gaussian import NotACovarianceError, PoseGaussian
-from teamslam.team.estimation.map_joining.gauss_newton import (
-    Island,
-    JoinSettings,
+from teamslam.team.estimation.gaussian import (
+    NotACovarianceError,
     NotDeterminedError,
-    ages,
-    joint_marginal,
-    solve_island,
+    PoseGaussian,
 )
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
@@ -91,22 +85,16 @@ GATE = 18.420680744107813
 χ² beyond which a submap's observation of a landmark is attributed to another landmark. Some twenty
 are tested for each pose, and leaving out a correct one costs little.
 """
+MAX_ITERATIONS, STEP_TOLERANCE = 50, 1e-6
+"""End of a solve, by number or largest change [m, rad], as in `JoinSettings`."""
 CONTRADICTED = 1e-6
 """Probability below which the cost of a prior and submaps counts as a contradiction."""
-TRUSTING = JoinSettings(robust=False)
-"""Settings of plain least squares."""
-DOUBTING = JoinSettings(submap_gate=math.inf, landmark_gate=GATE)
-"""Settings that discount landmarks beyond a narrowing gate, but no submap as a whole."""
-DISPUTED = JoinSettings(submap_gate=0.5, landmark_gate=GATE)
-"""Settings for contradictory input: a whole submap, or the map, may be down-weighted."""
 FEWEST = 2
 """Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a
 misread.
 """
 NO_COVARIANCE = 2
 """Fault of the core: a map of the chain has no covariance."""
-SELF = ("self", 0)
-"""The stream of the prior and of the robot's submaps in the graph that is solved."""
 
 
 class SubmapCorrection(NamedTuple):
@@ -195,8 +183,9 @@ def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     found = _solve_chain(whole, submaps)
     known, refused = tuple(found.known.tolist()), tuple(0 for _ in submaps)
     if (found.landmark_chi2 > GATE).any():
-        doubted, _, _ = solve_island(_make_island(whole, submaps, DOUBTING))
-        beyond = _beyond_gate(doubted)
+        from teamslam.team.estimation.map_joining.contradictions import find_beyond
+
+        beyond = find_beyond(whole, submaps, GATE)
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
             found = _solve_chain(
@@ -207,7 +196,9 @@ def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
         is_majority(*pair) for pair in zip(refused, known, strict=True)
     )
     if disputed:
-        joint = _join_robustly(whole, submaps)
+        from teamslam.team.estimation.map_joining.contradictions import join_robustly
+
+        joint = join_robustly(whole, submaps, GATE)
     return Followed(joint, known, refused, found.cost, found.dof, disputed)
 
 
@@ -215,21 +206,13 @@ def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolu
     chain = core.Chain(whole)
     for each in submaps:
         chain.append(each.ids, each.mean, each.covariance)
-    found = chain.solve(TRUSTING.max_iterations, TRUSTING.step_tolerance)
+    found = chain.solve(MAX_ITERATIONS, STEP_TOLERANCE)
     if found.fault == NO_COVARIANCE:
         what = f"the robot's submap {found.at} behind the prior" if found.at else "the prior"
         raise NotACovarianceError(what, "not positive definite")
     if found.fault:
         raise NotDeterminedError("the robot's map")
     return found
-
-
-def _join_robustly(whole: WholeMap, submaps: Sequence[LocalMap]) -> WholeMap:
-    island, _, _ = solve_island(_make_island(whole, submaps, DISPUTED))
-    graph = island.graph
-    ids = sorted(graph.landmarks)
-    nodes = [graph.streams[SELF][-1], *(graph.landmarks[id_] for id_ in ids)]
-    return WholeMap(np.array(ids, dtype=np.uint32), *joint_marginal(island, nodes))
 
 
 def is_majority(refused: int, known: int) -> bool:
@@ -239,18 +222,6 @@ def is_majority(refused: int, known: int) -> bool:
 
 def _largest_cost(dof: int) -> float:
     return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
-
-
-def _make_island(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
-    chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
-    taken = [Contribution(*SELF, k, k, each) for k, each in enumerate(chain)]
-    graph, state = add_submaps(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
-    return Island(graph, state, ages(len(taken)), ages(0), settings)
-
-
-def _beyond_gate(island: Island) -> list[Bool[np.ndarray, " L"]]:
-    beyond = island.graph.factors.landmark_chi2(island.state, 1.0) > GATE
-    return np.split(beyond, island.graph.landmark_start[1:-1])[1:]
 
 
 def _remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:

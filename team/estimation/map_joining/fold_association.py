@@ -25,8 +25,8 @@ from teamslam.team.estimation.association.landmark_sets import (
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from teamslam.team.estimation.association.verification import Closure, is_ambiguous
 from teamslam.team.estimation.contribution import Contribution, Stream, first_of
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.gauss_newton import (
-    UNSOLVABLE,
     Island,
     is_solvable,
     iterate_tick,

@@ -24,7 +24,7 @@ from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.gaussian import NotACovarianceError
+from teamslam.team.estimation.gaussian import UNSOLVABLE, NotDeterminedError
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph, encounter_of
 from teamslam.team.shapes import Float, Int64
@@ -121,18 +121,6 @@ class JoinSettings:
     joined_ranges: bool = False
     landmark_sigma: float = 0.0
     association: AssociationProfile = DEFAULT_PROFILE
-
-
-class NotDeterminedError(ValueError):
-    """The submaps leave a node of the graph undetermined."""
-
-    def __init__(self, node: str) -> None:
-        super().__init__(f"{node} is not determined by the submaps")
-        self.node = node
-
-
-UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
-"""Exceptions of a solve without a solution: a case to decide on, not a defect."""
 
 
 def ages(count: int) -> Int64[np.ndarray, " count"]:

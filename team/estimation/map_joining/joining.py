@@ -35,10 +35,10 @@ from teamslam.team.estimation.contribution import (
     named,
     whole_of,
 )
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor, SightingKey
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.gauss_newton import (
-    UNSOLVABLE,
     Island,
     JoinSettings,
     add_sightings,

@@ -21,15 +21,16 @@ from teamslam.team.estimation.map_joining.alignment import (
     refusal,
 )
 from teamslam.team.estimation.map_joining.conditioning import (
-    TRUSTING,
     Posed,
     join_pending,
     join_submap,
 )
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
+SETTINGS = JoinSettings()
 FLAT = 1e4
 """Factor by which the covariance of the alignment is raised for the prior of the start: the
 landmarks that give it are counted in the solution.
@@ -49,7 +50,7 @@ def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None)
     fit, why = shared.fit()
     count, refused = len(in_team), 0
     if fit is not None and why is not None and count > LEAST_AGREEING:
-        limit = chi2_limit(2, 1.0 - TRUSTING.alignment_confidence)
+        limit = chi2_limit(2, 1.0 - SETTINGS.alignment_confidence)
         agree = agreeing(shared.a, shared.A, shared.b, shared.P[3:, 3:], limit)
         refused = count - int(agree.sum())
         if count - refused >= LEAST_AGREEING and 2 * refused < count:
@@ -103,9 +104,9 @@ class _Shared(NamedTuple):
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
             fit = align(self.a, self.A, self.b, self.P[3:, 3:])
-        why = refusal(shared, fit, TRUSTING.alignment_heading_sigma)
+        why = refusal(shared, fit, SETTINGS.alignment_heading_sigma)
         if why is None and fit is not None:
-            why = disagreement(shared, fit.chi2, TRUSTING.alignment_confidence)
+            why = disagreement(shared, fit.chi2, SETTINGS.alignment_confidence)
         return fit, why
 
 

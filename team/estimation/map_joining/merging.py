@@ -21,12 +21,11 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.gaussian import deviation
+from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining import alignment
 from teamslam.team.estimation.map_joining.alignment import Alignment, SharedPoints
 from teamslam.team.estimation.map_joining.gauss_newton import (
-    UNSOLVABLE,
     Island,
     add_sightings,
     ages,

@@ -15,10 +15,9 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation.contribution import Stream, named
+from teamslam.team.estimation.gaussian import UNSOLVABLE, NotDeterminedError
 from teamslam.team.estimation.map_joining.gauss_newton import (
-    UNSOLVABLE,
     Island,
-    NotDeterminedError,
     degrees_of_freedom,
     final_cost,
     is_suspicious,

@@ -21,9 +21,10 @@ from teamslam.team.estimation.contribution import (
     Stream,
     named,
 )
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.fold_association import associate_tick
-from teamslam.team.estimation.map_joining.gauss_newton import UNSOLVABLE, JoinSettings, is_solvable
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, is_solvable
 from teamslam.team.estimation.map_joining.joining import Fold, Tick, add_start, fold_submaps
 
 T = TypeVar("T")

@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from teamslam.team.estimation.contribution import Contribution, Key, Stream
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
 from teamslam.team.estimation.map_joining.condensing import LIMITS
 from teamslam.team.estimation.map_joining.cutting import cut_members
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
-    UNSOLVABLE,
     Island,
     add_sightings,
     ages,

@@ -9,10 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     STUCK,
-    UNSOLVABLE,
     Island,
     age_factors,
     final_cost,

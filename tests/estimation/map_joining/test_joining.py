@@ -10,7 +10,8 @@ from scipy.linalg import block_diag
 
 from teamslam.team import core
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
-from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, NotDeterminedError
+from teamslam.team.estimation.gaussian import NotDeterminedError
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import (
     solve_fold,
 )
