@@ -3,11 +3,13 @@
 Covariances are those of (x, y, θ) in the frame of the header; z, roll and pitch are exactly zero.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 
 from teamslam.team.ros2.definitions import types
 from teamslam.team.shapes import Float
@@ -17,9 +19,12 @@ SIGMAS = 2.0
 HEIGHT_M = 0.1
 LEAST_AXIS_M = 0.02
 """Least length of an ellipse's axis [m], so that an accurate landmark is visible."""
-_ADD, _DELETE_ALL = 0, 3
+_DELETE_ALL = 3
 _CYLINDER, _TEXT = 3, 9
-_BLUE, _GREY, _WHITE = (0.12, 0.47, 0.71, 0.35), (0.5, 0.5, 0.5, 0.35), (1.0, 1.0, 1.0, 0.9)
+_BLUE, _GREY, _WHITE = (
+    dict(zip("rgba", colour, strict=True))
+    for colour in ((0.12, 0.47, 0.71, 0.35), (0.5, 0.5, 0.5, 0.35), (1.0, 1.0, 1.0, 0.9))
+)
 Pose = tuple[float, float, float]
 """(x [m], y [m], θ [rad])."""
 
@@ -78,42 +83,52 @@ def _wrapped(angle: float) -> float:
     return float(np.pi - (np.pi - angle) % (2.0 * np.pi))
 
 
-# Messages.
+# Messages. Fields that are left out are zero or empty.
 
 
-def _new(kind: str, **fields: Any) -> Any:
-    return types().types[kind](**fields)
+@cache
+def _zeros(kind: str) -> dict[str, Any]:
+    return {name: _zero(*node) for name, node in types().fielddefs[kind][1]}
+
+
+def _zero(node: Nodetype, of: Any) -> Any:
+    if node is Nodetype.NAME:
+        return build(of)
+    if node is Nodetype.BASE:
+        return {"string": "", "bool": False}.get(of[0], 0)
+    (inner, element), length = of
+    return np.zeros(length, element[0]) if inner is Nodetype.BASE else []
+
+
+def build(kind: str, **values: Any) -> Any:
+    """Build a message of this type; parts are messages, or tables of their fields."""
+    nodes: dict[str, Any] = dict(types().fielddefs[kind][1])
+    given = {name: _part(nodes[name], value) for name, value in values.items()}
+    return types().types[kind](**{**_zeros(kind), **given})
+
+
+def _part(declared: tuple[Nodetype, Any], value: Any) -> Any:
+    node, of = declared
+    if node is Nodetype.NAME and isinstance(value, dict):
+        return build(of, **value)
+    return [_part(of[0], each) for each in value] if isinstance(value, list) else value
 
 
 def header(stamp_ns: int, frame: str) -> Any:
     """std_msgs/Header."""
-    return _new("std_msgs/msg/Header", stamp=_time(stamp_ns), frame_id=frame)
-
-
-def _time(stamp_ns: int) -> Any:
     seconds, rest = divmod(stamp_ns, 10**9)
-    return _new("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+    stamp = {"sec": seconds, "nanosec": rest}
+    return build("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-def _point(x: float, y: float, z: float = 0.0) -> Any:
-    return _new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+def _rotation(theta: float) -> dict[str, float]:
+    return {"z": float(np.sin(0.5 * theta)), "w": float(np.cos(0.5 * theta))}
 
 
-def _vector(x: float, y: float, z: float = 0.0) -> Any:
-    return _new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-
-def _rotation(theta: float) -> Any:
-    half = 0.5 * theta
-    return _new(
-        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(np.sin(half)), w=float(np.cos(half))
-    )
-
-
-def planar_pose(pose: Pose, z: float = 0.0) -> Any:
-    """geometry_msgs/Pose."""
+def _planar(pose: Pose, z: float = 0.0) -> dict[str, Any]:
+    """The fields of geometry_msgs/Pose."""
     x, y, theta = pose
-    return _new("geometry_msgs/msg/Pose", position=_point(x, y, z), orientation=_rotation(theta))
+    return {"position": {"x": x, "y": y, "z": z}, "orientation": _rotation(theta)}
 
 
 def covariance_6x6(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "36"]:
@@ -126,54 +141,45 @@ def covariance_6x6(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "36"]:
 
 def pose_with_covariance(stamp_ns: int, frame: str, pose: Pose, P: Float[np.ndarray, "3 3"]) -> Any:
     """geometry_msgs/PoseWithCovarianceStamped."""
-    inner = _new(
-        "geometry_msgs/msg/PoseWithCovariance",
-        pose=planar_pose(pose),
-        covariance=covariance_6x6(P),
-    )
-    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    return _new(kind, header=header(stamp_ns, frame), pose=inner)
-
-
-def transform(stamp_ns: int, parent: str, child: str, pose: Pose) -> Any:
-    """geometry_msgs/TransformStamped: the pose of `child` in `parent`."""
-    x, y, theta = pose
-    inner = _new(
-        "geometry_msgs/msg/Transform", translation=_vector(x, y), rotation=_rotation(theta)
-    )
-    return _new(
-        "geometry_msgs/msg/TransformStamped",
-        header=header(stamp_ns, parent),
-        child_frame_id=child,
-        transform=inner,
-    )
-
-
-def odometry(stamp_ns: int, names: Names, pose: Pose, speeds: tuple[float, float]) -> Any:
-    """nav_msgs/Odometry: the pose of the base in the odometry's frame; (forward, yaw rate)."""
-    zero = np.zeros(36)
-    twist = _new(
-        "geometry_msgs/msg/Twist", linear=_vector(speeds[0], 0.0), angular=_vector(0, 0, speeds[1])
-    )
-    return _new(
-        "nav_msgs/msg/Odometry",
-        header=header(stamp_ns, names.odometry_frame),
-        child_frame_id=names.base_frame,
-        pose=_new("geometry_msgs/msg/PoseWithCovariance", pose=planar_pose(pose), covariance=zero),
-        twist=_new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=zero),
+    return build(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(stamp_ns, frame),
+        pose={"pose": _planar(pose), "covariance": covariance_6x6(P)},
     )
 
 
 def pose_stamped(stamp_ns: int, frame: str, pose: Pose) -> Any:
     """geometry_msgs/PoseStamped."""
     kind = "geometry_msgs/msg/PoseStamped"
-    return _new(kind, header=header(stamp_ns, frame), pose=planar_pose(pose))
+    return build(kind, header=header(stamp_ns, frame), pose=_planar(pose))
+
+
+def transform(stamp_ns: int, parent: str, child: str, pose: Pose) -> Any:
+    """geometry_msgs/TransformStamped: the pose of `child` in `parent`."""
+    x, y, theta = pose
+    return build(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        transform={"translation": {"x": x, "y": y}, "rotation": _rotation(theta)},
+    )
+
+
+def odometry(stamp_ns: int, names: Names, pose: Pose, speeds: tuple[float, float]) -> Any:
+    """nav_msgs/Odometry: the pose of the base in the odometry's frame; (forward, yaw rate)."""
+    return build(
+        "nav_msgs/msg/Odometry",
+        header=header(stamp_ns, names.odometry_frame),
+        child_frame_id=names.base_frame,
+        pose={"pose": _planar(pose)},
+        twist={"twist": {"linear": {"x": speeds[0]}, "angular": {"z": speeds[1]}}},
+    )
 
 
 def path(stamp_ns: int, frame: str, poses: Iterable[tuple[int, Pose]]) -> Any:
     """nav_msgs/Path."""
     stamped = [pose_stamped(t, frame, pose) for t, pose in poses]
-    return _new("nav_msgs/msg/Path", header=header(stamp_ns, frame), poses=stamped)
+    return build("nav_msgs/msg/Path", header=header(stamp_ns, frame), poses=stamped)
 
 
 def ellipse(P: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
@@ -195,48 +201,19 @@ def markers(
 
     The first marker deletes those of the map before. A landmark without identity is grey.
     """
-    marker = _marker(stamp_ns, frame)
-    found = [marker("landmarks", 0, _CYLINDER, action=_DELETE_ALL)]
+    head = header(stamp_ns, frame)
+    found = [{"header": head, "ns": "landmarks", "type": _CYLINDER, "action": _DELETE_ALL,
+              "pose": _planar((0.0, 0.0, 0.0)), "scale": {"x": 1.0, "y": 1.0, "z": 1.0},
+              "color": _BLUE}]  # fmt: skip
     for k, (x, y) in enumerate(means.tolist()):
         major, minor, turn = ellipse(blocks[k])
-        axes = max(major, LEAST_AXIS_M), max(minor, LEAST_AXIS_M), HEIGHT_M
-        colour = _BLUE if named[k] else _GREY
-        found.append(marker("landmarks", k, _CYLINDER, (x, y, turn), axes, colour))
-        size = (0.0, 0.0, 0.3)
-        found.append(marker("labels", k, _TEXT, (x, y, 0.0), size, _WHITE, text=labels[k], z=0.3))
-    return _new("visualization_msgs/msg/MarkerArray", markers=found)
-
-
-def _marker(stamp_ns: int, frame: str) -> Callable[..., Any]:
-    head = header(stamp_ns, frame)
-    image = _new("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="",
-                 data=np.empty(0, np.uint8))  # fmt: skip
-    mesh = _new("visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8))
-
-    def build(
-        space: str,
-        number: int,
-        kind: int,
-        pose: Pose = (0.0, 0.0, 0.0),
-        scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        colour: tuple[float, float, float, float] = _BLUE,
-        *,
-        text: str = "",
-        action: int = _ADD,
-        z: float = 0.0,
-    ) -> Any:
-        r, g, b, a = colour
-        return _new(
-            "visualization_msgs/msg/Marker",
-            header=head, ns=space, id=number, type=kind, action=action, pose=planar_pose(pose, z),
-            scale=_vector(*scale), color=_new("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
-            lifetime=_new("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-            frame_locked=False, points=[], colors=[], texture_resource="", texture=image,
-            uv_coordinates=[], text=text, mesh_resource="", mesh_file=mesh,
-            mesh_use_embedded_materials=False,
-        )  # fmt: skip
-
-    return build
+        axes = {"x": max(major, LEAST_AXIS_M), "y": max(minor, LEAST_AXIS_M), "z": HEIGHT_M}
+        shown = {"header": head, "id": k}
+        found.append({**shown, "ns": "landmarks", "type": _CYLINDER, "pose": _planar((x, y, turn)),
+                      "scale": axes, "color": _BLUE if named[k] else _GREY})  # fmt: skip
+        found.append({**shown, "ns": "labels", "type": _TEXT, "pose": _planar((x, y, 0.0), 0.3),
+                      "scale": {"z": 0.3}, "color": _WHITE, "text": labels[k]})  # fmt: skip
+    return build("visualization_msgs/msg/MarkerArray", markers=found)
 
 
 def detections(
@@ -250,41 +227,32 @@ def detections(
     head = header(stamp_ns, frame)
     found = []
     for name, (x, y), P in zip(names, means.tolist(), blocks, strict=True):
-        at = planar_pose((x, y, 0.0))
-        pose = _new("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=covariance_6x6(P))
-        hypothesis = _new("vision_msgs/msg/ObjectHypothesis", class_id=name, score=1.0)
-        kind = "vision_msgs/msg/ObjectHypothesisWithPose"
-        guess = _new(kind, hypothesis=hypothesis, pose=pose)
-        box = _new("vision_msgs/msg/BoundingBox3D", center=at, size=_vector(0.0, 0.0))
-        kind = "vision_msgs/msg/Detection3D"
-        found.append(_new(kind, header=head, results=[guess], bbox=box, id=name))
-    return _new("vision_msgs/msg/Detection3DArray", header=head, detections=found)
+        at = _planar((x, y, 0.0))
+        result = {
+            "hypothesis": {"class_id": name, "score": 1.0},
+            "pose": {"pose": at, "covariance": covariance_6x6(P)},
+        }
+        found.append({"header": head, "results": [result], "bbox": {"center": at}, "id": name})
+    return build("vision_msgs/msg/Detection3DArray", header=head, detections=found)
 
 
 def diagnostics(
     stamp_ns: int, node: str, state: str, warnings: Sequence[str], figures: Mapping[str, float]
 ) -> Any:
     """diagnostic_msgs/DiagnosticArray: a node's state, its warnings and its figures."""
-    values = [
-        _new("diagnostic_msgs/msg/KeyValue", key=name, value=f"{value:g}")
-        for name, value in figures.items()
-    ]
-    values += [
-        _new("diagnostic_msgs/msg/KeyValue", key=f"warning {k + 1}", value=text)
-        for k, text in enumerate(warnings)
-    ]
-    one = _new(
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=1 if warnings else 0,
-        name=f"teamslam: {node}",
-        message=warnings[-1] if warnings else state,
-        hardware_id=node,
-        values=values,
-    )
+    values = [{"key": name, "value": f"{value:g}"} for name, value in figures.items()]
+    values += [{"key": f"warning {k}", "value": text} for k, text in enumerate(warnings, 1)]
+    one = {
+        "level": 1 if warnings else 0,
+        "name": f"teamslam: {node}",
+        "message": warnings[-1] if warnings else state,
+        "hardware_id": node,
+        "values": values,
+    }
     kind = "diagnostic_msgs/msg/DiagnosticArray"
-    return _new(kind, header=header(max(stamp_ns, 0), ""), status=[one])
+    return build(kind, header=header(max(stamp_ns, 0), ""), status=[one])
 
 
 def transforms(*found: Any) -> Any:
     """tf2_msgs/TFMessage."""
-    return _new("tf2_msgs/msg/TFMessage", transforms=list(found))
+    return build("tf2_msgs/msg/TFMessage", transforms=list(found))
