@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
@@ -366,7 +367,7 @@ def record(
     from teamslam.team.recording.parts import check_continues, next_part
     from teamslam.team.recording.provenance import provenance
     from teamslam.team.recording.reader import LogError
-    from teamslam.team.recording.shell import record as record_until_end
+    from teamslam.team.recording.shell import RecordLoop
     from teamslam.team.shell import process
     from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL, robot_node
 
@@ -407,16 +408,9 @@ def record(
         if exists:
             _LOG.info("%s goes on in %s", output, recorder.path.name)
         try:
-            written = record_until_end(
-                bus,
-                recorder,
-                expected,
-                inventory,
-                lambda: next_part(output, resolved.team, metadata),
-                stop=stop,
-                scenario=configurations,
-                peers=peers,
-            )
+            more = partial(next_part, output, resolved.team, metadata)
+            loop = RecordLoop(bus, recorder, expected, inventory, more, peers)
+            written = loop.run(stop, configurations)
             _LOG.info("wrote %s, %d messages", recorder.path, written)
         finally:
             parts = _join_parts(output) if join_parts else parts_of(output)

@@ -87,9 +87,9 @@ More = Callable[[], tuple[Recorder, Inventory]]
 class RecordLoop:
     """Write each bus sample once, request missing ones, and report progress.
 
-    inventory: of earlier parts. more: opens the next part after a write error; without it the error
-    is raised. peers: recording ends when each has concluded, or was given up or withdrawn. The
-    centre's final map ends any team.
+    expected: nodes whose absence is a warning. inventory: of earlier parts. more: opens the next
+    part after a write error; without it the error is raised. peers: recording ends when each has
+    concluded, or was given up or withdrawn. The centre's final map ends any team.
     """
 
     def __init__(
@@ -225,11 +225,6 @@ class RecordLoop:
         self._bus.redeliver()
         _LOG.warning("recording goes on in %s", self._recorder.path)
 
-    def write_scenario(self, scenario: Sequence[Configuration]) -> None:
-        """Write configurations in place of an absent world."""
-        announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
-        self._write([each for each in announced if self._inventory.is_new(each)])
-
     def close(self) -> None:
         """Complete the log; raises `RecorderError`."""
         try:
@@ -294,7 +289,7 @@ class RecordLoop:
 
     def _note_liveliness(self, sample: Sample, node: str) -> Sample:
         try:
-            came = _is_alive(sample.payload)
+            came = decoded(sample.payload, Liveliness).alive
         except WireError as error:  # not a node name: recorded unchanged
             _LOG.warning("%.80s: %s", sample.key, error)
             return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
@@ -339,54 +334,40 @@ class RecordLoop:
         self._statuses += 1
         return status
 
+    def run(self, stop: threading.Event, scenario: Sequence[Configuration] = ()) -> int:
+        """Record until the final map is present and all nodes have left, or until `stop`; return
+        the number of messages written.
 
-def record(
-    bus: Bus,
-    recorder: Recorder,
-    expected: Collection[str] = (),
-    inventory: Inventory | None = None,
-    more: More | None = None,
-    on_status: Callable[[Status], None] | None = None,
-    stop: threading.Event | None = None,
-    scenario: Sequence[Configuration] = (),
-    peers: Collection[str] = (),
-) -> int:
-    """Record until the final map is present and all nodes have left, or until `stop`.
-
-    Returns the number of messages written. expected: nodes whose absence is a warning. inventory,
-    more, peers: as `RecordLoop`. scenario: configurations logged for a team without a world. Raises
-    `RecorderError` on a write error: at once without `more`, else at the end.
-    """
-    stop = threading.Event() if stop is None else stop
-    loop = RecordLoop(bus, recorder, expected, inventory, more, peers)
-    with closing(loop):
-        loop.write_scenario(scenario)
-        due = time.monotonic()
-        remind_due = due + _REMIND_S
-        end = EndQuery(bus, NODE, ENDS if peers else (FINAL_MAP,))
-        while not stop.is_set():
-            if loop.finished:
-                # A token has priority over data: overtaken messages still arrive.
-                if not (samples := bus.receive(_QUIET_S)):
-                    break
-                loop.take(samples)
-            loop.take(samples := bus.receive(_WAIT_S))
-            loop.request_missing(time.monotonic())
-            loop.check_end(end)
-            if time.monotonic() >= due:
-                due = time.monotonic() + _STATUS_S
-                status = loop.status()
-                if on_status is not None:
-                    on_status(status)
-                if status.warnings and time.monotonic() >= remind_due:
-                    remind_due = time.monotonic() + _REMIND_S
-                    _LOG.info("%s", "; ".join(status.warnings))
-            if 0 < len(samples) < PROGRESS_EVERY:
-                stop.wait(_PACE_S)
-        loop.take(bus.receive(0.0))
-        for warning in loop.status(last=True).warnings:
-            _LOG.warning("%s", warning)
-    return loop.written
+        scenario: configurations logged for a team without a world. Raises `RecorderError` on a
+        write error: at once without `more`, else at the end.
+        """
+        with closing(self):
+            announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
+            self._write([each for each in announced if self._inventory.is_new(each)])
+            due = time.monotonic()
+            remind_due = due + _REMIND_S
+            end = EndQuery(self._bus, NODE, ENDS if self._are_peers else (FINAL_MAP,))
+            while not stop.is_set():
+                if self.finished:
+                    # A token has priority over data: overtaken messages still arrive.
+                    if not (samples := self._bus.receive(_QUIET_S)):
+                        break
+                    self.take(samples)
+                self.take(samples := self._bus.receive(_WAIT_S))
+                self.request_missing(time.monotonic())
+                self.check_end(end)
+                if time.monotonic() >= due:
+                    due = time.monotonic() + _STATUS_S
+                    status = self.status()
+                    if status.warnings and time.monotonic() >= remind_due:
+                        remind_due = time.monotonic() + _REMIND_S
+                        _LOG.info("%s", "; ".join(status.warnings))
+                if 0 < len(samples) < PROGRESS_EVERY:
+                    stop.wait(_PACE_S)
+            self.take(self._bus.receive(0.0))
+            for warning in self.status(last=True).warnings:
+                _LOG.warning("%s", warning)
+        return self.written
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
@@ -408,7 +389,3 @@ def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Ev
 
 def _own(key: str, message: Message, counter: int) -> Sample:
     return Sample(key, encoded(message), message.stamp_ns, time.time_ns(), counter)
-
-
-def _is_alive(payload: bytes) -> bool:
-    return decoded(payload, Liveliness).alive

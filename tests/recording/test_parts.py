@@ -22,7 +22,7 @@ from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.records import read_frames
 from teamslam.team.recording.repair import read_undamaged
-from teamslam.team.recording.shell import RecordLoop, record
+from teamslam.team.recording.shell import RecordLoop
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
@@ -67,7 +67,8 @@ def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path):
         assert check_continues(path, "t", {"scenario": "s"})
         recorder, inventory = next_part(path, "t", {"scenario": "s"})
         second = ZenohBus("t", at)
-        thread = threading.Thread(target=record, args=(second, recorder, (), inventory))
+        loop, stop = RecordLoop(second, recorder, (), inventory), threading.Event()
+        thread = threading.Thread(target=loop.run, args=(stop,))
         thread.start()
         part = part_of(path, 2)
         team.says(10)
@@ -298,6 +299,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
 def test_a_disk_that_stays_full_is_an_error_at_the_end(path):
     network = MemoryNetwork()
     stop = threading.Event()
+    stop.set()
     recorder = Recorder(path, "t", {})
     recorder._failure = OSError("No space left on device")
 
@@ -305,7 +307,7 @@ def test_a_disk_that_stays_full_is_an_error_at_the_end(path):
         raise RecorderError("the disk is full")
 
     with pytest.raises(RecorderError, match="No space left"):
-        record(MemoryBus(network), recorder, (), None, more, lambda _: stop.set(), stop=stop)
+        RecordLoop(MemoryBus(network), recorder, (), None, more).run(stop)
 
 
 def test_what_a_bus_sends_and_receives_is_in_its_own_log_and_merged_there_once(tmp_path):

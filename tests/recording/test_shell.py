@@ -14,7 +14,7 @@ from teamslam.team.recording.check import holes
 from teamslam.team.recording.parts import next_part
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.shell import RecordLoop, record, replay, schedule
+from teamslam.team.recording.shell import RecordLoop, replay, schedule
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
@@ -124,15 +124,11 @@ def team_of(source: Bus) -> list[Outgoing]:
 
 
 def test_a_recording_ends_with_the_final_map_and_the_last_token(path, endpoint):
-    statuses: list[m.Status] = []
     with ZenohBus("t", endpoint) as team, ZenohBus("t", endpoint) as bus:
         team.watch_alive("recorder")
         team.declare_alive("robot/alpha")
-        thread = threading.Thread(
-            target=record,
-            args=(bus, Recorder(path, "t", {}), ("central",)),
-            kwargs={"on_status": statuses.append},
-        )
+        loop = RecordLoop(bus, Recorder(path, "t", {}), ("central",))
+        thread = threading.Thread(target=loop.run, args=(threading.Event(),))
         thread.start()
         received(team, 1)  # its subscriptions are declared by then
         flows(team, path)
@@ -151,8 +147,9 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path, endpoint):
         build.liveliness(node="robot/alpha"),
         build.liveliness(stamp_ns=999_000_000, node="robot/alpha", alive=False),
     ]
-    assert messages_of(list(log.samples()), c.STATUS)[:-1] == statuses != []
-    assert statuses[0].warnings == ("central has not appeared yet",)
+    first, *_, last = messages_of(list(log.samples()), c.STATUS)
+    assert (first.state, first.warnings) == ("recording", ("central has not appeared yet",))
+    assert last.state == "done"
 
 
 class Team:
