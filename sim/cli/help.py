@@ -62,6 +62,11 @@ class _Plain:
             raise
         return parsed
 
+    def collect_usage_pieces(self: Any, ctx: Any) -> list[str]:
+        """Words of the usage line, arguments as in their section: `LOG`, `[SCENARIO]`."""
+        pieces: list[str] = super().collect_usage_pieces(ctx)  # type: ignore[misc]
+        return [piece.upper().replace("{", "").replace("}", "") for piece in pieces]
+
     def format_options(self: Any, ctx: Any, formatter: Any) -> None:
         """Write arguments, then the sections of options."""
         _write_parameters(self.get_params(ctx), ctx, formatter)

@@ -15,7 +15,6 @@ from teamslam.sim.cli.help import Command, network, output_option, rare
 from teamslam.sim.cli.importing import import_into
 from teamslam.sim.cli.options import (
     ANY_PORT,
-    ASSUMED_NAME,
     FAILED,
     LOOPBACK,
     WRONG_USE,
@@ -47,7 +46,12 @@ from teamslam.sim.cli.options import (
 )
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.view import FoxglovePort, Open, Port, show_on_page
-from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
+from teamslam.sim.scenarios.scenario import (
+    ASSUMED_NAME,
+    Scenario,
+    scenario_warnings,
+    with_options,
+)
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:

@@ -41,6 +41,7 @@ app = typer.Typer(
     name="log",
     cls=Group,
     help="Inspect, check, repair, cut, merge or export a log.",
+    epilog="teamslam log info runs/first\nteamslam log export runs/first -o bag --format rosbag2",
     no_args_is_help=True,
 )
 app.command(cls=Command, epilog="teamslam log repair team.mcap -o whole.mcap")(repair)

@@ -30,6 +30,7 @@ app = typer.Typer(
     name="map",
     cls=Group,
     help="Save the final map of a run, show a saved map, or request a peer's.",
+    epilog="teamslam map save runs/first -o site.map\nteamslam launch waypoints --map site.map",
     no_args_is_help=True,
 )
 

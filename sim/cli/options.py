@@ -18,7 +18,7 @@ import typer
 
 from teamslam.sim.cli.help import network, rare
 from teamslam.sim.scenarios.checks import ScenarioError
-from teamslam.sim.scenarios.scenario import Scenario, load, loads
+from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import MAP, Estimator, FusionRule
 from teamslam.team.wire.text import one_line, printable_lines
@@ -82,8 +82,6 @@ Keys = Annotated[
         metavar="DIR",
     ),
 ]
-ASSUMED_NAME = "recorded"
-"""Built-in scenario for uncalibrated robots' recorded data."""
 ASSUMED = (
     "the built-in one `recorded` is taken. It assumes odometry that is off by 5 cm and 2° after a "
     "metre and by 6° after a radian, ranges by 5 cm and 2 %, bearings by 1.7°"

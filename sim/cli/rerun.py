@@ -25,9 +25,11 @@ from teamslam.sim.cli.options import (
     fail,
     failing,
     saved_maps,
+    set_aside,
     warn_of_holes,
     write_json,
 )
+from teamslam.sim.cli.results import Steps, print_written, read_run
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.verification.verification import Verification
     from teamslam.sim.recorded.changed_run import Changes
+    from teamslam.team.wire.bus import Sample
 
 app = typer.Typer()
 
@@ -57,7 +60,8 @@ def rerun(
         list[str] | None, typer.Option(help="A robot to leave out; repeatable.", metavar="ROBOT")
     ] = None,
     output: Annotated[
-        Path | None, output_option("Folder for a picture of both maps.", metavar="DIR")
+        Path | None,
+        output_option("Folder for log and report of the computed run.", metavar="DIR"),
     ] = None,
     particles: Annotated[
         int | None, typer.Option(help="Particles of each robot.", min=4, metavar="N")
@@ -258,9 +262,9 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     }
     write_json(json_file, figures)
     if output is not None:
-        picture = output / "maps.png"
-        if draw_maps({"recorded": recorded, "recomputed": changed}, picture):
-            console.print(f"wrote {picture}", highlight=False, soft_wrap=True)
+        _write_run(computed, changed, output, console)
+        if not plain and draw_maps(runs, output / "maps.png"):
+            console.print(f"wrote {output / 'maps.png'}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
     if missing := changed.missing:
@@ -271,6 +275,29 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
             f"{log.path} -o FIXED.mcap` completes the log",
             FAILED,
         )
+
+
+def _write_run(
+    computed: "list[Sample]", evaluation: "Evaluation", folder: Path, console: "Console"
+) -> None:
+    """Write log and report of a computed run."""
+    from teamslam.central.desk.evaluation.figures import to_json
+    from teamslam.central.desk.report.page import write_report
+    from teamslam.central.desk.report.run import run_figures
+    from teamslam.team.recording.provenance import provenance
+    from teamslam.team.recording.reader import IN_FOLDER, open_log
+    from teamslam.team.recording.recorder import Recorder
+
+    assert evaluation.scenario is not None
+    log = folder / IN_FOLDER
+    if log.exists():
+        set_aside(log)
+    with Recorder(log, evaluation.scenario.team, provenance()) as recorder:
+        recorder.write(computed)
+    steps = Steps()
+    run = read_run(open_log(log), evaluation, steps, proves_ledger=False)
+    steps.begin("drawing")
+    print_written(write_report(run, folder, to_json(evaluation, run_figures(run))), console)
 
 
 def _print_warnings(

@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,6 +27,7 @@ from teamslam.sim.cli.options import (
     scenario_of,
     warn_of_holes,
 )
+from teamslam.sim.cli.results import Steps
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
@@ -186,10 +188,14 @@ def _write_video(log: Path, path: Path) -> None:
 
     if path.suffix != ".gif" or not path.parent.is_dir():
         fail(f"--export-video {path}: give a .gif in an existing folder", WRONG_USE)
-    opened = open_log(log)
+    steps = Steps()
+    opened = replace(open_log(log), reading=steps.share)
     warn_of_holes(opened)
+    steps.begin("reading the run")
     maps = (decoded(s.payload, FusedMap) for s in opened.samples((FUSED_MAP, FINAL_MAP)))
-    if not draw_film(evaluate(opened.samples()), maps_over_time(maps), path):
+    evaluation, drawn = evaluate(opened.samples()), maps_over_time(maps)
+    steps.begin("drawing the film")
+    if not draw_film(evaluation, drawn, path, steps.share):
         fail(f"{log} has no final map or no poses to draw", FAILED)
     typer.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
 

@@ -62,8 +62,17 @@ def named_document(name: str) -> tuple[Fields, str]:
     document, path = _resolve_base(own_document(name)), Path(name)
     kind = checked_table(document.get("world", {}), "world").get("kind")
     if path.name == "scenario.toml" and kind not in ("simulated", "live"):
-        return document, data_set_name(path.resolve().parent) or path.stem
+        return document, named_after(path.parent) or path.stem
     return document, path.stem
+
+
+def named_after(data_set: Path) -> str:
+    """Name of a data set's team: that of its folder or file."""
+    return _short_name(data_set_name(data_set.resolve()))
+
+
+def _short_name(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", text)[:64]
 
 
 def own_document(name: str) -> Fields:
@@ -111,7 +120,7 @@ def resolve(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     """
     for name in document:
         check_known(name, [*known, "base", "defaults", "robot_count"], "")
-    fields: Fields = {"name": re.sub(r"[^A-Za-z0-9_.-]", "-", stem)[:64]} | document
+    fields: Fields = {"name": _short_name(stem)} | document
     defaults = checked_table(fields.pop("defaults", {}), "defaults")
     _check_part(defaults, RobotConfig, "defaults", {"id": "r1"})
     if "id" in defaults:

@@ -18,6 +18,7 @@ from teamslam.sim.scenarios.document import (
     builtin_names,
     checked_count,
     checked_table,
+    named_after,
     named_document,
     resolve,
 )
@@ -37,9 +38,11 @@ from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
 from teamslam.team.registry import absence
 
-__all__ = ["Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads",
+__all__ = ["ASSUMED_NAME", "Scenario", "ScenarioError", "builtin_names", "dumps", "load", "loads",
            "scenario_warnings", "with_options"]  # fmt: skip
 
+ASSUMED_NAME = "recorded"
+"""Built-in scenario for recorded data of uncalibrated robots; the team is named by its data set."""
 FAR_M = 10.0
 """Default end of a sensor's range."""
 PASSED = 0.5
@@ -114,6 +117,8 @@ def with_options(
     fields["centre"] = fields["centre"] and centre
     if dataset is not None:
         fields["world"] = _world_of(scenario, str(dataset))
+        if scenario.name == ASSUMED_NAME:
+            fields["name"] = fields["team"] = named_after(Path(dataset)) or ASSUMED_NAME
     world = fields["world"]
     if identities is not None:
         world["identities"] = identities

@@ -125,6 +125,7 @@ class Driver:
             raise DriverError(str(error)) from None
         if left:
             warnings.warn(left, DriverWarning, stacklevel=2)
+        self._continued = self._journal
         self._again: int | None = None if self._journal.calls else -1
         self._closed = False
 
@@ -405,6 +406,8 @@ class Driver:
                 f"{self.robot}: the team has ended, so nothing more is measured; for another run "
                 "start its processes and a driver"
             )
+        if self._continued is not self._journal:
+            self._begin_again()
         if self._again is not None:
             return
         if stamp_ns <= self._journal.newest_ns:
@@ -418,6 +421,13 @@ class Driver:
             return
         self._odometer.end_ns = self._journal.driven_ns
         self._odometer.pose = self._journal.pose
+
+    def _begin_again(self) -> None:
+        """Begin the empty stream of a later run, at an unknown pose: the robot may have moved."""
+        self._continued, self._start = self._journal, (b"", b"")
+        self._again, self._incarnation = -1, 0
+        self._odometer = Odometer(self.robot, self._bounds)
+        self._warn(self._link.left, f"{self._link.left} at an unknown pose")
 
     def _put(self, kind: int, stamp_ns: int, payload: bytes) -> None:
         """Append to the file, unless the program repeats a call that the file has."""

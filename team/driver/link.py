@@ -63,7 +63,8 @@ class Link:
         self._up = threading.Event()
         self._tried = threading.Event()
         self._is_open = False
-        self._left = ""
+        self.left = ""
+        """Description of a stream that is set aside; empty: none."""
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
         self._failure: Exception | None = None
@@ -91,7 +92,7 @@ class Link:
             self._tried.wait(FIRST_S)
         with self._lock:
             self._is_open = True
-        return self._left
+        return self.left
 
     def close(self) -> None:
         """Publish the remaining messages and stop the thread."""
@@ -237,21 +238,13 @@ class Link:
         _LOG.warning("%s", self._node.warnings[-1])
 
     def _check_run(self) -> None:
-        """Set the stream of an earlier run aside, of which this run's robot has nothing.
-
-        Raises JournalError if the program has continued it before the team was reached.
-        """
+        """Set the stream of an earlier run aside, of which this run's robot has nothing."""
         journal, run = self._node.journal, self._node.run
         is_earlier = journal.run and run not in ("", journal.run)
         if not is_earlier or not journal.calls or self._node.delivered > (0, 0):
             return
         with self._lock:
-            if self._is_open:
-                raise JournalError(
-                    f"{journal.path} is of an earlier run of team {self._team}, and was continued "
-                    "before this run was reached"
-                )
-            fresh, self._left = replace_journal(
+            fresh, self.left = replace_journal(
                 journal,
                 f"is of an earlier run of team {self._team}",
                 journal.latency_ns,
@@ -259,6 +252,8 @@ class Link:
                 journal.start,
             )
             self._node.replace(fresh)
+            if self._is_open:
+                self._node.warnings.append(self.left)
 
     def _note_run(self) -> None:
         if self._node.run not in ("", self._node.journal.run):

@@ -391,8 +391,8 @@ def test_a_stream_that_an_earlier_run_received_is_not_delivered_to_the_next(tmp_
         robot.close()
 
 
-def test_a_stream_that_is_continued_where_no_team_is_does_not_enter_a_later_run(tmp_path):
-    options = {"team": "lab", "file": tmp_path / "r1.stream"}
+def test_a_stream_that_is_continued_where_no_team_is_begins_again_in_a_later_run(tmp_path):
+    options = {"team": "lab", "file": tmp_path / "r1.stream", "start": (1.0, 0.0, 0.0)}
     first = Driver("r1", connect="tcp/127.0.0.1:1", patience_s=0.0, **options)
     drive(first, range(5))
     first._journal.mark_run("first")
@@ -400,17 +400,25 @@ def test_a_stream_that_is_continued_where_no_team_is_does_not_enter_a_later_run(
     with router() as endpoint:
         robot = Driver("r1", connect="tcp/127.0.0.1:1", **options)
         drive(robot, range(5, 8))
+        earlier = robot._journal
         robot._link._connect = endpoint  # the run begins where the driver is
         with ZenohBus("lab", endpoint) as bus:
             bus.declare_alive("recorder")
             status = build.status(node="recorder", state="recording", figures={}, run="second")
             bus.publish(Outgoing(ch.STATUS, "recorder", status))
-            wait_until(lambda: robot._link.failure is not None)
-            with pytest.raises(DriverError, match=r"of an earlier run of team lab.*start it again"):
-                drive(robot, range(8, 9))
+            wait_until(lambda: robot._journal is not earlier)
+            with pytest.warns(DriverWarning, match="of an earlier run of team lab.* unknown pose"):
+                drive(robot, range(8, 12))
+            wait_until(lambda: robot._journal.run == "second")
+            start, *rest = messages(robot)
+            assert (start.incarnation, start.pose) == (2, b""), "it has moved since its start"
+            assert {each.incarnation for each in rest} == {2}
+            assert robot.path.with_name("r1.stream.1").exists()
             robot.close()
-            with pytest.warns(DriverWarning, match="is of an earlier run of team lab: it is now"):
-                Driver("r1", connect=endpoint, **options).close()
+            again = Driver("r1", connect=endpoint, **options)
+            drive(again, range(12, 14))
+            assert {each.incarnation for each in messages(again)} == {2}, "the same stream"
+            again.close()
 
 
 def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):

@@ -213,8 +213,8 @@ class _Gathering:
     def _arrived(self, robot: str, incarnation: int, submap: _Submap, wall_ns: int) -> None:
         clocks = self.published[robot, incarnation]
         first_ns, last_ns = clocks.of(submap.first_measurement), clocks.of(submap.last_measurement)
-        if first_ns is None or last_ns is None:
-            return  # partial log: the measurement precedes it
+        if not first_ns or not last_ns:
+            return  # partial log: the measurement precedes it; 0: recomputed, without wall time
         first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
         self.latencies[robot].append((submap.end_ns, first, last))
 

@@ -1,6 +1,6 @@
 """Draw a run as an animated GIF."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,8 +44,16 @@ def maps_over_time(maps: Iterable[m.FusedMap]) -> list[MapAt]:
     return sorted(found, key=lambda each: each.stamp_ns)
 
 
-def draw_film(evaluation: Evaluation, maps: Sequence[MapAt], path: FilePath) -> bool:
-    """Write the GIF of online paths, then the final map; False without a map."""
+def draw_film(
+    evaluation: Evaluation,
+    maps: Sequence[MapAt],
+    path: FilePath,
+    progress: Callable[[float], None] = lambda _: None,
+) -> bool:
+    """Write the GIF of online paths, then the final map; False without a map.
+
+    progress: receives the drawn share.
+    """
     from matplotlib.animation import PillowWriter
 
     evaluation = in_the_maps_frame(evaluation)
@@ -89,6 +97,7 @@ def draw_film(evaluation: Evaluation, maps: Sequence[MapAt], path: FilePath) -> 
             axis.set_xlabel("x [m]" + (f"; 95 % ellipses × {times}" if times > 1 else ""))
             axis.set_title(_words(evaluation, (now - first) * 1e-9, is_last=is_last), fontsize=10)
             writer.grab_frame()
+            progress((frame + 1) / (FRAMES + LAST_FRAMES))
     return True
 
 

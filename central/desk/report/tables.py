@@ -88,7 +88,9 @@ def summary_tables(evaluation: Evaluation) -> list[Table]:
 
 def terminal_table(sheet: Sheet) -> Table:
     """Compact table with wrapped cells."""
-    table = Table(caption=sheet.note or None, box=box.SIMPLE, padding=(0, 1, 0, 0))
+    table = Table(
+        caption=sheet.note or None, caption_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0)
+    )
     for heading in sheet.headings:
         side: JustifyMethod = "left" if heading in LEFT else "right"
         table.add_column(Text(heading), justify=side, overflow="fold")
@@ -156,10 +158,12 @@ def team_rows(evaluation: Evaluation) -> Rows:
             rows.append(("map NEES per dof", nees))
         shape = errors.shape
         if shape is not None:
-            nees = f"{shape.nees_per_landmark / 2.0:.2f}; {shape.coverage:.0%} within 95 %"
+            nees = f"{shape.nees_per_landmark / 2.0:.2f}; {100 * shape.coverage:.0f} % within 95 %"
             rows.append(("shape NEES per dof", nees))
         if not arbitrary:
-            rows.append(("landmarks within 95 %", f"{errors.coverage:.0%}, as the map lies"))
+            rows.append(
+                ("landmarks within 95 %", f"{100 * errors.coverage:.0f} %, as the map lies")
+            )
     rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f")))
     rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
     rows += _association_rows(evaluation)

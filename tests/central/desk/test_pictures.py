@@ -111,7 +111,10 @@ def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(run, tmp_path, monke
     maps = [decoded(s.payload, m.FusedMap) for s in log if s.key == ch.FINAL_MAP.key()]
     moving = {n: replace(r, online_path=r.smoothed_path) for n, r in run.robots.items()}
     path = tmp_path / "team.gif"
-    assert film.draw_film(replace(run, robots=moving), film.maps_over_time(maps), path)
+    done: list[float] = []
+    moved = replace(run, robots=moving)
+    assert film.draw_film(moved, film.maps_over_time(maps), path, done.append)
+    assert done == [0.25, 0.5, 0.75, 1.0]
     with Image.open(path) as drawn:
         assert drawn.format == "GIF"
         assert getattr(drawn, "n_frames", 1) > 1

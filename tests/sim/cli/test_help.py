@@ -25,12 +25,14 @@ def test_every_command_is_in_one_section_and_has_an_example_that_it_understands(
     assert sorted(named) == sorted(SHOWN)
     assert len(SECTIONS) == 5
     commands = [(name, each) for name, each in SHOWN.items() if not hasattr(each, "commands")]
-    for group in ("log", "experiment"):
+    for group in ("log", "map", "experiment"):
+        assert SHOWN[group].epilog.startswith(f"teamslam {group} ")
         commands += [(f"{group} {name}", each) for name, each in SHOWN[group].commands.items()]
     for name, each in commands:
         for line in each.epilog.splitlines():
             assert line.startswith(f"teamslam {name} ")
             assert unknown(line.removeprefix("teamslam ")) is None
+    assert RUN.invoke(app, ["view", "--help"]).output.splitlines()[0].endswith("view [OPTIONS] LOG")
 
 
 def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():

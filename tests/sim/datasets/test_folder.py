@@ -288,6 +288,7 @@ def two_robots(path: Path) -> Scenario:
 
 def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path):
     scenario = two_robots(tmp_path)
+    assert scenario.name == scenario.team == tmp_path.name
     assert [robot.id for robot in scenario.robots] == ["alice", "bob"]
     assert scenario.robots[0].motion == load("recorded").robots[0].motion
     assert len(with_options(scenario, robots=1).robots) == 1

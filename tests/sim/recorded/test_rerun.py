@@ -18,6 +18,7 @@ from teamslam.sim.cli.rerun import app
 from teamslam.sim.recorded.changed_run import Changes, changed_run
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.team.pairs import PAIRS
+from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats
@@ -262,6 +263,18 @@ def test_the_command_ends_with_1_on_a_difference_and_2_on_wrong_use(log, samples
         ["--noise", "range=2", "--noise", "range=3"],
     ):
         assert runner.invoke(app, ["rerun", str(log.path), *wrong]).exit_code == 2
+
+
+def test_a_recomputed_run_is_written_as_a_log_that_verifies_with_its_report(log, tmp_path):
+    out = tmp_path / "out"
+    words = ["rerun", str(log.path), "--without", "r2", "-o", str(out)]
+    for _ in range(2):
+        assert CliRunner().invoke(app, words).exit_code == 0
+    assert {"log.mcap", "log.mcap.1", "report.html", "maps.png"} <= {x.name for x in out.iterdir()}
+    found = open_log(out / "log.mcap")
+    assert all_equal(verify(found))
+    assert {ch.SUBMAP.owner(s.key) for s in found.samples((ch.SUBMAP,))} == {"r1"}
+    assert 'id="latency"' not in (out / "report.html").read_text(), "nothing was on its way"
 
 
 @pytest.mark.parametrize(
