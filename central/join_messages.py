@@ -267,21 +267,12 @@ def priors(
     for stream in sorted(requested):
         part = fold.latest_part(stream)
         if part in found:
-            message = translate.prior_message(
-                fused.stamp_ns,
-                *stream,
-                fold.next_sequence(part) - 1,
-                fused.digest,
-                found[part],
-                frame=fused.frame,
-                members=fused.members,
-                received=fused.heard,
-                withdrawn=len(fused.withdrawn),
-            )
+            last = fold.next_sequence(part) - 1
+            message = translate.prior_message(fused, stream, last, found[part])
         else:
             is_alone = gets_landmarks_alone(fold, shown, fused, stream)
             landmarks = _landmarks_alone(fold, shown) if is_alone else NO_LANDMARKS
-            message = translate.landmark_prior_message(*stream, fused, landmarks, fold.frame)
+            message = translate.landmark_prior_message(fused, stream, landmarks, fold.frame)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
 

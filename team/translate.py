@@ -1,7 +1,6 @@
 """Convert estimation values to messages and back: the only module that imports both."""
 
-from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -375,26 +374,27 @@ def landmarks_of(
     )
 
 
-def prior_message(
-    stamp_ns: int,
-    robot: str,
-    incarnation: int,
-    sequence: int,
-    digest: bytes,
-    prior: RobotPrior,
-    *,
-    frame: str,
-    members: Sequence[m.VersionEntry] = (),
-    received: int = 0,
-    withdrawn: int = 0,
-) -> m.Prior:
-    """Make the message of a robot's prior, in the team's frame."""
+def _prior(fused: m.FusedMap, stream: Stream, **fields: Any) -> m.Prior:
+    robot, incarnation = stream
     return m.Prior(
-        stamp_ns=stamp_ns,
+        stamp_ns=fused.stamp_ns,
         robot=robot,
         incarnation=incarnation,
+        digest=fused.digest,
+        members=fused.members,
+        heard=fused.heard,
+        withdrawn=len(fused.withdrawn),
+        **fields,
+    )
+
+
+def prior_message(fused: m.FusedMap, stream: Stream, sequence: int, prior: RobotPrior) -> m.Prior:
+    """Make the prior of a robot in the team's map, up to its submap `sequence`."""
+    robot, incarnation = stream
+    return _prior(
+        fused,
+        stream,
         sequence=sequence,
-        digest=digest,
         ids=from_ids(prior.ids),
         mean=from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
         covariance=joint_bytes(prior.covariance),
@@ -405,11 +405,7 @@ def prior_message(
             )
             for bias, value, sigma in prior.shared.biases
         ),
-        members=tuple(members),
-        heard=received,
-        withdrawn=withdrawn,
-        frame=frame,
-        in_team_frame=True,
+        frame=fused.frame,
     )
 
 
@@ -426,27 +422,18 @@ def prior_of(message: m.Prior) -> RobotPrior:
 
 
 def landmark_prior_message(
-    robot: str,
-    incarnation: int,
-    fused: m.FusedMap,
-    landmarks: LandmarkGaussian,
-    frame: Stream | None,
+    fused: m.FusedMap, stream: Stream, landmarks: LandmarkGaussian, frame: Stream | None
 ) -> m.Prior:
     """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one."""
     of_team = frame is not None and len(landmarks.ids) > 0
-    return m.Prior(
-        stamp_ns=fused.stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
+    return _prior(
+        fused,
+        stream,
         sequence=-1,
-        digest=fused.digest,
         ids=from_ids(landmarks.ids),
         mean=from_floats(landmarks.means.ravel()),
         covariance=joint_bytes(landmarks.covariance) if of_team else b"",
-        members=fused.members,
-        heard=fused.heard,
-        withdrawn=len(fused.withdrawn),
-        frame=frame_name(*(frame if of_team and frame else (robot, incarnation))),
+        frame=frame_name(*(frame if of_team and frame else stream)),
         in_team_frame=False,
     )
 

@@ -92,12 +92,13 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
     local = local_map(ids, seed)
     shared = SubmapCorrection(2.5, (("bearing", 0.01, 0.001), ("range_scale", -0.02, 0.003)))
     prior = RobotPrior(local.end_pose, local.ids, local.landmarks, local.covariance, shared)
-    there = over_the_wire(translate.prior_message(7, "r1", 1, 3, b"its name", prior, frame="r1/1"))
+    fused = build.fused_map(digest=b"its name", means=b"")
+    there = over_the_wire(translate.prior_message(fused, ("r1", 1), 3, prior))
     found = translate.prior_of(there)
     for value, expected in zip(found[:-1], prior[:-1], strict=True):
         assert value.tobytes() == np.ascontiguousarray(expected).tobytes()
     assert found.shared == shared
-    assert (there.sequence, there.digest) == (3, b"its name")
+    assert (there.sequence, there.digest, there.frame) == (3, b"its name", "r1/1")
 
 
 @pytest.mark.parametrize("covariance", [None, np.diag([0.25, 0.5, 0.125])])
