@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from teamslam.team.config import Sensor
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose, tangent
-from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)
@@ -27,16 +26,9 @@ def initial_state(pose: Pose) -> DeadReckoning:
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 
-def filter_step(
-    state: DeadReckoning,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-) -> DeadReckoning:
+def filter_step(state: DeadReckoning, step: RobotStep) -> DeadReckoning:
     """Compose the pose with the increment."""
-    return DeadReckoning(state.pose.then(increment))
+    return DeadReckoning(state.pose.then(step.increment))
 
 
 def pose_gaussian(state: DeadReckoning) -> PoseGaussian:

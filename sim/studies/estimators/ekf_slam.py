@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from teamslam.sim.studies.estimators.innovation import joint_innovation, slots_of
-from teamslam.sim.studies.estimators.robot_step import variances
+from teamslam.sim.studies.estimators.robot_step import RobotStep, variances
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.models import NEAREST_M, Increment
+from teamslam.team.estimation.models import NEAREST_M
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
@@ -39,7 +38,7 @@ Variances = tuple[float, float, float]
 NO_CLAIM = np.empty((1, 0))
 
 
-def step(
+def advance(
     mean: Float[np.ndarray, " n"],
     P: Float[np.ndarray, "n n"],
     known: int,
@@ -235,59 +234,36 @@ def initial_state(pose: Pose) -> EkfSlam:
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
-def filter_step(
-    state: EkfSlam,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-) -> EkfSlam:
+def filter_step(state: EkfSlam, step: RobotStep) -> EkfSlam:
     """Move, update by all known landmarks at once, then place the new ones.
 
     Further measurements of a new landmark update it. Raises NotACovarianceError.
     """
-    ids_after, slots, first = slots_of(state.ids, ids)
+    ids_after, slots, first = slots_of(state.ids, step.ids)
     n = 3 + 2 * len(ids_after)
     mean, P = np.empty(n), np.empty((n, n))
     known = len(state.mean)
     mean[:known] = state.mean
     P[:known, :known] = state.covariance
-    sound = step(
+    sound = advance(
         mean,
         P,
         len(state.ids),
-        increment.mean,
-        increment.covariance,
+        step.increment.mean,
+        step.increment.covariance,
         slots,
         first,
-        np.column_stack((ranges, bearings)),
-        variances(sensor),
+        np.column_stack((step.ranges, step.bearings)),
+        variances(step.sensor),
     )
     if not sound:
         raise NotACovarianceError("the prediction of measurements", "not positive definite")
     return EkfSlam(ids_after, mean, P)
 
 
-def innovation(
-    state: EkfSlam,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-) -> Innovation:
+def innovation(state: EkfSlam, step: RobotStep) -> Innovation:
     """NIS of the used measurements."""
-    return joint_innovation(
-        landmarks=state.ids,
-        mean=state.mean,
-        covariance=state.covariance,
-        increment=increment,
-        sensor=sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-    )
+    return joint_innovation(state.ids, state.mean, state.covariance, step)
 
 
 def pose_gaussian(state: EkfSlam) -> PoseGaussian:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
 from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.core import mean_direction
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from teamslam.team.estimation.models import Increment
 from teamslam.team.shapes import Float, Int64
 
 
@@ -21,7 +21,8 @@ from teamslam.team.shapes import Float, Int64
 class FastSlamMl:
     """M particles with C landmark slots, of which the first counts[m] are used.
 
-    seen: detections per slot. took: slot of each detection, by particle.
+    seen: detections per slot. took: slot of each detection, by particle. resample_below: relative
+    effective sample size below which a step resamples.
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -31,9 +32,12 @@ class FastSlamMl:
     seen: Int64[np.ndarray, "M C"]
     counts: Int64[np.ndarray, " M"]
     took: Int64[np.ndarray, "M N"]
+    resample_below: float
 
 
-def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]) -> FastSlamMl:
+def initial_state(
+    poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"], resample_below: float
+) -> FastSlamMl:
     """Make particles without landmarks; logs: of the weights."""
     particles = len(poses)
     return FastSlamMl(
@@ -44,31 +48,25 @@ def initial_state(poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"]
         seen=np.zeros((particles, 16), np.int64),
         counts=np.zeros(particles, np.int64),
         took=np.empty((particles, 0), np.int64),
+        resample_below=resample_below,
     )
 
 
-def filter_step(
-    state: FastSlamMl,
-    increment: Increment,
-    sensor: Sensor,
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    resample_below: float,
-    generator: np.random.Generator,
-    gate: float = GATE,
-) -> FastSlamMl:
+def filter_step(state: FastSlamMl, step: RobotStep, generator: np.random.Generator) -> FastSlamMl:
     """Move, associate, update and resample."""
-    values, vectors = np.linalg.eigh(increment.covariance)
+    values, vectors = np.linalg.eigh(step.increment.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    drawn = increment.mean + dense.product(generator.standard_normal((len(state.poses), 3)), root.T)
+    drawn = step.increment.mean + dense.product(
+        generator.standard_normal((len(state.poses), 3)), root.T
+    )
     s, c = core.sin_and_cos(state.poses[:, 2])
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
-    state = _make_room(replace(state, poses=poses), len(ranges))
+    state = _make_room(replace(state, poses=poses), len(step.ids))
     scan = _Scan(state)
-    for r, b in zip(ranges.tolist(), bearings.tolist(), strict=True):
-        scan.take(r, b, sensor, gate)
-    return _resample(scan.state(), resample_below, generator)
+    for r, b in zip(step.ranges.tolist(), step.bearings.tolist(), strict=True):
+        scan.take(r, b, step.sensor)
+    return _resample(scan.state(), generator)
 
 
 class _Scan:
@@ -80,7 +78,7 @@ class _Scan:
         self._free = np.ones(state.seen.shape, np.bool_)
         self._took: list[Int64[np.ndarray, " M"]] = []
 
-    def take(self, r: float, b: float, sensor: Sensor, gate: float) -> None:
+    def take(self, r: float, b: float, sensor: Sensor) -> None:
         """Assign a detection in each particle to its likeliest free landmark, or a new one."""
         x, y, heading = self._state.poses.T
         particles = np.arange(len(x))
@@ -107,9 +105,9 @@ class _Scan:
         ) / determinant
         likely = -0.5 * squared - 0.5 * core.log(determinant) - core.log(2.0 * np.pi)
         used = np.arange(self._means.shape[1]) < self._counts[:, None]
-        likely = np.where(used & self._free & (squared < gate), likely, -np.inf)
+        likely = np.where(used & self._free & (squared < GATE), likely, -np.inf)
         best = likely.argmax(axis=1)
-        edge = -0.5 * gate - 0.5 * core.log(np.linalg.det(R)) - core.log(2.0 * np.pi)
+        edge = -0.5 * GATE - 0.5 * core.log(np.linalg.det(R)) - core.log(2.0 * np.pi)
         old = likely[particles, best] > edge
         self._logs += np.where(old, likely[particles, best], edge)
         place = np.where(old, best, self._counts)
@@ -181,9 +179,9 @@ def _weights(state: FastSlamMl) -> Float[np.ndarray, " M"]:
     return np.asarray(weights / weights.sum())
 
 
-def _resample(state: FastSlamMl, below: float, generator: np.random.Generator) -> FastSlamMl:
+def _resample(state: FastSlamMl, generator: np.random.Generator) -> FastSlamMl:
     weights, m = _weights(state), len(state.poses)
-    if 1.0 / float(dense.product(weights, weights)) >= below * m:
+    if 1.0 / float(dense.product(weights, weights)) >= state.resample_below * m:
         return state
     at = (np.arange(m) + generator.random()) / m
     chosen = np.minimum(np.searchsorted(np.cumsum(weights), at), m - 1)

@@ -4,16 +4,14 @@ W. Xu, sections 4.2 and 4.3. The reset makes covariances far too small. Correcte
 initial covariance follows from the measurement (thesis: 30 m), and weights restart with each step.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.core import moments
-from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float, UInt32
 
@@ -24,6 +22,7 @@ class ThesisState:
 
     pose: (x [m], y [m], theta [rad]). pose_covariance: of the last step's particles, may be
     singular. ids: strictly ascending. landmarks: [m]; covariances: [m²].
+    particles: their number in a step.
     """
 
     pose: Pose
@@ -31,43 +30,26 @@ class ThesisState:
     ids: UInt32[np.ndarray, " L"]
     landmarks: Float[np.ndarray, "L 2"]
     covariances: Float[np.ndarray, "L 2 2"]
+    particles: int
 
 
-def initial_state(pose: Pose) -> ThesisState:
+def initial_state(pose: Pose, particles: int) -> ThesisState:
     """Start at an exact pose without landmarks."""
-    return ThesisState(
-        pose, np.zeros((3, 3)), np.empty(0, np.uint32), np.empty((0, 2)), np.empty((0, 2, 2))
-    )
+    none = np.empty((0, 2)), np.empty((0, 2, 2))
+    return ThesisState(pose, np.zeros((3, 3)), np.empty(0, np.uint32), *none, particles)
 
 
-def filter_step(
-    state: ThesisState,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    particles: int,
-    generator: np.random.Generator,
-) -> ThesisState:
+def filter_step(state: ThesisState, step: RobotStep, generator: np.random.Generator) -> ThesisState:
     """Sample poses about the mean, update and weigh (FastSLAM 1.0), reset to eq. 4.5-4.6.
 
     Unmeasured landmarks keep their bits.
     """
-    after, _ = fastslam.filter_step(
-        particles=reset(state, ids, particles),
-        increment=increment,
-        sensor=sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        proposal="fastslam1",
-        generator=generator,
-    )
+    drawn = reset(state, step.ids, state.particles)
+    after = step.fastslam(drawn, "fastslam1", generator)
     mean, P = moments(after.poses, core.exp(after.log_weights), after.means, after.covariances, 1.0)
     columns = 3 + 2 * np.arange(len(after.ids))[:, None] + np.arange(2)
     return absorb_map(
-        ThesisState(mean[:3], P[:3, :3], state.ids, state.landmarks, state.covariances),
+        replace(state, pose=mean[:3], pose_covariance=P[:3, :3]),
         after.ids,
         mean[3:].reshape(-1, 2),
         P[columns[:, :, None], columns[:, None, :]],
@@ -98,10 +80,9 @@ def absorb_map(
     others = ~np.isin(state.ids, ids)
     merged = np.concatenate((state.ids[others], ids))
     order = np.argsort(merged)
-    return ThesisState(
-        state.pose,
-        state.pose_covariance,
-        merged[order],
-        np.concatenate((state.landmarks[others], landmarks))[order],
-        np.concatenate((state.covariances[others], covariances))[order],
+    return replace(
+        state,
+        ids=merged[order],
+        landmarks=np.concatenate((state.landmarks[others], landmarks))[order],
+        covariances=np.concatenate((state.covariances[others], covariances))[order],
     )

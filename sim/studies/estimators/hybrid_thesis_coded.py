@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float, UInt32
 
@@ -39,30 +38,15 @@ def initial_state(pose: Pose, particles: int) -> CodedState:
     return CodedState(at, at)
 
 
-def filter_step(
-    state: CodedState,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    generator: np.random.Generator,
-) -> CodedState:
+def filter_step(state: CodedState, step: RobotStep, generator: np.random.Generator) -> CodedState:
     """Move, multiply the weights, update the landmarks, set all to the mean."""
     known = len(state.particles.ids)
-    drawn, _ = fastslam.filter_step(
-        particles=state.particles,
-        increment=increment,
-        sensor=sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        proposal="fastslam1",
-        generator=generator,
-    )
+    drawn = step.fastslam(state.particles, "fastslam1", generator)
     for slot in range(known, len(drawn.ids)):
-        first = int(np.flatnonzero(ids == drawn.ids[slot])[0])
-        drawn.covariances[:, slot] = _at_first(drawn.poses, ranges[first], bearings[first])
+        first = int(np.flatnonzero(step.ids == drawn.ids[slot])[0])
+        drawn.covariances[:, slot] = _at_first(
+            drawn.poses, step.ranges[first], step.bearings[first]
+        )
     pose, landmarks = pose_moments(drawn).mean, landmark_moments(drawn)
     rows = np.searchsorted(landmarks.ids, drawn.ids)
     count = len(drawn.poses)

@@ -7,39 +7,34 @@ import math
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import CoreErrors, cholesky_factor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.models import Increment, noise, noise_of
-from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.models import noise, noise_of
 from teamslam.team.estimation.se2 import compose, tangent, wrapped
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 
-def innovation(
-    particles: Particles,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    own: Own | None = None,
-) -> Innovation:
+def innovation(particles: Particles, step: RobotStep) -> Innovation:
     """ν = z − ẑ of one keyframe's measurements, with their joint predictive covariance.
 
     Moments of the mixture Σ wᵢ N(ẑᵢ, Sᵢ) that the particles before predict for known landmarks:
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
         S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ, bearings on the circle.
-    own: the measurements' noises; R is white. Raises NotACovarianceError.
+    Noises are the measurements' own, or the sensor's; R is white. Raises NotACovarianceError.
     """
-    noises = unclaimed(len(ids)) if own is None else own
     with CoreErrors():
-        window = core.Window.of_particles(*particles.arrays, noise_of(sensor))
+        window = core.Window.of_particles(*particles.arrays, noise_of(step.sensor))
         squared, error, S = window.innovation(
-            increment.mean, increment.covariance, ids, ranges, bearings, noises
+            step.increment.mean,
+            step.increment.covariance,
+            step.ids,
+            step.ranges,
+            step.bearings,
+            step.claims,
         )
     return _innovation_of(squared, error, S) if len(error) else NOTHING
 
@@ -48,11 +43,7 @@ def joint_innovation(
     landmarks: UInt32[np.ndarray, " L"],
     mean: Float[np.ndarray, " N"],
     covariance: Float[np.ndarray, "N N"],
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
+    step: RobotStep,
 ) -> Innovation:
     """As `innovation`, of one Gaussian over pose and landmarks, such as an EKF's.
 
@@ -60,32 +51,32 @@ def joint_innovation(
     F = ∂(pose ∘ mean)/∂pose; G = blkdiag(R(θ'), 1). mean: (x, y, θ), then `landmarks`; N = 3 + 2
     L.
     """
-    _, at, _ = slots_of(landmarks, ids)
+    _, at, _ = slots_of(landmarks, step.ids)
     known = at < len(landmarks)
     if not known.any():
         return NOTHING
     read, slots = np.unique(at[known], return_inverse=True)
     columns = np.concatenate((np.arange(3), (3 + 2 * read[:, None] + np.arange(2)).ravel()))
     places = mean[columns[3:]].reshape(-1, 2)
-    pose = compose(mean[:3], increment.mean)
+    pose = compose(mean[:3], step.increment.mean)
     dx, dy = pose[:2] - mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     to_own = dense.product(tangent(pose[2]).T, F)
     m = 2 * len(slots)
     error, A, R = np.empty(m), np.zeros((m, len(columns))), np.empty(m)
-    measurements = np.column_stack((ranges, bearings))[known]
+    measurements = np.column_stack((step.ranges, step.bearings))[known]
     expected, by_pose, by_landmark = core.predict(pose, places[slots])
     for k, slot in enumerate(slots):
         rows = slice(2 * k, 2 * k + 2)
         distance, bearing = expected[k].tolist()
         error[rows] = measurements[k, 0] - distance, wrapped(measurements[k, 1] - bearing)
-        R[rows] = noise(sensor, distance)
+        R[rows] = noise(step.sensor, distance)
         A[rows, :3] = dense.product(by_pose[k], to_own)
         A[rows, 3 + 2 * slot : 5 + 2 * slot] = by_landmark[k]
     H = by_pose.reshape(m, 3)
     S = (
         dense.product(dense.product(A, covariance[np.ix_(columns, columns)]), A.T)
-        + dense.product(dense.product(H, increment.covariance), H.T)
+        + dense.product(dense.product(H, step.increment.covariance), H.T)
         + np.diag(R)
     )
     return _innovation_of(core.normalised_square(error, S), error, S)

@@ -73,17 +73,7 @@ def filter_step(
         )
     for turn in turns:
         index = state.robots.index(turn.robot)
-        after, _ = fastslam.filter_step(
-            particles=_particles_of(state, index),
-            increment=turn.increment,
-            sensor=turn.sensor,
-            ids=turn.ids,
-            ranges=turn.ranges,
-            bearings=turn.bearings,
-            proposal=state.proposal,
-            generator=generator,
-            own=turn.own if len(turn.own) else None,
-        )
+        after = turn.fastslam(_particles_of(state, index), state.proposal, generator)
         poses = state.poses.copy()
         poses[index] = after.poses
         state = replace(

@@ -12,14 +12,12 @@ import numpy as np
 from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators.ekf_slam import see
 from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
-from teamslam.sim.studies.estimators.robot_step import variances
+from teamslam.sim.studies.estimators.robot_step import RobotStep, variances
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float, UInt32
 
@@ -63,13 +61,7 @@ def initial_state_anywhere(
 
 
 def filter_step(
-    state: Localisation,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    generator: np.random.Generator,
+    state: Localisation, step: RobotStep, generator: np.random.Generator
 ) -> Localisation:
     """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
 
@@ -79,29 +71,22 @@ def filter_step(
     thin = state.resample_below * len(cloud.poses)
     if fastslam.effective_sample_size(cloud.log_weights) < thin:
         cloud, _ = fastslam.resampled(cloud, generator)
-    cloud = fastslam.propagated(cloud, increment, generator)
-    mapped = np.isin(ids, state.ids)
+    cloud = fastslam.propagated(cloud, step.increment, generator)
+    mapped = np.isin(step.ids, state.ids)
     log_weights = _weigh(
         cloud.log_weights,
         cloud.poses,
-        state.landmarks[np.searchsorted(state.ids, ids[mapped])],
-        np.column_stack((ranges[mapped], bearings[mapped])),
-        variances(sensor),
+        state.landmarks[np.searchsorted(state.ids, step.ids[mapped])],
+        np.column_stack((step.ranges[mapped], step.bearings[mapped])),
+        variances(step.sensor),
     )
     log_weights, _ = fastslam.normalise(log_weights)
     return replace(state, cloud=replace(cloud, log_weights=log_weights))
 
 
-def innovation(
-    state: Localisation,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-) -> Innovation:
+def innovation(state: Localisation, step: RobotStep) -> Innovation:
     """Innovation of the used measurements; valid for one mode."""
-    read = np.isin(state.ids, ids)
+    read = np.isin(state.ids, step.ids)
     count, known = len(state.cloud.poses), int(read.sum())
     on_map = replace(
         state.cloud,
@@ -109,7 +94,7 @@ def innovation(
         means=np.tile(state.landmarks[read], (count, 1, 1)),
         covariances=np.zeros((count, known, 3)),
     )
-    return innovations.innovation(on_map, increment, sensor, ids, ranges, bearings)
+    return innovations.innovation(on_map, step)
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:

@@ -10,6 +10,7 @@ import numpy as np
 
 from teamslam.sim.studies.estimators import ekf_slam
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
 from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.estimation import dense
@@ -34,59 +35,34 @@ def initial_state(pose: Pose) -> NearestNeighbour:
     return NearestNeighbour(ekf_slam.initial_state(pose))
 
 
-def filter_step(
-    state: NearestNeighbour,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    gate: float = GATE,
-) -> NearestNeighbour:
+def filter_step(state: NearestNeighbour, step: RobotStep) -> NearestNeighbour:
     """Move, associate detections (ids from UNNAMED on), and update at once."""
-    unnamed = np.flatnonzero(ids >= UNNAMED)
+    unnamed = np.flatnonzero(step.ids >= UNNAMED)
     if not len(unnamed):
-        slam = ekf_slam.filter_step(state.slam, increment, sensor, ids, ranges, bearings)
-        return replace(state, slam=slam)
-    slam, given = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, gate)
-    slam = ekf_slam.filter_step(slam, Increment.identity(), sensor, given, ranges, bearings)
+        return replace(state, slam=ekf_slam.filter_step(state.slam, step))
+    slam, given = _move_and_name(state.slam, step)
+    slam = ekf_slam.filter_step(slam, step._replace(increment=Increment.identity(), ids=given))
     return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
 
 
-def innovation(
-    state: NearestNeighbour,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-) -> Innovation:
+def innovation(state: NearestNeighbour, step: RobotStep) -> Innovation:
     """Innovation of the used measurements."""
-    if (ids >= UNNAMED).any():
-        _, ids = _move_and_name(state.slam, increment, sensor, ids, ranges, bearings, GATE)
-    return ekf_slam.innovation(state.slam, increment, sensor, ids, ranges, bearings)
+    if (step.ids >= UNNAMED).any():
+        step = step._replace(ids=_move_and_name(state.slam, step)[1])
+    return ekf_slam.innovation(state.slam, step)
 
 
-def _move_and_name(
-    slam: EkfSlam,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    gate: float,
-) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
-    slam = ekf_slam.filter_step(slam, increment, sensor, ids[:0], ranges[:0], bearings[:0])
-    unnamed = np.flatnonzero(ids >= UNNAMED)
-    given = ids.copy()
-    given[unnamed] = _associate(slam, sensor, gate, ranges[unnamed], bearings[unnamed])
+def _move_and_name(slam: EkfSlam, step: RobotStep) -> tuple[EkfSlam, UInt32[np.ndarray, " n"]]:
+    slam = ekf_slam.filter_step(slam, step.blind)
+    unnamed = np.flatnonzero(step.ids >= UNNAMED)
+    given = step.ids.copy()
+    given[unnamed] = _associate(slam, step.sensor, step.ranges[unnamed], step.bearings[unnamed])
     return slam, given
 
 
 def _associate(
     slam: EkfSlam,
     sensor: Sensor,
-    gate: float,
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
 ) -> UInt32[np.ndarray, " n"]:
@@ -98,7 +74,7 @@ def _associate(
     off = np.column_stack((ranges, bearings))[:, None] - predicted[None]
     off[..., 1] = np.remainder(off[..., 1] + np.pi, 2.0 * np.pi) - np.pi
     squared, determinants = compute_mahalanobis(off, spread[None] + R[:, None])
-    found = match_best_first(squared < gate, squared + core.log(determinants))
+    found = match_best_first(squared < GATE, squared + core.log(determinants))
     numbers = np.zeros(len(ranges), np.uint32)
     numbers[found != UNASSIGNED] = slam.ids[known[found[found != UNASSIGNED]]]
     new = np.flatnonzero(found == UNASSIGNED)

@@ -8,16 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
-from teamslam.team.config import Sensor
 from teamslam.team.core import moments
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.scans import Own
 from teamslam.team.estimation.se2 import Pose
-from teamslam.team.shapes import Float, UInt32
 
 
 @dataclass(frozen=True)
@@ -41,29 +38,14 @@ def initial_state(
 
 
 def filter_step(
-    state: PlainFastSlam,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    generator: np.random.Generator,
-    own: Own | None = None,
+    state: PlainFastSlam, step: RobotStep, generator: np.random.Generator
 ) -> PlainFastSlam:
     """Resample if needed, move, and update."""
-    particles, _ = fastslam.propagated_and_updated(
-        particles=state.particles,
-        increment=increment,
-        sensor=sensor,
-        ids=ids,
-        ranges=ranges,
-        bearings=bearings,
-        proposal=state.proposal,
-        resample_below=state.resample_below,
-        generator=generator,
-        own=own,
-    )
-    return replace(state, particles=particles)
+    particles = state.particles
+    thin = state.resample_below * len(particles.poses)
+    if fastslam.effective_sample_size(particles.log_weights) < thin:
+        particles, _ = fastslam.resampled(particles, generator)
+    return replace(state, particles=step.fastslam(particles, state.proposal, generator))
 
 
 def pose_gaussian(state: PlainFastSlam) -> PoseGaussian:

@@ -1,4 +1,4 @@
-"""One robot's input to an estimate over raw measurements."""
+"""One robot's input to a filter over raw measurements."""
 
 from typing import NamedTuple
 
@@ -8,6 +8,8 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, tangent
@@ -18,7 +20,7 @@ POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 
 
 class RobotStep(NamedTuple):
-    """Motion of a robot since its last turn, and the measurements at its end.
+    """Motion of a robot since its last step, and the measurements at its end, none by default.
 
     ranges [m] and bearings [rad] are calibrated; own: their covariances, or no rows.
     """
@@ -26,21 +28,27 @@ class RobotStep(NamedTuple):
     robot: str
     increment: Increment
     sensor: Sensor
-    ids: UInt32[np.ndarray, " n"]
-    ranges: Float[np.ndarray, " n"]
-    bearings: Float[np.ndarray, " n"]
+    ids: UInt32[np.ndarray, " n"] = np.empty(0, np.uint32)
+    ranges: Float[np.ndarray, " n"] = np.empty(0)
+    bearings: Float[np.ndarray, " n"] = np.empty(0)
     own: Own = unclaimed(0)
 
     @property
     def blind(self) -> "RobotStep":
         """The motion alone."""
-        none = slice(0)
-        return self._replace(
-            ids=self.ids[none],
-            ranges=self.ranges[none],
-            bearings=self.bearings[none],
-            own=self.own[none],
-        )
+        return RobotStep(*self[:3])
+
+    @property
+    def claims(self) -> Own:
+        """Covariances of the measurements, in as many rows."""
+        return self.own if len(self.own) else unclaimed(len(self.ids))
+
+    def fastslam(
+        self, particles: Particles, proposal: Proposal, generator: np.random.Generator
+    ) -> Particles:
+        """Move and update these particles."""
+        after, _ = fastslam.filter_step(particles, *self[1:6], proposal, generator, own=self.claims)
+        return after
 
 
 def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:

@@ -20,6 +20,7 @@ from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.estimators import localisation
 from teamslam.sim.studies.estimators.localisation import Localisation
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.experiments.curves import true_landmarks
 from teamslam.sim.studies.experiments.drawing import as_map, figure, spread
 from teamslam.sim.studies.experiments.experiment import (
@@ -218,19 +219,15 @@ def _run_of(world: Mapping[str, Any]) -> _Run:
 def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     """Predict over the stretch, weigh by one measurement, resample."""
     run = _run_of(world)
-    sensor = run.scenario.robots[0].sensor
-    random = generator(run.scenario.seed, run.scenario.robots[0].id, 0, 0)
-    nothing = np.empty(0)
-    none = np.empty(0, np.uint32)
+    robot = run.scenario.robots[0]
+    random = generator(run.scenario.seed, robot.id, 0, 0)
     state = replace(
         localisation.initial_state(run.start, PARTICLES, run.ids, run.landmarks), resample_below=0.0
     )
     blind = [state]
     for each in run.keyframes:
-        motion = each.keyframe.increment
-        blind.append(
-            localisation.filter_step(blind[-1], motion, sensor, none, nothing, nothing, random)
-        )
+        step = RobotStep(robot.id, each.keyframe.increment, robot.sensor)
+        blind.append(localisation.filter_step(blind[-1], step, random))
     last = run.keyframes[-1]
     true = run.truth[last.stamp_ns]
     # The landmark farthest to the left: as in figure 3.3.
@@ -240,9 +237,8 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         last.keyframe.ranges[k : k + 1],
         last.keyframe.bearings[k : k + 1],
     )
-    weighed = localisation.filter_step(
-        blind[-1], Increment.identity(), sensor, *measurement, random
-    )
+    step = RobotStep(robot.id, Increment.identity(), robot.sensor, *measurement)
+    weighed = localisation.filter_step(blind[-1], step, random)
     cloud, _ = fastslam.resampled(weighed.cloud, random)
     resampled = replace(weighed, cloud=cloud)
     found: Figures = {
@@ -286,9 +282,8 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
         keyframe = each.keyframe
         far = np.argsort(keyframe.ranges)[-1:]  # all of them would localise at once
         measurements = keyframe.ids[far], keyframe.ranges[far], keyframe.bearings[far]
-        state = localisation.filter_step(
-            state, keyframe.increment, config.sensor, *measurements, random
-        )
+        step = RobotStep(config.id, keyframe.increment, config.sensor, *measurements)
+        state = localisation.filter_step(state, step, random)
         if k in ANYWHERE_STEPS:
             true = run.truth[each.stamp_ns]
             found[str(k)] = _summary(state, true)

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import msgspec
 import numpy as np
 
-from teamslam.team.config import RobotConfig, Sensor
+from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import Became
@@ -113,15 +113,8 @@ def estimator_of(
 IN_MAP = "in the running map"
 IN_POSE = "in the running pose"
 """Dispositions of a measurement that such an estimator uses."""
-Step = tuple[Increment, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Motion since the last keyframe; landmark ids, ranges [m], bearings [rad] and own covariances
-(`teamslam.team.estimation.scans`) at its end.
-"""
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
-FilterStep = Callable[[Any, RobotConfig, Step, np.random.Generator], Any]
-Judged = Callable[
-    [Any, Increment, Sensor, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Innovation
-]
+FilterStep = Callable[[Any, RobotStep, np.random.Generator], Any]
 
 
 class Filter(NamedTuple):
@@ -136,7 +129,7 @@ class Filter(NamedTuple):
     filter_step: FilterStep
     pose: Callable[[Any], PoseGaussian]
     landmarks: Callable[[Any], LandmarkGaussian]
-    innovation: Judged
+    innovation: Callable[[Any, RobotStep], Innovation]
     absorbed: Callable[[Any, np.ndarray, np.ndarray, Matrix], Any] | None = None
     used: str = IN_MAP
     looks: bool = True

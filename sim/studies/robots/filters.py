@@ -17,19 +17,16 @@ from teamslam.sim.studies.estimators import (
     plain_fastslam,
 )
 from teamslam.sim.studies.estimators.fastslam_ml import FastSlamMl
-from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
 from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
-from teamslam.sim.studies.estimators.robot_step import uncertain_start
+from teamslam.sim.studies.estimators.robot_step import RobotStep, uncertain_start
 from teamslam.sim.studies.robots.estimator import (
     IN_POSE,
     Filter,
     FilterStep,
     InitialState,
-    Judged,
     KnownMap,
-    Step,
 )
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, Estimator, RobotConfig, Sensor
@@ -39,111 +36,83 @@ from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.robot.maps import InitialPose
 
+S = TypeVar("S")
 
-def with_association(plain: Filter) -> Filter:
+
+def _with_association(plain: Filter) -> Filter:
     """Use identities until the first scan without, none later.
 
     Particles keep their poses; landmarks mapped by identity are dropped.
     """
-    assert plain.particles is not None
-    particles_of = plain.particles
 
     def filter_step(
-        state: Any, config: RobotConfig, step: Step, generator: np.random.Generator
-    ) -> Any:
-        increment, ids, ranges, bearings, _ = step
-        if not isinstance(state, FastSlamMl):
-            if not (ids >= UNNAMED).any():
-                return plain.filter_step(state, config, step, generator)
-            particles = particles_of(state)
-            state = fastslam_ml.initial_state(particles.poses, particles.log_weights)
-        return fastslam_ml.filter_step(
-            state=state,
-            increment=increment,
-            sensor=config.sensor,
-            ranges=ranges,
-            bearings=bearings,
-            resample_below=config.front_end.resample_below,
-            generator=generator,
-        )
+        state: PlainFastSlam | FastSlamMl, step: RobotStep, generator: np.random.Generator
+    ) -> PlainFastSlam | FastSlamMl:
+        if isinstance(state, PlainFastSlam):
+            if not (step.ids >= UNNAMED).any():
+                return plain_fastslam.filter_step(state, step, generator)
+            poses, logs = state.particles.poses, state.particles.log_weights
+            state = fastslam_ml.initial_state(poses, logs, state.resample_below)
+        return fastslam_ml.filter_step(state, step, generator)
 
-    def pose(state: Any) -> PoseGaussian:
-        known = isinstance(state, FastSlamMl)
-        return fastslam_ml.pose_gaussian(state) if known else plain.pose(state)
+    def of_either(
+        named: Callable[[Any], S], unnamed: Callable[[FastSlamMl], S]
+    ) -> Callable[[Any], S]:
+        return lambda state: (unnamed if isinstance(state, FastSlamMl) else named)(state)
 
-    def landmarks(state: Any) -> LandmarkGaussian:
-        known = isinstance(state, FastSlamMl)
-        return fastslam_ml.landmark_gaussian(state) if known else plain.landmarks(state)
+    def innovation(state: PlainFastSlam | FastSlamMl, step: RobotStep) -> Innovation:
+        return NOTHING if isinstance(state, FastSlamMl) else plain.innovation(state, step)
 
-    def innovation(state: Any, *step: Any) -> Innovation:
-        return NOTHING if isinstance(state, FastSlamMl) else plain.innovation(state, *step)
-
-    def particles(state: Any) -> Particles:
-        known = isinstance(state, FastSlamMl)
-        return fastslam.at_poses(state.poses) if known else particles_of(state)
-
-    def took(state: Any) -> np.ndarray:
-        known = isinstance(state, FastSlamMl)
-        return fastslam_ml.slots_of_detections(state) if known else np.empty(0, np.int64)
-
+    assert plain.particles is not None
     return plain._replace(
         filter_step=filter_step,
-        pose=pose,
-        landmarks=landmarks,
+        pose=of_either(plain.pose, fastslam_ml.pose_gaussian),
+        landmarks=of_either(plain.landmarks, fastslam_ml.landmark_gaussian),
         innovation=innovation,
-        particles=particles,
-        took=took,
+        particles=of_either(plain.particles, lambda state: fastslam.at_poses(state.poses)),
+        took=of_either(lambda state: np.empty(0, np.int64), fastslam_ml.slots_of_detections),
     )
 
 
-def _random(filter_step: Callable[..., Any]) -> FilterStep:
-    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
-        increment, *scan, _ = step
-        return filter_step(state, increment, config.sensor, *scan, generator)
+def _of_particles(particles: Callable[[Any], Particles]) -> Callable[[Any, RobotStep], Innovation]:
+    return lambda state, step: innovation(particles(state), step)
 
-    return step
+
+def _started(
+    make: Callable[[np.ndarray], S],
+    advance: Callable[..., S],
+    initial: InitialPose,
+    *generator: np.random.Generator,
+) -> S:
+    """The state at an initial pose with its covariance, if any."""
+    at = np.zeros(3) if initial.pose is None else initial.pose
+    if initial.covariance is None:
+        return make(at)
+    start = RobotStep("", uncertain_start(at, initial.covariance), Sensor())
+    return advance(make(at), start, *generator)
 
 
 def _exact(
-    initial_state: Callable[..., Any], filter_step: Callable[..., Any]
+    make: Callable[[np.ndarray], S], advance: Callable[[S, RobotStep], S]
 ) -> tuple[InitialState, FilterStep]:
-    def start(
-        config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
-    ) -> Any:
-        return _with_start(initial_state, filter_step, initial)
-
-    def step(state: Any, config: RobotConfig, step: Step, generator: np.random.Generator) -> Any:
-        increment, *scan, _ = step
-        return filter_step(state, increment, config.sensor, *scan)
-
-    return start, step
-
-
-def _thesis_initial_state(
-    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
-) -> hybrid_thesis.ThesisState:
-    return hybrid_thesis.initial_state(np.zeros(3) if initial.pose is None else initial.pose)
-
-
-def _thesis_step(
-    state: hybrid_thesis.ThesisState,
-    config: RobotConfig,
-    step: Step,
-    generator: np.random.Generator,
-) -> hybrid_thesis.ThesisState:
-    increment, ids, ranges, bearings, _ = step
-    count = config.front_end.particles
-    return hybrid_thesis.filter_step(
-        state, increment, config.sensor, ids, ranges, bearings, count, generator
+    """Start and step of a filter without random numbers."""
+    return (
+        lambda config, initial, known, generator: _started(make, advance, initial),
+        lambda state, step, generator: advance(state, step),
     )
 
 
-def _of_particles(particles: Callable[[Any], Particles]) -> Judged:
-    return lambda state, *measurements: innovation(particles(state), *measurements)
+def _at_pose(make: Callable[[np.ndarray, int], Any]) -> InitialState:
+    """Start of a filter with exact initial poses and particles."""
+    return lambda config, initial, known, generator: make(
+        np.zeros(3) if initial.pose is None else initial.pose, config.front_end.particles
+    )
 
 
-def _without_claims(judged: Callable[..., Innovation]) -> Judged:
-    return lambda state, *measurements: judged(state, *measurements[:-1])
+def _absorb(absorb_map: Callable[..., Any]) -> Callable[[Any, np.ndarray, np.ndarray, Matrix], Any]:
+    return lambda state, ids, means, covariance: absorb_map(
+        state, ids, means, translate.blocks_of(covariance)
+    )
 
 
 def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
@@ -151,51 +120,6 @@ def _thesis_landmarks(state: hybrid_thesis.ThesisState) -> LandmarkGaussian:
     for i, block in enumerate(state.covariances):
         joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
     return LandmarkGaussian(state.ids, state.landmarks, joint)
-
-
-def _thesis_absorbed(
-    state: hybrid_thesis.ThesisState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
-) -> hybrid_thesis.ThesisState:
-    return hybrid_thesis.absorb_map(state, ids, means, translate.blocks_of(covariance))
-
-
-def _coded_initial_state(
-    config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
-) -> CodedState:
-    pose = np.zeros(3) if initial.pose is None else initial.pose
-    return hybrid_thesis_coded.initial_state(pose, config.front_end.particles)
-
-
-def _absorb_coded(
-    state: CodedState, ids: np.ndarray, means: np.ndarray, covariance: Matrix
-) -> CodedState:
-    return hybrid_thesis_coded.absorb_map(state, ids, means, translate.blocks_of(covariance))
-
-
-S = TypeVar("S")
-
-
-def _with_start(
-    initial_state: Callable[[np.ndarray], S],
-    filter_step: Callable[..., S],
-    initial: InitialPose,
-    *generator: np.random.Generator,
-) -> S:
-    at = np.zeros(3) if initial.pose is None else initial.pose
-    state = initial_state(at)
-    if initial.covariance is None:
-        return state
-    still, nothing = uncertain_start(at, initial.covariance), np.empty(0)
-    return filter_step(state, still, Sensor(), np.empty(0, np.uint32), nothing, nothing, *generator)
-
-
-def _plain_step(
-    state: PlainFastSlam, config: RobotConfig, step: Step, generator: np.random.Generator
-) -> PlainFastSlam:
-    increment, ids, ranges, bearings, own = step
-    return plain_fastslam.filter_step(
-        state, increment, config.sensor, ids, ranges, bearings, generator, own
-    )
 
 
 def _plain(proposal: Proposal) -> Filter:
@@ -209,11 +133,11 @@ def _plain(proposal: Proposal) -> Filter:
                 pose, front.particles, proposal, front.resample_below
             )
 
-        return _with_start(at, plain_fastslam.filter_step, initial, generator)
+        return _started(at, plain_fastslam.filter_step, initial, generator)
 
     return Filter(
         initial_state,
-        _plain_step,
+        plain_fastslam.filter_step,
         plain_fastslam.pose_gaussian,
         plain_fastslam.landmark_gaussian,
         _of_particles(lambda state: state.particles),
@@ -243,7 +167,7 @@ def _localisation_initial_state(
         state = localisation.initial_state(pose, front.particles, *known)
         return replace(state, resample_below=front.resample_below)
 
-    return _with_start(at, localisation.filter_step, initial, generator)
+    return _started(at, localisation.filter_step, initial, generator)
 
 
 FILTERS: Mapping[Estimator, Filter] = {
@@ -251,17 +175,17 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(dead_reckoning.initial_state, dead_reckoning.filter_step),
         dead_reckoning.pose_gaussian,
         dead_reckoning.landmark_gaussian,
-        lambda *measurements: NOTHING,
+        lambda state, step: NOTHING,
         used=IN_POSE,
         looks=False,
         maps=False,
     ),
     "localisation": Filter(
         _localisation_initial_state,
-        _random(localisation.filter_step),
+        localisation.filter_step,
         localisation.pose_gaussian,
         lambda state: NO_LANDMARKS,  # its map was given, not estimated
-        _without_claims(localisation.innovation),
+        localisation.innovation,
         used=IN_POSE,
         maps=False,
     ),
@@ -269,27 +193,27 @@ FILTERS: Mapping[Estimator, Filter] = {
         *_exact(nearest_neighbour.initial_state, nearest_neighbour.filter_step),
         lambda state: ekf_slam.pose_gaussian(state.slam),
         lambda state: ekf_slam.landmark_gaussian(state.slam),
-        _without_claims(nearest_neighbour.innovation),
+        nearest_neighbour.innovation,
         took=lambda state: np.concatenate((np.empty(0, np.int64), *state.took)),
     ),
-    "fastslam1": with_association(_plain("fastslam1")),
+    "fastslam1": _with_association(_plain("fastslam1")),
     "fastslam2": _plain("fastslam2"),
     "hybrid-thesis": Filter(
-        _thesis_initial_state,
-        _thesis_step,
+        _at_pose(hybrid_thesis.initial_state),
+        hybrid_thesis.filter_step,
         lambda state: PoseGaussian(state.pose, state.pose_covariance),
         _thesis_landmarks,
         _of_particles(lambda state: hybrid_thesis.reset(state, state.ids, 1)),
-        _thesis_absorbed,
+        _absorb(hybrid_thesis.absorb_map),
         joint=False,
     ),
     "hybrid-thesis-coded": Filter(
-        _coded_initial_state,
-        _random(hybrid_thesis_coded.filter_step),
+        _at_pose(hybrid_thesis_coded.initial_state),
+        hybrid_thesis_coded.filter_step,
         hybrid_thesis_coded.pose_gaussian,
         hybrid_thesis_coded.landmark_gaussian,
         _of_particles(lambda state: state.particles),
-        _absorb_coded,
+        _absorb(hybrid_thesis_coded.absorb_map),
         joint=False,
     ),
 }

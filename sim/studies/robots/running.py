@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR
-from teamslam.sim.studies.robots.estimator import Estimates, KnownMap, Step
+from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
+from teamslam.sim.studies.robots.estimator import Estimates, KnownMap
 from teamslam.sim.studies.robots.filters import FILTERS
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import (
@@ -24,7 +24,7 @@ from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.randomness import generator
-from teamslam.team.estimation.scans import Scan, unclaimed
+from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK
@@ -98,8 +98,7 @@ class RunningEstimator:
             self._take(keyframe)
         if not self._filter.looks:
             _, rest = self._segmenter.cut(stamp_ns)
-            nothing = np.empty(0)
-            self._advance(stamp_ns, rest, np.empty(0, np.uint32), nothing, nothing, unclaimed(0))
+            self._advance(stamp_ns, rest)
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
@@ -156,34 +155,25 @@ class RunningEstimator:
     def _took(self) -> int:
         return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
-    def _advance(
-        self,
-        stamp_ns: int,
-        increment: Increment,
-        ids: np.ndarray,
-        ranges: np.ndarray,
-        bearings: np.ndarray,
-        own: np.ndarray,
-    ) -> None:
-        step = increment, ids, ranges, bearings, own
+    def _advance(self, stamp_ns: int, increment: Increment, *scan: np.ndarray) -> None:
+        step = RobotStep(self._config.id, increment, self._config.sensor, *scan)
         after = self._after(step)
         if after is None:  # no solution with the measurements: the motion alone
-            self.unsolved += bool(len(ids))
-            after = self._after((increment, ids[:0], ranges[:0], bearings[:0], own[:0]))
+            self.unsolved += bool(len(step.ids))
+            after = self._after(step.blind)
         if after is not None:
             self._state, judged = after
             self._unsaid = self._unsaid.plus(judged)
         self.sequence += 1
         self.last_keyframe_ns = stamp_ns
 
-    def _after(self, step: Step) -> tuple[Any, Innovation] | None:
-        increment, *scan = step
+    def _after(self, step: RobotStep) -> tuple[Any, Innovation] | None:
         judged = NOTHING
         with np.errstate(all="ignore"):
             with suppress(NotACovarianceError):  # without an innovation
-                judged = self._filter.innovation(self._state, increment, self._config.sensor, *scan)
+                judged = self._filter.innovation(self._state, step)
             try:
-                state = self._filter.filter_step(self._state, self._config, step, self._generator)
+                state = self._filter.filter_step(self._state, step, self._generator)
                 pose = self._filter.pose(state)
             except (NotACovarianceError, np.linalg.LinAlgError):
                 return None

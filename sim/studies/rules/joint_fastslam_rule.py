@@ -11,9 +11,7 @@ from teamslam.sim.studies.estimators.joint_fastslam import JointFastSlam
 from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep, uncertain_start
 from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
-from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
-from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.wire.bus import Outgoing
@@ -45,7 +43,7 @@ class JointFastSlamCentre(MeasurementCentre):
         particles = self.config.particles
         self._state = joint_fastslam.initial_state(poses, particles, "fastslam1", RESAMPLE_BELOW)
         turns = [
-            _start_robot(name, uncertain_start(pose, covariance), self.models[name].sensor)
+            RobotStep(name, uncertain_start(pose, covariance), self.models[name].sensor)
             for name, (pose, covariance) in starts.items()
             if covariance is not None
         ]
@@ -73,8 +71,3 @@ class JointFastSlamCentre(MeasurementCentre):
 
     def _content(self, *, final: bool) -> MapContent:
         return MapContent(joint_fastslam.landmark_gaussian(self._state))
-
-
-def _start_robot(robot: str, start: Increment, sensor: Sensor) -> RobotStep:
-    nothing = np.empty(0)
-    return RobotStep(robot, start, sensor, np.empty(0, np.uint32), nothing, nothing)

@@ -2,6 +2,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from teamslam.sim.studies.estimators import dead_reckoning
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.models import Increment, increment_of
@@ -11,7 +12,6 @@ MOTION = MotionModel(
     "turn-then-drive", forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=np.deg2rad(3.0))
 )
 SENSOR = Sensor()
-NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
 START = np.array([3.0, -2.0, 2.5])
 noise = st.floats(-0.3, 0.3)
 component = st.floats(-2.0, 2.0)
@@ -22,10 +22,10 @@ increments = st.builds(
 )
 
 
-def reckoned(steps, start=START, measurements=NOTHING):
+def reckoned(steps, start=START, measurements=()):
     state = dead_reckoning.initial_state(start)
     for step in steps:
-        state = dead_reckoning.filter_step(state, step, SENSOR, *measurements)
+        state = dead_reckoning.filter_step(state, RobotStep("r1", step, SENSOR, *measurements))
     return state
 
 

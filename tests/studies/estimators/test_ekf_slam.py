@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from teamslam.sim.studies.estimators import ekf_slam
 from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
@@ -94,9 +95,10 @@ def test_a_step_is_the_textbooks_with_all_measurements_of_the_keyframe_at_once(s
     there = np.concatenate((compose(state.mean[:3], motion.mean), state.mean[3:]))
     measurements = [observed(there, k) + rng.normal(scale=[0.2, 0.03]) for k in slots]
     z = np.array(measurements)
-    after = ekf_slam.filter_step(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
+    step = RobotStep("r1", motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
+    after = ekf_slam.filter_step(state, step)
     mean, P, squared = textbook(state, motion, slots, measurements)
-    judged = ekf_slam.innovation(state, motion, SENSOR, state.ids[slots], z[:, 0], z[:, 1])
+    judged = ekf_slam.innovation(state, step)
     assert judged.dof == 2 * len(slots)
     assert judged.squared == pytest.approx(squared, rel=1e-5)
     np.testing.assert_allclose(after.mean, mean, atol=1e-7)
@@ -112,7 +114,7 @@ def test_a_first_sight_adds_the_landmark_with_its_cross_terms_and_changes_nothin
     state = some_state(rng)
     z = np.array([rng.uniform(2.0, 20.0), rng.uniform(-np.pi, np.pi)])
     new = np.array([33], np.uint32)
-    after = ekf_slam.filter_step(state, STANDING, SENSOR, new, z[:1], z[1:])
+    after = ekf_slam.filter_step(state, RobotStep("r1", STANDING, SENSOR, new, z[:1], z[1:]))
     n = len(state.mean)
     np.testing.assert_allclose(after.mean[:n], state.mean)
     np.testing.assert_allclose(after.covariance[:n, :n], state.covariance)
@@ -150,8 +152,9 @@ def short_run(seed, repeat):
         ids = np.repeat(seen.astype(np.uint32), repeat)
         z = np.repeat(z, repeat, axis=0)
         keyframe = ids, z[:, 0], wrap(z[:, 1])
-        judged = judged.plus(ekf_slam.innovation(state, motion, sensor, *keyframe))
-        state = ekf_slam.filter_step(state, motion, sensor, *keyframe)
+        step = RobotStep("r1", motion, sensor, *keyframe)
+        judged = judged.plus(ekf_slam.innovation(state, step))
+        state = ekf_slam.filter_step(state, step)
     local = ekf_slam.local_map(state)
     error = state_error(local.mean, np.concatenate((truth, landmarks[local.ids].ravel())))
     return nees(error, local.covariance), len(error), *judged
@@ -173,4 +176,4 @@ def test_a_state_whose_covariance_is_none_any_more_is_named_not_carried_on():
     broken = dataclasses.replace(state, covariance=state.covariance - np.eye(11))
     measurements = (state.ids[:1], np.array([9.0]), np.array([0.1]))
     with pytest.raises(NotACovarianceError, match="prediction of measurements"):
-        ekf_slam.filter_step(broken, STANDING, SENSOR, *measurements)
+        ekf_slam.filter_step(broken, RobotStep("r1", STANDING, SENSOR, *measurements))

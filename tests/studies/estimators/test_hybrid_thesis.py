@@ -3,6 +3,7 @@ import numpy as np
 from teamslam.sim.studies.estimators import hybrid_thesis, hybrid_thesis_coded
 from teamslam.sim.studies.estimators.hybrid_thesis import ThesisState
 from teamslam.sim.studies.estimators.hybrid_thesis_coded import CodedState
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import Increment
 
@@ -15,6 +16,7 @@ KNOWN = ThesisState(
     ids=np.array([2, 5, 8], np.uint32),
     landmarks=np.array([[9.0, 2.0], [-4.0, 7.0], [0.0, -6.0]]),
     covariances=np.array([np.diag([0.3, 0.2]), np.diag([0.5, 0.9]), np.diag([0.1, 0.1])]),
+    particles=10,
 )
 
 
@@ -22,24 +24,17 @@ def ids(*values):
     return np.array(values, np.uint32)
 
 
-def filter_step(state, motion, seen, ranges, bearings, particles=2000, seed=0):
-    return hybrid_thesis.filter_step(
-        state,
-        motion,
-        SENSOR,
-        ids(*seen),
-        np.array(ranges, float),
-        np.array(bearings, float),
-        particles,
-        np.random.default_rng(seed),
-    )
+def filter_step(state, motion, seen, ranges, bearings):
+    measurements = ids(*seen), np.array(ranges, float), np.array(bearings, float)
+    step = RobotStep("r1", motion, SENSOR, *measurements)
+    return hybrid_thesis.filter_step(state, step, np.random.default_rng(0))
 
 
 def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_does():
     offset = KNOWN.landmarks[1] - KNOWN.pose[:2]
     r = np.hypot(*offset)
     z = np.array([r + 0.3, np.arctan2(offset[1], offset[0]) - KNOWN.pose[2] + 0.02])
-    after = filter_step(KNOWN, STANDING, [5], z[:1], z[1:], particles=10)
+    after = filter_step(KNOWN, STANDING, [5], z[:1], z[1:])
     e = offset / r
     H = np.array([e, [-e[1] / r, e[0] / r]])
     S = H @ KNOWN.covariances[1] @ H.T + np.diag([0.04, 0.0009])
@@ -50,13 +45,13 @@ def test_standing_still_a_measurement_updates_its_landmark_as_the_kalman_filter_
 
 
 def test_a_new_landmark_has_the_covariance_of_its_measurement_and_of_the_steps_spread():
-    state = hybrid_thesis.initial_state(np.array([1.0, 2.0, 0.5]))
-    after = filter_step(state, STANDING, [4], [10.0], [0.2], particles=10)
+    state = hybrid_thesis.initial_state(np.array([1.0, 2.0, 0.5]), 5000)
+    after = filter_step(state, STANDING, [4], [10.0], [0.2])
     c, s = np.cos(0.7), np.sin(0.7)
     np.testing.assert_allclose(after.landmarks, [[1.0 + 10.0 * c, 2.0 + 10.0 * s]])
     G = np.array([[c, -10.0 * s], [s, 10.0 * c]])
     np.testing.assert_allclose(after.covariances[0], G @ np.diag([0.04, 0.0009]) @ G.T)
-    spread = filter_step(state, MOTION, [4], [10.0], [0.2], particles=5000)
+    spread = filter_step(state, MOTION, [4], [10.0], [0.2])
     across = np.array([-np.sin(0.8), np.cos(0.8)])
     # Range 10 m: bearing and heading noise add in variance across the line of sight.
     expected = 100.0 * (0.03**2 + 0.05**2) + 0.02**2
@@ -88,14 +83,10 @@ def run(steps: int, particles: int = 50, seed: int = 1) -> list[CodedState]:
     for k in range(1, steps + 1):
         offset = np.array([10.0 - k, 5.0])
         measurement = np.array([np.hypot(*offset)]), np.array([np.arctan2(offset[1], offset[0])])
-        state = hybrid_thesis_coded.filter_step(
-            state,
-            MOTION_HYBRID_THESIS_CODED,
-            SENSOR_HYBRID_THESIS_CODED,
-            ID,
-            *measurement,
-            generator,
+        step = RobotStep(
+            "r1", MOTION_HYBRID_THESIS_CODED, SENSOR_HYBRID_THESIS_CODED, ID, *measurement
         )
+        state = hybrid_thesis_coded.filter_step(state, step, generator)
         states.append(state)
     return states
 
@@ -115,15 +106,10 @@ def test_all_poses_and_landmarks_become_the_mean_and_covariances_stay_each_parti
 def test_a_new_landmark_begins_with_15_m_and_the_printed_matrix():
     generator = np.random.default_rng(1)
     started = hybrid_thesis_coded.initial_state(np.zeros(3), 4)
-    state = hybrid_thesis_coded.filter_step(
-        started,
-        Increment.identity(),
-        SENSOR_HYBRID_THESIS_CODED,
-        ID,
-        np.array([10.0]),
-        np.array([0.3]),
-        generator,
+    step = RobotStep(
+        "r1", STANDING, SENSOR_HYBRID_THESIS_CODED, ID, np.array([10.0]), np.array([0.3])
     )
+    state = hybrid_thesis_coded.filter_step(started, step, generator)
     s, c = np.sin(0.3), np.cos(0.3)
     Gz = np.array([[c, 10.0 * s], [s, 10.0 * c]])
     printed = Gz @ np.diag([15.0**2, 10.0 * np.pi / 18.0**2]) @ Gz.T

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from teamslam.sim.studies.estimators.innovation import innovation
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment, predicted
@@ -67,6 +68,6 @@ def by_differences(of, ids, measurements):
 def test_it_is_the_error_in_the_metric_of_the_mixtures_prediction(count):
     of = particles(count)
     error, S = by_differences(of, IDS, np.column_stack((RANGES, BEARINGS)))
-    found = innovation(of, INCREMENT, SENSOR, IDS, RANGES, BEARINGS)
+    found = innovation(of, RobotStep("r1", INCREMENT, SENSOR, IDS, RANGES, BEARINGS))
     assert found.dof == 6
     assert found.squared == pytest.approx(error @ np.linalg.solve(S, error), rel=1e-3)

@@ -32,8 +32,8 @@ def test_a_team_of_one_is_plain_fastslam_bit_for_bit(proposal, resample_below):
         plain_fastslam.initial_state(start["r1"], 50, proposal, resample_below),
         np.random.default_rng(0),
     )
-    for ((_, *turn),) in rounds:
-        plain = plain_fastslam.filter_step(plain, *turn[:-1], random)
+    for (turn,) in rounds:
+        plain = plain_fastslam.filter_step(plain, turn, random)
     for name in ("poses", "log_weights", "ids", "means", "covariances"):
         ours = getattr(joint, name)
         assert ours.tobytes() == getattr(plain.particles, name).tobytes()
@@ -59,8 +59,8 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
         for robot, pose in STARTS.items()
     }
     for turns in rounds:
-        for robot, *turn in turns:
-            alone[robot] = plain_fastslam.filter_step(alone[robot], *turn[:-1], random)
+        for turn in turns:
+            alone[turn.robot] = plain_fastslam.filter_step(alone[turn.robot], turn, random)
     product = sum(state.particles.log_weights for state in alone.values())
     np.testing.assert_allclose(joint.log_weights, fastslam.normalise(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):

@@ -8,6 +8,7 @@ import pytest
 
 from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators import localisation
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.hybrid_slam import fastslam
@@ -19,7 +20,6 @@ LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
 SENSOR = Sensor(range_sigma=0.8, range_sigma_per_m=0.02, bearing_sigma=0.15)
 MOTION = Increment(np.array([1.0, 0.1, 0.2]), np.diag([0.1, 0.05, 0.05]) ** 2)
 STANDING = Increment.identity()
-NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
 
 
 def wrap(angle):
@@ -67,8 +67,10 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
     low, high = np.array([-5.0, -5.0]), np.array([5.0, 5.0])
     state = localisation.initial_state_anywhere(low, high, 200_000, IDS, LANDMARKS, random)
     state = dataclasses.replace(state, resample_below=0.0)
-    state = localisation.filter_step(state, STANDING, SENSOR, IDS[:2], r1[:2], b1[:2], random)
-    state = localisation.filter_step(state, exact, SENSOR, IDS[2:], r2[2:], b2[2:], random)
+    first = RobotStep("r1", STANDING, SENSOR, IDS[:2], r1[:2], b1[:2])
+    state = localisation.filter_step(state, first, random)
+    second = RobotStep("r1", exact, SENSOR, IDS[2:], r2[2:], b2[2:])
+    state = localisation.filter_step(state, second, random)
     found, spread = localisation.pose_gaussian(state)
     sigma = np.sqrt(np.diag(P))
     effective = fastslam.effective_sample_size(state.cloud.log_weights)
@@ -90,8 +92,9 @@ def short_run(seed, repeat):
         ranges = ranges + sigma * random.standard_normal(3)
         bearings = wrap(bearings + 0.15 * random.standard_normal(3))
         keyframe = [np.repeat(part, repeat) for part in (IDS, ranges, bearings)]
-        judged = judged.plus(localisation.innovation(state, MOTION, SENSOR, *keyframe))
-        state = localisation.filter_step(state, MOTION, SENSOR, *keyframe, random)
+        step = RobotStep("r1", MOTION, SENSOR, *keyframe)
+        judged = judged.plus(localisation.innovation(state, step))
+        state = localisation.filter_step(state, step, random)
     pose = localisation.pose_gaussian(state)
     return nees(state_error(pose.mean, truth), pose.covariance), 3, *judged
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from teamslam.sim.studies.estimators import plain_fastslam
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import increment_of
@@ -16,8 +17,8 @@ PROPOSALS = ["fastslam1", "fastslam2"]
 def filtered(drive_, sensor, state, random, repeat=1):
     for (distance, turn), keyframe in zip(drive_.motions, drive_.keyframes, strict=True):
         measurements = (np.repeat(part, repeat) for part in keyframe)
-        increment = increment_of(ROBOT, 1.0, distance, turn)
-        state = plain_fastslam.filter_step(state, increment, sensor, *measurements, random)
+        step = RobotStep("r1", increment_of(ROBOT, 1.0, distance, turn), sensor, *measurements)
+        state = plain_fastslam.filter_step(state, step, random)
     return state
 
 

@@ -8,6 +8,7 @@ from teamslam.sim.studies.estimators import (
     localisation,
     plain_fastslam,
 )
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.robots.estimator import (
     NOTHING_KNOWN,
     AbsorbsMaps,
@@ -77,18 +78,17 @@ def by_hand(estimator, robot, start=None):
         "fastslam2": plain(front, "fastslam2"),
     }[estimator]  # fmt: skip
     state, more = initial_state(np.zeros(3)), (drawn,) if draws else ()
-    nothing = np.empty(0)
     if start is not None:
-        still = Increment(np.zeros(3), start)
-        none = np.empty(0, np.uint32)
-        state = filter_step(state, still, robot.sensor, none, nothing, nothing, *more)
+        still = RobotStep(robot.id, Increment(np.zeros(3), start), robot.sensor)
+        state = filter_step(state, still, *more)
     told, seen = STREAM.intervals, STREAM.landmark_detections
     for k in range(len(told.end_ns)):
         step = told.duration_ns[k] * 1e-9, told.forward[k], told.yaw_rate[k]
         rows = seen.rows(k)
         measurements = corrected(robot.sensor, seen.ranges[rows], seen.bearings[rows])
         increment = increment_of(robot.motion, *map(float, step))
-        state = filter_step(state, increment, robot.sensor, seen.ids[rows], *measurements, *more)
+        step = RobotStep(robot.id, increment, robot.sensor, seen.ids[rows], *measurements)
+        state = filter_step(state, step, *more)
     return of_pose(state), of_map(state)
 
 
