@@ -1,7 +1,7 @@
 """Track the presence and progress of each robot, and which the final map awaits."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from heapq import heappop, heappush
 from typing import Generic, TypeVar
 
@@ -120,9 +120,10 @@ class TeamAttendance:
     operator has ordered the live team to end.
     """
 
-    robots: dict[str, Attendance]
+    names: InitVar[Sequence[str]]
     has_received: HasReceived
     processed: Processed
+    robots: dict[str, Attendance] = field(init=False)
     world_end: m.End | None = None
     ends: list[m.End] = field(default_factory=list)
     now_ns: int = 0
@@ -137,12 +138,8 @@ class TeamAttendance:
     _of_all: tuple[object, ...] = field(default=(), init=False)
     _least: Least = field(default_factory=Least, init=False)
 
-    @classmethod
-    def of(
-        cls, robots: Sequence[str], has_received: HasReceived, processed: Processed
-    ) -> "TeamAttendance":
-        """Create a team's attendance."""
-        return cls({robot: Attendance() for robot in sorted(robots)}, has_received, processed)
+    def __post_init__(self, names: Sequence[str]) -> None:
+        self.robots = {robot: Attendance() for robot in sorted(names)}
 
     def admit(self, robot: str) -> None:
         """Add a robot to the team."""

@@ -58,7 +58,7 @@ class CentralNode:
         self.config = config
         self.announcement = announce_configuration("central", 0, 0, config)
         self.config_digest = self.announcement.digest
-        self.attendance = TeamAttendance.of(
+        self.attendance = TeamAttendance(
             robots, self.has_received, lambda stream: self.store.processed(stream)
         )
         self._door = Door(robots)

@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from teamslam.team.recording.inventory import Inventory
-from teamslam.team.recording.opening import LogFile
 from teamslam.team.recording.part_files import (
     JOINED,
     LOG_ID,
+    LogFile,
     joined_leftovers,
     next_number,
     open_part,

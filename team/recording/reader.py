@@ -15,8 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel as LogChannel
 from mcap.records import Schema
 
-from teamslam.team.recording.opening import LogFile, open_file
-from teamslam.team.recording.part_files import open_part, parts_of
+from teamslam.team.recording.part_files import LogFile, open_file, open_part, parts_of
 from teamslam.team.recording.records import (
     LARGEST_CHUNK,
     MALFORMED,

@@ -30,9 +30,9 @@ from teamslam.team.robot.ledger import Ledger, OnDisposition
 from teamslam.team.robot.maps import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.statements import MessageWriter
+from teamslam.team.robot.stream import StreamJudge
 from teamslam.team.robot.submaps import Submaps
 from teamslam.team.robot.warnings import slipped
-from teamslam.team.stream.judge import StreamJudge
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 

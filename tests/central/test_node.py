@@ -282,7 +282,7 @@ def done_attendance(robot: str, submaps: int) -> m.Done:
 
 class Looking:
     def __init__(self, robots: list[str]) -> None:
-        self.attendance = TeamAttendance.of(robots, self.dealt, self.count)
+        self.attendance = TeamAttendance(robots, self.dealt, self.count)
         self.here = dict.fromkeys(robots, 0)
 
     def count(self, stream: tuple[str, int]) -> int:

@@ -11,8 +11,7 @@ from teamslam.team.config import Bounds, RobotConfig
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from teamslam.team.estimation.scans import sensible
 from teamslam.team.rejection import UNMEASURED
-from teamslam.team.robot.stream import Inbox
-from teamslam.team.stream.judge import StreamJudge
+from teamslam.team.robot.stream import Inbox, StreamJudge
 from teamslam.team.wire import messages as m
 
 

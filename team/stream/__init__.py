@@ -1,1 +1,0 @@
-"""Order and check a robot's measurements before estimation."""
