@@ -356,7 +356,7 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         if row.first is not None:
             console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)
     if result.other_platform:
-        from teamslam.central.desk.verification.differences import RELATIVE
+        from teamslam.central.desk.verification.verification import RELATIVE
 
         differing = ", ".join(result.other_platform)
         note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"

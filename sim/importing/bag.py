@@ -4,14 +4,17 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
-from teamslam.sim.importing.bag_topics import UndecidedError, decide_topics, listing
+from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
 from teamslam.team.datum import Datum
-from teamslam.team.ros2.bags import Bag, opened_bag
+from teamslam.team.ros2.bags import Bag, Topic, opened_bag
 from teamslam.team.ros2.decoding import (
+    READERS,
     DamagedError,
     FixRecord,
     OdometryRecord,
@@ -20,10 +23,228 @@ from teamslam.team.ros2.decoding import (
     decode,
 )
 from teamslam.team.ros2.frames import Frames
-from teamslam.team.ros2.keys import moving_topics, static_topics
+from teamslam.team.ros2.keys import STATIC, moving_topics, static_topics
 from teamslam.team.ros2.owners import Owners
-from teamslam.team.ros2.topics import Topics
-from teamslam.team.ros2.translator import Translator
+from teamslam.team.ros2.topics import RobotTopics, Topics
+from teamslam.team.ros2.translator import TAG, Translator
+
+ODOMETRY = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped")
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+FIX = "sensor_msgs/msg/NavSatFix"
+WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
+FILTERED = ("filtered", "fused", "ekf", "ukf")
+"""Words for fixes that contain odometry."""
+PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
+"""Initial topic words that name a part of a robot, not a robot."""
+SAMPLED_MESSAGES = 2000
+"""Number of /tf messages searched for tags."""
+
+
+class UndecidedError(DatasetError):
+    """A bag's topics are ambiguous; the text has a remedy."""
+
+
+class Proposal(NamedTuple):
+    """Topics of each robot; others: further possible odometry; warnings: ambiguities."""
+
+    robots: dict[str, RobotTopics]
+    others: dict[str, list[str]]
+    warnings: list[str]
+
+
+def propose_topics(path: Path) -> str:
+    """Describe a bag's topics, with a proposed assignment file; raises BagError."""
+    with opened_bag(path) as bag:
+        return _question(path, bag, _proposed(bag, None))
+
+
+def propose_assignment(path: Path) -> str:
+    """Proposed assignment file of a bag's topics; raises BagError."""
+    with opened_bag(path) as bag:
+        found = _proposed(bag, None)
+        topics = [*listing(bag.topics).splitlines(), *found.warnings]
+        return "".join(f"# {line.strip()}\n" for line in topics) + as_toml(found)
+
+
+def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
+    """Topics of each robot by names and types; raises UndecidedError if ambiguous."""
+    found = _proposed(bag, robot)
+    if found.warnings:
+        raise UndecidedError(_question(path, bag, found))
+    return Topics(robots=found.robots)
+
+
+def _question(path: Path, bag: Bag, found: Proposal) -> str:
+    if found.warnings:
+        head = f"{path}: the topics are ambiguous.\n"
+    else:
+        head = f"{path}: `teamslam import {path} -o FOLDER` imports these topics as below.\n"
+    return (
+        head
+        + f"{listing(bag.topics)}\n"
+        + "".join(f"{doubt}\n" for doubt in found.warnings)
+        + ("To decide" if found.warnings else "To change the roles")
+        + ", write this into topics.toml:\n\n"
+        + as_toml(found)
+        + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml (where there is no "
+        "such file, this writes it)\n"
+    )
+
+
+def _proposed(bag: Bag, robot: str | None) -> Proposal:
+    found = bag.topics
+    tagged = _tags_in(bag)
+    bases = {topic.name: _base_in(bag, topic) for topic in found if topic.kind in ODOMETRY}
+    robots: dict[str, RobotTopics] = {}
+    others: dict[str, list[str]] = {}
+    warnings: list[str] = []
+    spaces = _spaces(found, tagged, bases)
+    everyones = [] if "" in spaces or None in spaces else _candidates(found, tagged, "")[1]
+    for space in spaces:
+        alone = space is None
+        odometry, detections, truth = _candidates(found, tagged, space)
+        detections = detections or everyones
+        name = _robot_name(_only_space(found) if space is None else space, robot if alone else None)
+        if len(odometry) != 1:
+            warnings.append(
+                f"{name}: {len(odometry)} topics may be its odometry" + _choice(odometry)
+            )
+        if not detections:
+            warnings.append(f"{name}: no topic with detections of landmarks")
+        fixes = [t.name for t in found if t.kind == FIX and (space in (None, _namespace(t.name)))]
+        fixes = [each for each in fixes if not has_word(each, FILTERED)] or fixes
+        if len(fixes) > 1:
+            warnings.append(f"{name}: {len(fixes)} topics may be its fixes: {', '.join(fixes)}")
+        if len(truth) > 1:
+            warnings.append(f"{name}: {len(truth)} topics may be its truth")
+        others[name] = odometry[1:]
+        robots[name] = RobotTopics(
+            odometry=odometry[0] if odometry else "/odom",
+            detections=tuple(detections),
+            fixes=fixes[0] if fixes else "",
+            truth=truth[0] if truth else "",
+            base_frame=(bases[odometry[0]] if odometry else "") or "base_link",
+        )
+    if not robots:
+        warnings.append("no topic with odometry")
+        robots[robot or "r1"] = RobotTopics(odometry="/odom", detections=("/detections",))
+    return Proposal(robots, others, warnings)
+
+
+def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
+    """Namespaces that are robots; None: all topics are one robot's.
+
+    They are one robot's if none has both odometry and detections, and all odometry has one frame.
+    """
+    spaces = sorted({_namespace(name) for name in bases})
+    if len(spaces) < 2:
+        return [None] if spaces else []
+    whole = [space for space in spaces if all(_candidates(topics, tagged, space)[:2])]
+    return [None] if not whole and len(set(bases.values())) == 1 else spaces
+
+
+def _only_space(topics: list[Topic]) -> str:
+    spaces = {_namespace(topic.name) for topic in topics if topic.kind in ODOMETRY}
+    return spaces.pop() if len(spaces) == 1 else ""
+
+
+def _base_in(bag: Bag, topic: Topic) -> str:
+    for raw in bag.messages([topic.name]):
+        try:
+            record = decode(raw.kind, raw.data, bag.store)
+        except DamagedError:
+            continue
+        return record.child.lstrip("/") if isinstance(record, OdometryRecord) else ""
+    return ""
+
+
+def _choice(odometry: list[str]) -> str:
+    if len(odometry) < 2:
+        return ""
+    return (
+        f", and one is used: {odometry[0]} is proposed. It should be the wheels' own: one that is "
+        "fused with landmarks, GPS or a map (the frame `map`) would count them twice, and jumps"
+    )
+
+
+def _candidates(
+    topics: list[Topic], tagged: set[str], space: str | None
+) -> tuple[list[str], list[str], list[str]]:
+    """Candidates for odometry (likeliest first), detections and truth in a namespace; None: all."""
+    here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
+    true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
+    odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
+    odometry.sort(
+        key=lambda name: (has_word(name, FUSED_WORDS), not has_word(name, WHEEL_WORDS), name)
+    )
+    other = (*ODOMETRY, *POSES, TRANSFORMS, FIX, "geometry_msgs/msg/TransformStamped")
+    detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
+    detections += [t.name for t in here if t.name in tagged]
+    return odometry, detections, true
+
+
+def _is_truth(topic: Topic) -> bool:
+    return has_word(topic.name, TRUTH_WORDS)
+
+
+def _namespace(topic: str) -> str:
+    """First part of /r1/odom; empty for /odom, /odometry/filtered and /wheel/odom."""
+    parts = topic.strip("/").split("/")
+    part = len(parts) > 1 and (parts[0].startswith("odom") or has_word(parts[0], PART_WORDS))
+    return parts[0] if len(parts) > 1 and not part else ""
+
+
+def _robot_name(space: str, robot: str | None) -> str:
+    cleaned = "".join(c if c.isalnum() else "_" for c in space.lower())[:32]
+    usable = cleaned and cleaned[0].isalpha() and cleaned.isascii()
+    return robot or (cleaned if usable else "r1")
+
+
+def _tags_in(bag: Bag) -> set[str]:
+    found = set()
+    for topic in bag.topics:
+        if topic.kind != TRANSFORMS or topic.name.rpartition("/")[2] == STATIC:
+            continue
+        for number, raw in enumerate(bag.messages([topic.name])):
+            if number == SAMPLED_MESSAGES:
+                break
+            try:
+                record = decode(raw.kind, raw.data, bag.store)
+            except DamagedError:
+                continue
+            assert isinstance(record, TransformsRecord)
+            if any(TAG.match(transform.child) for transform in record.transforms):
+                found.add(topic.name)
+                break
+    return found
+
+
+def listing(topics: list[Topic]) -> str:
+    """Describe a bag's topics, one per line, with remarks on unusable ones."""
+    lines = []
+    for topic in topics:
+        used = "" if topic.kind in READERS else "   (not read here)"
+        lines.append(f"  {topic.name}   {topic.kind}   {topic.messages} messages{used}")
+    return "\n".join(lines)
+
+
+def as_toml(found: Proposal) -> str:
+    """TOML file that assigns topics to robots."""
+    lines = []
+    for name, topics in found.robots.items():
+        either = "".join(f'   # or "{other}"' for other in found.others.get(name, ()))
+        detections = ", ".join(f'"{topic}"' for topic in topics.detections)
+        lines += [
+            f"[robots.{name}]",
+            f'odometry = "{topics.odometry}"{either}',
+            'use = "pose"           # or "twist": speeds that hold until the next message',
+            f"detections = [{detections}]",
+        ]
+        lines += [f'fixes = "{topics.fixes}"'] if topics.fixes else []
+        lines += [f'truth = "{topics.truth}"'] if topics.truth else []
+        lines += [f'base_frame = "{topics.base_frame}"', ""]
+    return "\n".join(lines)
 
 
 @dataclass

@@ -28,8 +28,7 @@ from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.bag import import_bag
-from teamslam.sim.importing.bag_topics import propose_assignment, propose_topics
+from teamslam.sim.importing.bag import import_bag, propose_assignment, propose_topics
 from teamslam.sim.importing.columns import MEASURED, ColumnMap, load_map
 from teamslam.sim.importing.files import import_files, map_by_names, read_files, trajectory
 from teamslam.sim.importing.proposal import propose_map, split_by_robot, write_proposal

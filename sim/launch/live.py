@@ -21,7 +21,7 @@ from teamslam.sim.launch.watch import DRIVERS, Watch, team_time
 from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:
-    from teamslam.sim.launch.truth import LiveErrors
+    from teamslam.sim.launch.watch import LiveErrors
 
 AHEAD_S = 10.0
 """Smallest reported lead of the world over the map [s]."""

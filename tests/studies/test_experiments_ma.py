@@ -6,7 +6,7 @@ import pytest
 from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.experiments import ma, ma_errors, ma_maps
+from teamslam.sim.studies.experiments import ma, ma_figures
 from teamslam.sim.studies.experiments.experiment import Options, Results
 from teamslam.sim.studies.experiments.runner import dataset
 
@@ -46,5 +46,5 @@ def test_the_last_error_of_the_map_is_the_mean_distance_of_its_landmarks(runs):
 
 
 def test_without_a_set_the_figures_say_where_to_get_one():
-    for experiment in (ma_errors.FIGURE_6A, ma_maps.FIGURE_5):
+    for experiment in (ma_figures.FIGURE_6A, ma_figures.FIGURE_5):
         assert "MRCLAM" in experiment.outcome(Options((1,)), Results({})).missing[0]

@@ -8,10 +8,9 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.errors import Path, associate_truth
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import Evaluation
-from teamslam.central.desk.evaluation.trajectories import associate_truth
 from teamslam.team.recording.reader import Log, LogError
 
 KINDS = ("smoothed", "online")

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from teamslam.central.desk.evaluation.errors import TrajectoryErrors, trajectory_errors
 from teamslam.central.desk.evaluation.history import History
 from teamslam.central.desk.evaluation.results import Evaluation
-from teamslam.central.desk.evaluation.trajectories import TrajectoryErrors, trajectory_errors
 from teamslam.central.desk.export.take_home import TakenHome
 from teamslam.central.desk.ledger import Ledger
 from teamslam.central.desk.paths import SmoothedPath

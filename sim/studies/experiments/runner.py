@@ -108,17 +108,17 @@ ENTRIES = (
         quick_seeds=1,
         seeds_in_all=2,
     ),
-    Entry("ma-3", "ma_maps:FIGURE_3", "Ma & Ma: dead reckoning and FastSLAM on UTIAS.", 1, 1),
+    Entry("ma-3", "ma_figures:FIGURE_3", "Ma & Ma: dead reckoning and FastSLAM on UTIAS.", 1, 1),
     Entry(
-        "ma-4a", "ma_errors:FIGURE_4A", "Ma & Ma: path, dead reckoning against FastSLAM.", 10, 1, 5
+        "ma-4a", "ma_figures:FIGURE_4A", "Ma & Ma: path, dead reckoning against FastSLAM.", 10, 1, 5
     ),
     Entry(
-        "ma-4b", "ma_errors:FIGURE_4B", "Ma & Ma: path error of FastSLAM, 1400 frames.", 10, 1, 5
+        "ma-4b", "ma_figures:FIGURE_4B", "Ma & Ma: path error of FastSLAM, 1400 frames.", 10, 1, 5
     ),
-    Entry("ma-4c", "ma_errors:FIGURE_4C", "Ma & Ma: landmark error of FastSLAM.", 10, 1, 5),
-    Entry("ma-5", "ma_maps:FIGURE_5", "Ma & Ma: paths of three and of five robots.", 1, 1),
-    Entry("ma-6a", "ma_errors:FIGURE_6A", "Ma & Ma: path, one robot against many.", 10, 1, 5),
-    Entry("ma-6b", "ma_errors:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 10, 1, 5),
+    Entry("ma-4c", "ma_figures:FIGURE_4C", "Ma & Ma: landmark error of FastSLAM.", 10, 1, 5),
+    Entry("ma-5", "ma_figures:FIGURE_5", "Ma & Ma: paths of three and of five robots.", 1, 1),
+    Entry("ma-6a", "ma_figures:FIGURE_6A", "Ma & Ma: path, one robot against many.", 10, 1, 5),
+    Entry("ma-6b", "ma_figures:FIGURE_6B", "Ma & Ma: landmarks, one robot against many.", 10, 1, 5),
     Entry("xu-3.5", "xu_localisation", "Thesis: particle-filter localisation on a known map."),
     Entry("xu-4.1", "xu_maps:FIGURE_4_1", "Thesis: the map of EKF-SLAM."),
     Entry("xu-4.2", "xu_maps:FIGURE_4_2", "Thesis: the map of FastSLAM."),

@@ -13,9 +13,8 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.errors import Path
+from teamslam.central.desk.evaluation.errors import Path, trajectory_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.evaluation.trajectories import trajectory_errors
 from teamslam.central.desk.export.tum import write_trajectories, write_tum
 from teamslam.sim.in_memory.team import run_team
 from tests.sim.logs import scenario, streams

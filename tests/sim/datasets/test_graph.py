@@ -9,10 +9,10 @@ from teamslam.sim.cli.entry import _advice
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.graph import graph_world, read_pyfg
 from teamslam.sim.datasets.graph_lines import read_graph
-from teamslam.sim.datasets.graph_writer import g2o_lines, isam_lines, pyfg_lines
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.recorded.export import g2o_lines, isam_lines, pyfg_lines
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.config import GraphWorld

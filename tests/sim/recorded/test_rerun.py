@@ -11,9 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central.desk.verification import verification
-from teamslam.central.desk.verification.differences import ARRAYS
 from teamslam.central.desk.verification.recorded import RerunError
-from teamslam.central.desk.verification.verification import Verification, verify
+from teamslam.central.desk.verification.verification import ARRAYS, Verification, verify
 from teamslam.sim.cli.rerun import app
 from teamslam.sim.recorded.changed_run import Changes, changed_run
 from teamslam.sim.scenarios.checks import ScenarioError
