@@ -44,19 +44,20 @@ Key = tuple[int, str, int, int]
 STORED_DIGESTS = 4
 
 
-class Members:
-    """Submaps by tick, with their inter-robot measurements and the digests of both.
+class FoldInputs:
+    """The set of submaps by ticks, with their inter-robot measurements and the digests of both,
+    initial poses and an operator's verdicts.
 
     Tick b has the submaps that end in (b·tick, (b + 1)·tick].
     """
 
-    def __init__(
-        self, tick_ns: int, least_sigma: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
-    ) -> None:
-        """File members. factor: on the covariances of submaps, as a saved map's contains it."""
-        self.tick_ns = tick_ns
-        self._factor = factor
-        self._least_sigma = least_sigma
+    def __init__(self, config: CentralConfig) -> None:
+        self.robots: set[str] = set()
+        self.tick_ns = round(config.tick_s * 1e9)
+        self._config = config
+        self._bounds_of_map = msgspec.structs.replace(
+            config.bounds, submap_landmarks=MOST_SAVED, extent_m=config.bounds.coordinate_m
+        )
         self._raised: set[Key] = set()
         self._ticks: dict[int, dict[Key, Submap]] = {}
         self._order: list[int] = []
@@ -65,126 +66,6 @@ class Members:
         self._own: dict[Key, OwnBiases] = {}
         self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
-
-    def add(
-        self,
-        submap: Submap,
-        digest: bytes,
-        sightings: Sequence[SightingFactor],
-        own: OwnBiases = NO_OWN,
-    ) -> int:
-        """File a submap with the `sightings` from it; return its tick.
-
-        own: the errors of single robots in a saved map.
-        """
-        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
-        tick = self.tick_of(submap.stamp_ns)
-        if tick not in self._ticks:
-            self._ticks[tick] = {}
-            insort(self._order, tick)
-        self._ticks[tick][key] = submap
-        self._digests[key] = digest
-        if sightings:
-            self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
-        if own.errors:
-            self._own[key] = own
-        self._made.pop(key, None)
-        self._raised.discard(key)
-        self._named = {at: each for at, each in self._named.items() if each[0] < tick}
-        return tick
-
-    def tick_of(self, end_ns: int) -> int:
-        """Return the tick of a submap that ends at this time."""
-        return (end_ns - 1) // self.tick_ns
-
-    def behind(self, after: float, last: float = math.inf) -> list[int]:
-        """List the ticks with members in (after, last], ascending."""
-        found = []
-        for tick in reversed(self._order):
-            if tick <= after:
-                break
-            if tick <= last:
-                found.append(tick)
-        return found[::-1]
-
-    def has(self, tick: int, gone: Collection[str]) -> bool:
-        """Whether a tick has a submap of a robot still in the team."""
-        return any(key[1] not in gone for key in self._ticks[tick])
-
-    def keys(self, tick: int, gone: Collection[str]) -> list[Key]:
-        """List the remaining robots' submaps of a tick in canonical order."""
-        return sorted(key for key in self._ticks[tick] if key[1] not in gone)
-
-    def contribution(self, key: Key) -> Contribution:
-        """Decode a submap, its covariance raised to the least."""
-        found = self._made.get(key)
-        if found is None:
-            found = translate.contribution_of(self._ticks[self.tick_of(key[0])][key])
-            local = found.local
-            if is_map(found.stream):
-                own = self._own.get(key, NO_OWN)
-                if own.errors:
-                    local, by_own = own.given(local)
-                    found = replace(found, own=own, by_own=by_own)
-                local = replace(local, covariance=local.covariance / self._factor)
-            else:
-                local = with_least_spread(local, self._least_sigma)
-                if local is not found.local:
-                    self._raised.add(key)
-            found = found if local is found.local else replace(found, local=local)
-            self._made[key] = found
-        return found
-
-    def raised(self, gone: Collection[str]) -> Mapping[str, int]:
-        """Count, by robot, the decoded submaps of raised covariance."""
-        robots = sorted(key[1] for key in self._raised if key[1] not in gone)
-        return Counter(robots)
-
-    def sightings(self, key: Key) -> tuple[InterRobotFactor, ...]:
-        """Return the inter-robot measurements from a submap."""
-        return self._sightings.get(key, ())
-
-    def concerns(self, tick: int, robot: str) -> bool:
-        """Whether a tick has a submap or an inter-robot measurement of a robot."""
-        return any(
-            key[1] == robot or any(each.teammate == robot for each in self.sightings(key))
-            for key in self._ticks[tick]
-        )
-
-    def digest(
-        self, before: tuple[bytes, ...], closed: float, last: float, gone: Collection[str]
-    ) -> bytes:
-        """Digest these parts and the members up to a tick, in canonical order; cached up to
-        `closed`.
-        """
-        until, digest = self._named.pop(before, (math.inf, Digest()))
-        if until > closed:
-            until, digest = -math.inf, Digest()
-            digest.update(*before)
-        digest.update(*self._digests_between(until, closed, gone))
-        self._named[before] = closed, digest
-        for oldest in list(self._named)[:-STORED_DIGESTS]:
-            del self._named[oldest]
-        whole = digest.copy()
-        whole.update(*self._digests_between(closed, last, gone))
-        return whole.value
-
-    def _digests_between(self, after: float, last: float, gone: Collection[str]) -> list[bytes]:
-        ticks = self.behind(after, last)
-        return [self._digests[key] for tick in ticks for key in self.keys(tick, gone)]
-
-
-class FoldInputs:
-    """The set of submaps by ticks, with initial poses and an operator's verdicts."""
-
-    def __init__(self, config: CentralConfig) -> None:
-        self.robots: set[str] = set()
-        self.tick_ns = round(config.tick_s * 1e9)
-        self._bounds = config.bounds
-        self._bounds_of_map = msgspec.structs.replace(
-            config.bounds, submap_landmarks=MOST_SAVED, extent_m=config.bounds.coordinate_m
-        )
-        self._members = Members(self.tick_ns, config.least_sigma, config.covariance_factor)
         self._starts: dict[Stream, InitialPoseFactor] = {}
         self._verdicts: set[Verdict] = set()
         self._tick_with: dict[tuple[str, int, int], int] = {}
@@ -204,13 +85,18 @@ class FoldInputs:
         own: OwnBiases = NO_OWN,
     ) -> int:
         """Add a submap with the inter-robot measurements from it; return the first tick that this
-        changes. own: see `Members.add`.
+        changes. own: the errors of single robots in a saved map.
 
         The first fix adds the station, before all of the team's time.
         """
-        tick = self._members.add(submap, digest, sightings, own)
+        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
+        tick = self._file(key, submap, digest)
+        if sightings:
+            self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
+        if own.errors:
+            self._own[key] = own
         self.robots.add(submap.robot)
-        self._tick_with[submap.robot, submap.incarnation, submap.sequence] = tick
+        self._tick_with[key[1:]] = tick
         if not self._has_station and any(each.teammate == GNSS for each in sightings):
             self._has_station = True
             tick = min(tick, self._add_known(*station()))
@@ -218,7 +104,23 @@ class FoldInputs:
 
     def _add_known(self, submap: Submap, start: InitialPoseFactor) -> int:
         self.add_start(start)
-        return self._members.add(submap, digest_of(encoded(submap)), ())
+        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
+        return self._file(key, submap, digest_of(encoded(submap)))
+
+    def _file(self, key: Key, submap: Submap, digest: bytes) -> int:
+        tick = self._tick_of(submap.stamp_ns)
+        if tick not in self._ticks:
+            self._ticks[tick] = {}
+            insort(self._order, tick)
+        self._ticks[tick][key] = submap
+        self._digests[key] = digest
+        self._made.pop(key, None)
+        self._raised.discard(key)
+        self._named = {at: each for at, each in self._named.items() if each[0] < tick}
+        return tick
+
+    def _tick_of(self, end_ns: int) -> int:
+        return (end_ns - 1) // self.tick_ns
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
         """Replace the verdicts; return the first tick that judges a changed one, else infinity."""
@@ -233,55 +135,93 @@ class FoldInputs:
         known = [tick for tick in ticks if tick is not None]
         return max(known) if len(known) == len(ticks) else None
 
+    # Ticks.
+
+    def ticks_after(
+        self, after: float, without: Collection[str] = (), last: float = math.inf
+    ) -> list[int]:
+        """List the ticks in (after, last] with a submap of any other robot, ascending."""
+        found = []
+        for tick in reversed(self._order):
+            if tick <= after:
+                break
+            if tick <= last and any(key[1] not in without for key in self._ticks[tick]):
+                found.append(tick)
+        return found[::-1]
+
     def first_tick_of(self, robot: str) -> float:
-        """Return the first tick that concerns a robot, else infinity."""
-        ticks = self._members.behind(-math.inf)
-        return next((tick for tick in ticks if self._members.concerns(tick, robot)), math.inf)
+        """Return the first tick with a submap or an inter-robot measurement of a robot, else
+        infinity.
+        """
+        for tick in self._order:
+            for key in self._ticks[tick]:
+                sightings = self._sightings.get(key, ())
+                if key[1] == robot or any(each.teammate == robot for each in sightings):
+                    return tick
+        return math.inf
 
-    def ticks_after(self, last: float, without: Collection[str]) -> list[int]:
-        """List the ticks after this one with a submap of any other robot."""
-        ticks = self._members.behind(last)
-        return [tick for tick in ticks if self._members.has(tick, without)]
+    def keys(self, tick: int, without: Collection[str]) -> list[Key]:
+        """List the submaps of a tick without some robots, in canonical order."""
+        return sorted(key for key in self._ticks[tick] if key[1] not in without)
 
-    def size(self, tick: int, without: Collection[str]) -> int:
-        """Count the submaps of a tick without some robots."""
-        return len(self._members.keys(tick, without))
+    def contribution(self, key: Key) -> Contribution:
+        """Decode a submap, its covariance raised to the least; that of a saved map without the
+        factor on the covariances of submaps, which it contains.
+        """
+        found = self._made.get(key)
+        if found is None:
+            found = translate.contribution_of(self._ticks[self._tick_of(key[0])][key])
+            local = found.local
+            if is_map(found.stream):
+                own = self._own.get(key, NO_OWN)
+                if own.errors:
+                    local, by_own = own.given(local)
+                    found = replace(found, own=own, by_own=by_own)
+                factor = self._config.covariance_factor
+                local = replace(local, covariance=local.covariance / factor)
+            else:
+                local = with_least_spread(local, self._config.least_sigma)
+                if local is not found.local:
+                    self._raised.add(key)
+            found = found if local is found.local else replace(found, local=local)
+            self._made[key] = found
+        return found
+
+    def raised(self, without: Collection[str]) -> Mapping[str, int]:
+        """Count, by robot, the decoded submaps of raised covariance."""
+        return Counter(sorted(key[1] for key in self._raised if key[1] not in without))
 
     def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
         """Return the submaps of each of a robot's streams within the bounds."""
         found: dict[Stream, list[Contribution]] = {}
-        for tick in self._members.behind(-math.inf):
-            for key in self._members.keys(tick, ()):
+        for tick in self._order:
+            for key in self.keys(tick, ()):
                 if key[1] == robot:
-                    each = self._members.contribution(key)
+                    each = self.contribution(key)
                     if self._beyond(each) is None:
                         found.setdefault(each.stream, []).append(each)
         return found
 
     def _beyond(self, submap: Contribution) -> str | None:
-        bounds = self._bounds_of_map if is_map(submap.stream) else self._bounds
+        bounds = self._bounds_of_map if is_map(submap.stream) else self._config.bounds
         return submap_beyond(submap.local, bounds)
-
-    def raised(self, without: Collection[str]) -> Mapping[str, int]:
-        """Count, by robot, the folded submaps of raised covariance."""
-        return self._members.raised(without)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """Return the members of a tick without some robots' submaps and measurements of these;
         refuse those beyond the bounds.
         """
-        order = self._members.keys(tick, without)
-        submaps = [self._members.contribution(key) for key in order]
+        order = self.keys(tick, without)
+        submaps = [self.contribution(key) for key in order]
         outside = {}
         for each in submaps:
             why = self._beyond(each)
             if why is not None:
                 outside[each.key] = why
-        sightings, set_aside = self._sightings(order, without)
+        sightings, set_aside = self._sightings_of(order, without)
         starts = []
         first = (m.stream for m in submaps if m.sequence == 0 and m.stream in self._starts)
         for start in (self._starts[stream] for stream in first):
-            why = start_beyond(start, self._bounds)
+            why = start_beyond(start, self._config.bounds)
             if why is None:
                 starts.append(start)
             else:
@@ -294,14 +234,14 @@ class FoldInputs:
         )
         return Tick(submaps, sightings, starts, outside, tuple(set_aside), tuple(verdicts))
 
-    def _sightings(
+    def _sightings_of(
         self, order: Sequence[Key], without: Collection[str]
     ) -> tuple[list[InterRobotFactor], list[str]]:
         sightings, refused = [], []
-        for sighting in (each for key in order for each in self._members.sightings(key)):
+        for sighting in (each for key in order for each in self._sightings.get(key, ())):
             if sighting.teammate in without:
                 continue
-            why = sighting_beyond(sighting, self._bounds)
+            why = sighting_beyond(sighting, self._config.bounds)
             if why is None:
                 sightings.append(sighting)
             else:
@@ -313,10 +253,10 @@ class FoldInputs:
         """Restore the condensed submaps of a fold up to this tick."""
         if not fold.condensed_count:
             return fold
-        ticks = self._members.behind(-math.inf, last)
-        order = [key for tick in ticks for key in self._members.keys(tick, without)]
-        submaps = [self._members.contribution(key) for key in order]
-        return restore_submaps(fold, submaps, self._sightings(order, without)[0])
+        ticks = self.ticks_after(-math.inf, without, last)
+        order = [key for tick in ticks for key in self.keys(tick, without)]
+        submaps = [self.contribution(key) for key in order]
+        return restore_submaps(fold, submaps, self._sightings_of(order, without)[0])
 
     def digest(
         self, fold: Fold, more: Sequence[bytes], closed: float, without: Collection[str]
@@ -338,6 +278,20 @@ class FoldInputs:
         judged = fold.landmarks.verdicts
         verdicts = sorted(f"{v.first} {v.second} {v.same}".encode() for v in judged)
         keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
-        last = max((self._members.tick_of(key[0]) for key in keys), default=-math.inf)
-        before = (*more, *gone, *starts, *verdicts)
-        return self._members.digest(before, min(last, closed), last, without)
+        last = max((self._tick_of(key[0]) for key in keys), default=-math.inf)
+        before, closed = (*more, *gone, *starts, *verdicts), min(last, closed)
+        until, digest = self._named.pop(before, (math.inf, Digest()))
+        if until > closed:
+            until, digest = -math.inf, Digest()
+            digest.update(*before)
+        digest.update(*self._digests_between(until, closed, without))
+        self._named[before] = closed, digest
+        for oldest in list(self._named)[:-STORED_DIGESTS]:
+            del self._named[oldest]
+        whole = digest.copy()
+        whole.update(*self._digests_between(closed, last, without))
+        return whole.value
+
+    def _digests_between(self, after: float, last: float, without: Collection[str]) -> list[bytes]:
+        ticks = self.ticks_after(after, without, last)
+        return [self._digests[key] for tick in ticks for key in self.keys(tick, without)]

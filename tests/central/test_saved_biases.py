@@ -6,7 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.fold_inputs import Members
+from teamslam.central.config import CentralConfig
+from teamslam.central.fold_inputs import FoldInputs
 from teamslam.central.saved_maps import save_map, sensor_warnings
 from teamslam.team import translate
 from teamslam.team.estimation.contribution import RobotBias, is_map
@@ -52,9 +53,9 @@ def saved_map(fold, before=()):
 
 
 def contribution(saved):
-    filed = Members(10**10)
+    filed = FoldInputs(CentralConfig())
     submap = submap_of(saved)
-    filed.add(submap, b"", (), translate.own_biases_of(saved))
+    filed.add_submap(submap, b"", (), translate.own_biases_of(saved))
     return filed.contribution((submap.stamp_ns, submap.robot, 0, 0))
 
 
