@@ -264,7 +264,8 @@ class Team:
         found = False
         for name, node in [(k, v) for k, v in self.nodes.items() if k.startswith("robot/")]:
             wanted = node.request()
-            if wanted is None and not node.finished and not node.inbox.waiting:
+            waiting = node.inbox.ahead or any(node.inbox.later.values())
+            if wanted is None and not node.finished and not waiting:
                 wanted = build.measurements_request(
                     robot=node.robot, incarnation=node.incarnation, first=node.next_measurement
                 )
