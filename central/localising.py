@@ -14,8 +14,8 @@ import numpy as np
 from teamslam.central.fused_map import JOINT_LANDMARKS
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
+from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import Stream, is_map
-from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import (

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import MAP, SURVEY, UNNAMED
+from teamslam.team.core import packed, unpacked
 from teamslam.team.datum import Datum
-from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.geodesy import geodetic_from_local
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m

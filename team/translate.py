@@ -5,7 +5,9 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import (
     NO_OWN,
     Contribution,
@@ -14,7 +16,7 @@ from teamslam.team.estimation.contribution import (
     RobotBias,
     Stream,
 )
-from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, packed, unpacked
+from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
@@ -28,7 +30,6 @@ from teamslam.team.wire.arrays import (
     from_derivatives,
     from_floats,
     from_ids,
-    from_numbers,
     from_stamps,
     ids,
     landmark_blocks,
@@ -73,15 +74,14 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     if isinstance(message, m.Detections):
         seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
     else:
-        seen = ids(message.ids, "ids").astype(np.uint32, copy=False)
+        seen = ids(message.ids, "ids")
     claimed = None
     if message.covariances:
         claimed = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
     if isinstance(message, m.Points):
         positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
         return point_scan(seen, positions, claimed)
-    ranges = floats(message.ranges, "ranges").astype(np.float64, copy=False)
-    bearings = floats(message.bearings, "bearings").astype(np.float64, copy=False)
+    ranges, bearings = floats(message.ranges, "ranges"), floats(message.bearings, "bearings")
     return polar_scan(seen, ranges, bearings, claimed)
 
 
@@ -268,16 +268,15 @@ def pose_message(
 
     frame: as in `FusedMap.frame`; in_team_frame: whether it is the team's.
     """
-    rows = covariance.tolist()  # so few numbers are added sooner one by one
-    symmetric = [0.5 * (rows[i][j] + rows[j][i]) for i in range(3) for j in range(3)]
+    mean, symmetric = core.pose_bytes(pose, covariance)
     return m.PoseEstimate(
         stamp_ns=stamp_ns,
         robot=robot,
         incarnation=incarnation,
         sequence=sequence,
         map_digest=digest,
-        pose=from_numbers(pose.tolist()),
-        covariance=from_numbers(symmetric),
+        pose=mean,
+        covariance=symmetric,
         frame=frame,
         in_team_frame=in_team_frame,
     )
@@ -302,7 +301,10 @@ def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
 
 def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
     """Pack a landmark covariance: the joint one, or each landmark's own block."""
-    return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
+    if joint:
+        return joint_bytes(covariance)
+    xx, xy, yy = (covariance.diagonal(k)[i::2] for k, i in ((0, 0), (1, 0), (0, 1)))
+    return from_floats(np.column_stack((xx, xy, yy)))
 
 
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:

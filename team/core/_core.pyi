@@ -26,6 +26,11 @@ class MotionError(ValueError):
 def check_finite(data: bytes, what: str, count: int | None = None) -> None:
     """Raise ValueError unless there are `count` float64, all finite."""
 
+def check_derivatives(data: bytes, count: int, what: str) -> None:
+    """
+    Raise ValueError unless there are `count` finite float32, or as many float64.
+    """
+
 def check_angles(data: bytes, what: str, count: int) -> None:
     """Raise ValueError unless there are `count` angles in [-pi, pi]."""
 
@@ -137,9 +142,28 @@ def factor_or_fault(P: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], 
     Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in teamslam.team.estimation.gaussian.FAULTS of why there is none.
     """
 
+def spread_of(P: NDArray[numpy.float64], headings: NDArray[numpy.bool_]) -> tuple[list[float], list[float], float] | None:
+    """
+    Find the (least, largest) standard deviation of coordinates and of headings, which `headings` marks, and the
+    least share of a number's variance that the others leave: 0 where P is not positive definite.
+
+    Returns None where a variance is not positive.
+    """
+
 def curved_covariance(heading: float, covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; teamslam.team.estimation.gaussian.curved describes it.
+    """
+
+def packed(P: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Pack the upper triangle, row-major: n(n+1)/2 numbers."""
+
+def unpacked(triangle: NDArray[numpy.float64], n: int) -> NDArray[numpy.float64]:
+    """Expand a packed upper triangle to a symmetric n x n matrix."""
+
+def largest(values: NDArray[numpy.float64]) -> float:
+    """
+    Find the largest size of a number: 0 of none, NaN where one is not a number.
     """
 
 def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
@@ -501,6 +525,12 @@ class WholeMap:
     def pose(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
         """Copy mean (3,) and covariance (3, 3) of the pose."""
 
+    @property
+    def has_sound_landmarks(self) -> bool:
+        """
+        Whether the landmarks' covariance is finite, and that of each landmark alone positive definite.
+        """
+
     def joined(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[WholeMap, int]:
         """
         Compose a submap, without pose nodes, onto the pose: known landmarks fused, new ones added.
@@ -769,6 +799,11 @@ def adjoint(a_from_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
 
 def tangent(heading: float) -> NDArray[numpy.float64]:
     """d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading."""
+
+def pose_bytes(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> tuple[bytes, bytes]:
+    """
+    Encode a pose and its covariance, made exactly symmetric, as float64 for a message.
+    """
 
 class NotPositiveDefiniteError(ValueError):
     """

@@ -1,20 +1,16 @@
 """Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.shapes import Float, Int64, UInt32
+from teamslam.team.shapes import Float, UInt32
 
 Vector = Float[np.ndarray, " n"]
 Matrix = Float[np.ndarray, "n n"]
-
-SMALL = 128
-"""Largest matrix whose triangle's indices are cached."""
 
 
 class PoseGaussian(NamedTuple):
@@ -94,29 +90,6 @@ def information(covariance: Matrix, what: str) -> Matrix:
     if not len(covariance):
         return np.zeros((0, 0))
     return dense.inverse_of_factored(cholesky_factor(covariance, what))
-
-
-def upper_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    """Rows and columns of the upper triangle of an n × n matrix, row-major, read-only."""
-    return _small_triangle(n) if n <= SMALL else np.triu_indices(n)
-
-
-@lru_cache(maxsize=SMALL)
-def _small_triangle(n: int) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " m"]]:
-    return np.triu_indices(n)
-
-
-def packed(covariance: Matrix) -> Float[np.ndarray, " m"]:
-    """Pack the upper triangle, row-major: n(n+1)/2 numbers."""
-    return np.ascontiguousarray(covariance[upper_triangle(len(covariance))])
-
-
-def unpacked(triangle: Float[np.ndarray, " m"], n: int) -> Matrix:
-    """Expand a packed upper triangle to a symmetric n × n matrix."""
-    rows, columns = upper_triangle(n)
-    matrix = np.empty((n, n))
-    matrix[rows, columns] = matrix[columns, rows] = triangle + 0.0  # a zero is positive
-    return matrix
 
 
 def curved(pose: PoseGaussian) -> PoseGaussian:

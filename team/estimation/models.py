@@ -147,8 +147,9 @@ class Noise(NamedTuple):
     bearing_white: float
 
 
+@lru_cache(maxsize=256)
 def noise_of(sensor: Sensor) -> Noise:
-    """Return the variances of a sensor and their white shares."""
+    """Return the variances of a sensor and their white shares, cached."""
     return Noise(
         core.squared(sensor.range_sigma),
         core.squared(sensor.range_sigma_per_m),

@@ -24,11 +24,11 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
     angles = _angles_of(local)
-    if np.abs(local.mean[angles]).max() > 2.0 * np.pi:
+    if core.largest(local.mean[angles]) > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(local.mean[~angles], bounds.extent_m, "of its start")
     rows = (local.sensitivity, local.curvature)
-    if why is None and max(np.abs(each).max(initial=0.0) for each in rows) > bounds.sensitivity:
+    if why is None and max(map(core.largest, rows)) > bounds.sensitivity:
         why = f"a sensitivity beyond {bounds.sensitivity:g}"
     return why or _spread(local.covariance, angles, bounds)
 
@@ -96,41 +96,27 @@ def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
     return bool((np.sqrt(np.diag(covariance)) <= most).all())
 
 
-def are_landmarks(covariance: Matrix) -> bool:
-    """Whether a joint covariance is finite and each point's block a covariance."""
-    if not np.isfinite(covariance).all():
-        return False
-    variances = covariance.diagonal()
-    xx, xy, yy = variances[::2], covariance.diagonal(1)[::2], variances[1::2]
-    if not ((xx > 0.0) & (yy > 0.0)).all():
-        return False
-    return bool((np.abs(xy) < np.sqrt(xx) * np.sqrt(yy)).all())
-
-
 def _far(coordinates: Values, limit_m: float, of: str) -> str | None:
-    farthest = float(np.abs(coordinates).max(initial=0.0))
+    farthest = core.largest(coordinates)
     if farthest <= limit_m:
         return None
     return f"a coordinate of {farthest:.3g} m, not within {limit_m:g} m {of}"
 
 
 def _spread(covariance: Matrix, angles: np.ndarray, bounds: Bounds) -> str | None:
-    variances = np.diag(covariance)
-    if not (variances > 0.0).all():
+    found = core.spread_of(covariance, angles)
+    if found is None:
         return "a variance that is not positive"
-    sigmas = np.sqrt(variances)
-    for of, unit, (least, most) in (
-        (sigmas[~angles].tolist(), "m", bounds.sigma_m),
-        (sigmas[angles].tolist(), "rad", bounds.sigma_rad),
+    metres, radians, left = found
+    for (smallest, largest), unit, (least, most) in (
+        (metres, "m", bounds.sigma_m),
+        (radians, "rad", bounds.sigma_rad),
     ):
-        worst = [s for s in (min([most, *of]), max([least, *of])) if not least <= s <= most]
-        if worst:
-            return f"a sigma of {worst[0]:.3g} {unit}, not from {least:g} to {most:g} {unit}"
-    try:
-        factor = dense.cholesky(covariance / sigmas / sigmas[:, None])
-    except np.linalg.LinAlgError:
+        if smallest < least or largest > most:
+            worst = smallest if smallest < least else largest
+            return f"a sigma of {worst:.3g} {unit}, not from {least:g} to {most:g} {unit}"
+    if not left:
         return "a covariance that is not positive definite"
-    left = core.squared(float(np.min(np.diag(factor), initial=1.0)))
     if left < bounds.independent:
         return (
             f"a number of which the others leave a share of {left:.1g} of its variance, "

@@ -34,7 +34,6 @@ from teamslam.team.estimation.map_joining.conditioning import (
     join_pending,
     join_submap,
 )
-from teamslam.team.estimation.plausibility import are_landmarks
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
@@ -87,7 +86,7 @@ class OwnMap:
             after = join_submap(self.whole, named)
         except NotACovarianceError:
             after = None
-        if after is None or not are_landmarks(after.covariance[3:, 3:]):
+        if after is None or not after.has_sound_landmarks:
             after = join_submap(self.whole, named.motion)
         self.whole = after
 

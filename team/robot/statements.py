@@ -8,7 +8,8 @@ import numpy as np
 
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian, packed
+from teamslam.team.core import packed
+from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.hybrid_slam.window import Innovation

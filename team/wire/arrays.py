@@ -3,11 +3,9 @@
 NumPy (14 MB) is imported at the first array; router and recorder receive none.
 """
 
-import struct
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from teamslam.team.core import check_finite
+from teamslam.team.core import check_derivatives, check_finite
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,17 +27,14 @@ Ids = bytes
 Stamps = bytes
 """int64 nanoseconds, little-endian."""
 
-_SIZES = {"<f8": 8, "<f4": 4, "<u4": 4, "<i8": 8, "u1": 1}
-FEW = 16
-"""Most floats that are encoded without an array."""
-_NUMBERS = tuple(struct.Struct(f"<{count}d") for count in range(FEW + 1))
-
 
 def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":
-    size = _SIZES[dtype]
-    if len(data) % size:
-        raise ValueError(f"wrong length: {what} has {len(data)} bytes, not a multiple of {size}")
-    return np.frombuffer(data, dtype=dtype)
+    try:
+        return np.frombuffer(data, dtype=dtype)
+    except ValueError:
+        size = np.dtype(dtype).itemsize
+        wrong = f"wrong length: {what} has {len(data)} bytes, not a multiple of {size}"
+        raise ValueError(wrong) from None
 
 
 def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
@@ -49,13 +44,8 @@ def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
 
 def derivatives(data: bytes, count: int, what: str) -> "np.typing.NDArray[np.float64]":
     """Read `count` derivatives as float64: float32 on the wire, float64 in older logs."""
-    dtype = "<f8" if len(data) == 8 * count else "<f4"
-    found = _array(data, dtype, what)
-    if len(found) != count:
-        raise ValueError(f"wrong length: {what} has {len(found)} numbers, {count} expected")
-    if not np.isfinite(found).all():
-        raise ValueError(f"not finite: {what}")
-    return found.astype(np.float64)
+    check_derivatives(data, count, what)
+    return _array(data, "<f8" if len(data) == 8 * count else "<f4", what).astype(np.float64)
 
 
 def ids(data: Ids, what: str) -> "np.typing.NDArray[np.uint32]":
@@ -81,11 +71,6 @@ def from_floats(values: Any) -> Floats:
 def from_derivatives(values: Any) -> bytes:
     """Encode as float32, C order."""
     return np.ascontiguousarray(values, dtype="<f4").tobytes()
-
-
-def from_numbers(values: Sequence[float]) -> Floats:
-    """Encode at most FEW floats as `from_floats` does, without an array."""
-    return _NUMBERS[len(values)].pack(*values)
 
 
 def from_ids(values: Any) -> Ids:

@@ -19,7 +19,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
-from teamslam.team.estimation.gaussian import unpacked
+from teamslam.team.core import unpacked
 from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import SavedMapError, map_figures, read_map, submap_of, write_map

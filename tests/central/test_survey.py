@@ -13,7 +13,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.config import SURVEY_FRAME
-from teamslam.team.estimation.gaussian import unpacked
+from teamslam.team.core import unpacked
 from teamslam.team.saved_map import SavedMapError, map_name
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

@@ -19,7 +19,7 @@ from teamslam.central.node import CentralNode, make_centre
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team.estimation.gaussian import unpacked
+from teamslam.team.core import unpacked
 from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids

@@ -33,8 +33,8 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.streams import NO_LABEL, Detections, RobotStream, WorldStreams
 from teamslam.team.config import UNNAMED, Sensor
+from teamslam.team.core import unpacked
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.gaussian import unpacked
 from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids

@@ -44,14 +44,29 @@ struct Packed {
 using Floats = Packed<double>;
 using Count = std::optional<std::size_t>;
 
+void check_count(std::size_t count, std::size_t expected, const char* what) {
+  if (count != expected)
+    refuse("wrong length", std::string(what) + " has " + std::to_string(count) + " numbers, " + std::to_string(expected) + " expected");
+}
+
 Floats finite_floats(const nb::bytes& data, const char* what, Count count) {
   const Floats values(data, what);
-  if (count && values.count != *count)
-    refuse("wrong length", std::string(what) + " has " + std::to_string(values.count) + " numbers, " +
-                               std::to_string(*count) + " expected");
+  if (count) check_count(values.count, *count, what);
   for (std::size_t i = 0; i < values.count; i++)
     if (!std::isfinite(values[i])) refuse("not finite", what);
   return values;
+}
+
+// float32, or float64 as in older logs.
+void check_derivatives(const nb::bytes& data, std::size_t count, const char* what) {
+  if (data.size() == sizeof(double) * count) {
+    finite_floats(data, what, count);
+    return;
+  }
+  const Packed<float> values(data, what);
+  check_count(values.count, count, what);
+  for (std::size_t i = 0; i < values.count; i++)
+    if (!std::isfinite(values[i])) refuse("not finite", what);
 }
 
 void check_angles(const nb::bytes& data, const char* what, std::size_t count) {
@@ -139,6 +154,8 @@ void bind_checks(nb::module_& m) {
   m.def(
       "check_finite", [](const nb::bytes& data, const char* what, Count count) { finite_floats(data, what, count); },
       "data"_a, "what"_a, "count"_a = nb::none(), "Raise ValueError unless there are `count` float64, all finite.");
+  m.def("check_derivatives", check_derivatives, "data"_a, "count"_a, "what"_a,
+        "Raise ValueError unless there are `count` finite float32, or as many float64.");
   m.def("check_angles", check_angles, "data"_a, "what"_a, "count"_a,
         "Raise ValueError unless there are `count` angles in [-pi, pi].");
   m.def("check_ranges", check_ranges, "data"_a, "what"_a, "count"_a = nb::none(),

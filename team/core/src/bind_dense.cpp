@@ -155,11 +155,58 @@ void bind_dense(nb::module_& m) {
       "Factor a covariance: lower L with L L^T = P, and 0; or an empty matrix, and the index in "
       "teamslam.team.estimation.gaussian.FAULTS of why there is none.");
   m.def(
+      "spread_of",
+      [](const Array& P, const nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>& headings)
+          -> std::optional<std::tuple<std::array<double, 2>, std::array<double, 2>, double>> {
+        check(headings.size() == square(P).rows, "headings must be (n,) of a covariance (n, n)");
+        const auto found = gaussian::spread_of(square(P), {headings.data(), headings.size()});
+        if (!found) return {};
+        const auto& [of, turns, independent] = *found;
+        return std::tuple(std::array{of.least, of.most}, std::array{turns.least, turns.most}, independent);
+      },
+      "P"_a, "headings"_a.noconvert(),
+      "Find the (least, largest) standard deviation of coordinates and of headings, which `headings` marks, and the\n"
+      "least share of a number's variance that the others leave: 0 where P is not positive definite.\n\n"
+      "Returns None where a variance is not positive.");
+  m.def(
       "curved_covariance",
       [](double heading, const linalg::Matrix3& P) { return gaussian::curved(heading, P); },
       "heading"_a, "covariance"_a,
       "Compute the covariance of (x, y, heading) about pose o Exp(xi) to second order; "
       "teamslam.team.estimation.gaussian.curved describes it.");
+  m.def(
+      "packed",
+      [](const Array& P) {
+        const dense::Const full = square(P);
+        std::vector<double> triangle;
+        triangle.reserve(full.rows * (full.rows + 1) / 2);
+        for (std::size_t i = 0; i < full.rows; i++) triangle.insert(triangle.end(), full[i] + i, full[i] + full.rows);
+        return triangle;
+      },
+      "P"_a, "Pack the upper triangle, row-major: n(n+1)/2 numbers.");
+  m.def(
+      "unpacked",
+      [](const Numbers& triangle, std::size_t n) {
+        check(n <= triangle.size() && triangle.size() == n * (n + 1) / 2, "the triangle must have n(n+1)/2 numbers");
+        dense::Matrix full(n, n);
+        const double* next = triangle.data();
+        for (std::size_t i = 0; i < n; i++)
+          for (std::size_t j = i; j < n; j++) full[i][j] = full[j][i] = *next++ + 0.0;  // a zero is positive
+        return full;
+      },
+      "triangle"_a, "n"_a, "Expand a packed upper triangle to a symmetric n x n matrix.");
+  m.def(
+      "largest",
+      [](const Array& values) {
+        double most = 0.0;
+        for (std::size_t i = 0; i < values.size(); i++) {
+          const double size = pack::abs(values.data()[i]);
+          if (!(size <= most)) most = size;
+          if (std::isnan(most)) break;
+        }
+        return most;
+      },
+      "values"_a, "Find the largest size of a number: 0 of none, NaN where one is not a number.");
   m.def(
       "chi2_quantiles",
       [](double below, double above, std::vector<double> dof) {

@@ -53,6 +53,8 @@ void bind_maps(nb::module_& m) {
                               made_matrix(dense::Matrix(self.covariance.view().part(0, 0, 3, 3))));
           },
           "Copy mean (3,) and covariance (3, 3) of the pose.")
+      .def_prop_ro("has_sound_landmarks", &WholeMap::has_sound_landmarks,
+                   "Whether the landmarks' covariance is finite, and that of each landmark alone positive definite.")
       .def(
           "joined",
           [](const WholeMap& self, const Ids& ids, const Numbers& mean, const Table& covariance) {

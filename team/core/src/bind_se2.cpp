@@ -19,6 +19,8 @@ MadeArray compose(const Pose<double>& a_from_b, const Array& b_from_c) {
   return made_array(std::move(composed), axes_of(b_from_c));
 }
 
+nb::bytes bytes_of(std::span<const double> numbers) { return nb::bytes(numbers.data(), numbers.size_bytes()); }
+
 }  // namespace
 
 void bind_se2(nb::module_& m) {
@@ -33,6 +35,16 @@ void bind_se2(nb::module_& m) {
   m.def("adjoint", se2::adjoint, "a_from_b"_a,
         "Ad with T o Exp(xi) = Exp(Ad_T xi) o T: carries a perturbation from the right to the left.");
   m.def("tangent", se2::tangent, "heading"_a, "d(x, y, heading)/d(xi) of pose o Exp(xi) for a pose of this heading.");
+  m.def(
+      "pose_bytes",
+      [](const Pose<double>& mean, const linalg::Matrix3& P) {
+        const std::array numbers{mean.x, mean.y, mean.heading};
+        std::array<double, 9> symmetric;
+        for (std::size_t i = 0; i < 3; i++)
+          for (std::size_t j = 0; j < 3; j++) symmetric[3 * i + j] = 0.5 * (P[i][j] + P[j][i]);
+        return std::tuple(bytes_of(numbers), bytes_of(symmetric));
+      },
+      "mean"_a, "covariance"_a, "Encode a pose and its covariance, made exactly symmetric, as float64 for a message.");
 }
 
 }  // namespace teamslam::binding

@@ -31,6 +31,27 @@ Factor factor_or_fault(dense::Const P) {
   return {std::move(*L), Fault::NONE};
 }
 
+std::optional<Spread> spread_of(dense::Const P, std::span<const bool> is_heading) {
+  assert(P.rows == P.columns && is_heading.size() == P.rows);
+  std::vector<double> sigmas(P.rows);
+  Spread found{};
+  for (std::size_t i = 0; i < P.rows; i++) {
+    if (!(P[i][i] > 0.0)) return {};
+    sigmas[i] = pack::sqrt(P[i][i]);
+    Spread::Sigmas& of = is_heading[i] ? found.headings : found.coordinates;
+    of = {pack::min(of.least, sigmas[i]), pack::max(of.most, sigmas[i])};
+  }
+  dense::Matrix scaled(P);
+  for (std::size_t i = 0; i < P.rows; i++)
+    for (std::size_t j = 0; j < P.rows; j++) scaled[i][j] = P[i][j] / sigmas[j] / sigmas[i];
+  if (const std::optional<dense::Matrix> L = dense::cholesky(scaled)) {
+    double least = 1.0;
+    for (std::size_t i = 0; i < P.rows; i++) least = pack::min(least, (*L)[i][i]);
+    found.independent = least * least;
+  }
+  return found;
+}
+
 dense::Matrix curved(double heading, dense::Const P) {
   const linalg::Matrix3 T = se2::tangent(heading);
   const dense::Matrix S = dense::product(dense::product(dense::transposed(T), P), T);

@@ -260,6 +260,15 @@ WholeMap in_order(const std::vector<std::uint32_t>& ids, const Numbers& mean, co
 
 }  // namespace
 
+bool WholeMap::has_sound_landmarks() const {
+  if (!dense::is_finite(covariance.view().part(3, 3, mean.size() - 3, mean.size() - 3))) return false;
+  for (std::size_t i = 3; i < mean.size(); i += 2) {
+    const double xx = covariance[i][i], xy = covariance[i][i + 1], yy = covariance[i + 1][i + 1];
+    if (!(xx > 0.0 && yy > 0.0 && pack::abs(xy) < pack::sqrt(xx) * pack::sqrt(yy))) return false;
+  }
+  return true;
+}
+
 Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   const Agreement found = agreement(map, submap, elementary::INF);
   if (found.fault != Fault::NONE) return found.fault;

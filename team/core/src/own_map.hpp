@@ -35,6 +35,9 @@ struct WholeMap {
   dense::Matrix covariance;
 
   LocalMap view() const { return {ids, mean, covariance}; }
+
+  // Whether the landmarks' covariance is finite, and that of each landmark alone positive definite.
+  bool has_sound_landmarks() const;
 };
 
 // Why maps can not be tied: the covariance of the constraints' innovation is not positive definite,

@@ -14,7 +14,7 @@ from teamslam.team.core import (
     check_pose_covariance,
     check_ranges,
 )
-from teamslam.team.wire.arrays import Floats, Ids, check_semidefinite, floats, ids
+from teamslam.team.wire.arrays import Floats, Ids, check_semidefinite, floats
 from teamslam.team.wire.messages.base import (
     Count,
     Message,
@@ -110,7 +110,7 @@ class Observations(Measurement, frozen=True, kw_only=True, tag="observations/1")
 
     def check(self) -> None:
         check_named(self.ids, "ids")
-        n = len(ids(self.ids, "ids"))
+        n = len(self.ids) // 4
         check_ranges(self.ranges, "ranges", n)
         check_angles(self.bearings, "bearings", n)
         if self.covariances:
@@ -130,7 +130,7 @@ class Points(Measurement, frozen=True, kw_only=True, tag="points/1"):
 
     def check(self) -> None:
         check_named(self.ids, "ids")
-        n = len(ids(self.ids, "ids"))
+        n = len(self.ids) // 4
         check_finite(self.positions, "positions", 2 * n)
         if self.covariances:
             check_blocks(self.covariances, n, "covariances")

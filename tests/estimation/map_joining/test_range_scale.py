@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
-from teamslam.team.estimation.gaussian import packed, unpacked
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
