@@ -39,9 +39,10 @@ Sight<T> sight(const se2::Pose<T>& pose, T x, T y, const Reading& z) {
   return {models::innovation_of(z, line.distance, off), line.distance, line.dx / line.distance, line.dy / line.distance};
 }
 
-// Adds a measurement's terms by its innovations and weights.
+// Adds a measurement's terms by its innovations and weights; what it shares with constant errors where
+// there are such.
 template <class T>
-void add(Sums<T>& s, const Sight<T>& at, T wr, T wb) {
+[[gnu::always_inline]] inline void add(Sums<T>& s, const Sight<T>& at, T wr, T wb, bool is_white) {
   const T distance = at.distance, ex = at.ex, ey = at.ey, of_range = at.of_range, of_bearing = at.of_bearing;
   s.cost += wr * of_range * of_range + wb * of_bearing * of_bearing;
   const T wr_r = wr * of_range, wb_b = wb * of_bearing / distance, wt = wb / (distance * distance);
@@ -50,6 +51,7 @@ void add(Sums<T>& s, const Sight<T>& at, T wr, T wb) {
   s.xx += wr * ex * ex + wt * ey * ey;
   s.xy += (wr - wt) * ex * ey;
   s.yy += wr * ey * ey + wt * ex * ex;
+  if (is_white) return;
   s.rx += wr * ex;
   s.ry += wr * ey;
   s.bx -= wb * ey / distance;
@@ -82,7 +84,7 @@ void add_claim(Sums<T>& s, const Sight<T>& at, const Noise& noise) {
   s.range_sum += along;
   s.bearing_sum += across;
   s.cross += w;
-  add(s, at, wr, wb);
+  add(s, at, wr, wb, noise.is_white());
 }
 
 // Subtracts the share of an eliminated error, whose sums are total and (x, y), from the landmark's.
@@ -122,6 +124,7 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const Seen> measurements, 
   Landmark<T> best = start;
   T at_x = start.x, at_y = start.y, least = pack::all<T>(INF);
   auto goes_on = least == INF;
+  const bool is_white = noise.is_white();
   const T bearing_weight = pack::all<T>(1.0 / (noise.bearing_white * noise.bearing_variance));
   for (int step = 0; step <= STEPS; step++) {
     Sums<T> s;
@@ -136,7 +139,7 @@ Landmark<T> solve(const Landmark<T>& start, std::span<const Seen> measurements, 
         continue;
       }
       if (step == 0) range_weights[k] = 1.0 / (noise.range_white * at.rr);
-      add(s, at, range_weights[k], bearing_weight);
+      add(s, at, range_weights[k], bearing_weight, is_white);
     }
     eliminate_errors(s, noise);
     const T determinant = s.xx * s.yy - s.xy * s.xy;

@@ -69,10 +69,9 @@ motion::Increment reversed(const motion::Increment& motion) {
 
 // The log p(z | another measurement of the landmark, odometry); motion: from where that one was read.
 //
-// The landmark is where `other` places it, with its noise, and is looked at after the odometry, with its
-// noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
-double log_likelihood(const Reading& z, const Reading& other, const motion::Increment& motion) {
-  const models::Landmark<double> at = models::place(Pose<double>{}, other);
+// The landmark is where the other one places it, with its noise, and is looked at after the odometry, with
+// its noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
+double log_likelihood(const Reading& z, const models::Landmark<double>& at, const motion::Increment& motion) {
   const Polar predicted = models::polar(motion.mean, {at.x, at.y});
   double P[5][5] = {};
   for (std::size_t i = 0; i < 3; i++) std::copy(motion.covariance[i], motion.covariance[i] + 3, P[i]);
@@ -118,20 +117,21 @@ void Consensus::add(const motion::Increment& motion, const Scan& scan) {
   for (std::size_t k = 0; k < scan.ids.size(); k++) {
     const Reading reading = models::reading_of(scan.ranges[k], scan.bearings[k], sensor_, scan.claim(k));
     farthest_ = std::max(farthest_, reading.range);
+    const models::Landmark<double> placed = models::place(Pose<double>{}, reading);
     Landmark& landmark = landmarks_[scan.ids[k]];
     std::vector<double> of_others;
     const bool may_place = landmark.logs.size() < MOST_COMPARED;
     for (std::size_t i = 0; i < landmark.logs.size(); i++) {
       const Measurement& other = measurements_[landmark.measurements[i]];
-      landmark.logs[i].push_back(log_likelihood(reading, other.reading, to_last_[other.scan]));
-      if (may_place) of_others.push_back(log_likelihood(other.reading, reading, from_last[other.scan]));
+      landmark.logs[i].push_back(log_likelihood(reading, other.placed, to_last_[other.scan]));
+      if (may_place) of_others.push_back(log_likelihood(other.reading, placed, from_last[other.scan]));
     }
     if (may_place) {
       of_others.push_back(0.0);
       landmark.logs.push_back(std::move(of_others));
     }
     landmark.measurements.push_back(size());
-    measurements_.push_back({b, reading});
+    measurements_.push_back({b, reading, placed});
   }
 }
 
@@ -284,7 +284,7 @@ bool Consensus::smooth(Smoothed& window, const std::vector<bool>& taken) const {
     }
     for (std::size_t n = 0; n < taken.size(); n++) {
       if (!taken[n]) continue;
-      const auto& [scan, reading] = measurements_[n];
+      const auto& [scan, reading, placed] = measurements_[n];
       const Polar predicted = models::polar(path[scan], landmarks[slots[n]]);
       const auto [e0, e1, rr, rb, bb] = models::innovation_of(reading, predicted);
       const Jacobian J = jacobian_of(predicted, path[scan].heading);
@@ -331,7 +331,7 @@ bool Consensus::smooth(Smoothed& window, const std::vector<bool>& taken) const {
 std::vector<double> Consensus::logs_of_others(const Smoothed& window, const std::vector<bool>& taken) const {
   std::vector<double> logs;
   for (std::size_t n = 0; n < taken.size(); n++) {
-    const auto& [scan, reading] = measurements_[n];
+    const auto& [scan, reading, placed] = measurements_[n];
     const Polar predicted = models::polar(window.path[scan], window.landmarks[window.slots[n]]);
     const auto [e0, e1, rr, rb, bb] = models::innovation_of(reading, predicted);
     const Covariance2 M = window.spread(jacobian_of(predicted, window.path[scan].heading), scan, window.slots[n]);
@@ -385,7 +385,7 @@ std::vector<bool> Consensus::misread(const Smoothed& window, std::span<const dou
     if (count[m] < 2.0) continue;
     std::vector<double> predicted(L);
     for (std::size_t n = 0; n < taken.size(); n++) {
-      const auto& [scan, reading] = measurements_[n];
+      const auto& [scan, reading, placed] = measurements_[n];
       const std::size_t l = window.slots[n];
       if (!taken[n] || l == m || count[l] > count[m]) continue;
       const Polar as_other = models::polar(window.path[scan], window.landmarks[m]);

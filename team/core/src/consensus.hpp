@@ -59,6 +59,7 @@ class Consensus {
   struct Measurement {
     std::size_t scan;
     Reading reading;
+    models::Landmark<double> placed;  // seen from its own scan
   };
   // The measurements of one landmark; logs[i][j]: log p(j | i, odometry), 0 of one by itself, for the
   // first MOST_COMPARED i.

@@ -1,5 +1,7 @@
 #include "innovation.hpp"
 
+#include <memory>
+
 namespace teamslam::window {
 
 using pack::LANES, pack::LaneSum, pack::load, pack::Pack, pack::store, pack::WIDTH;
@@ -20,10 +22,13 @@ struct Known {
   Reading reading;
 };
 
+// Every number is written before it is read, so none is zero at first.
 class Components {
  public:
   Components(std::size_t components, std::size_t stride)
-      : components_(components), rows_(components * ROWS * stride), roots_(stride) {}
+      : components_(components),
+        rows_(std::make_unique_for_overwrite<double[]>(components * ROWS * stride)),
+        roots_(std::make_unique_for_overwrite<double[]>(stride)) {}
 
   // A row's lanes of a component from particle `at` on.
   double* row(std::size_t component, std::size_t row, std::size_t at) {
@@ -33,10 +38,10 @@ class Components {
 
  private:
   std::size_t components_;
-  std::vector<double> rows_, roots_;
+  std::unique_ptr<double[]> rows_, roots_;
 };
 
-void add(Sums& sums, std::size_t part, const Pack& weight, const Prediction<Pack>& p) {
+[[gnu::always_inline]] inline void add(Sums& sums, std::size_t part, const Pack& weight, const Prediction<Pack>& p) {
   sums.rr.part[part] += weight * p.rr;
   sums.rb.part[part] += weight * p.rb;
   sums.bb.part[part] += weight * p.bb;

@@ -59,24 +59,6 @@ std::size_t Particles::slot_of(std::uint32_t id) const {
   return std::size_t(std::find(ids.begin(), ids.end(), id) - ids.begin());
 }
 
-Landmark<Pack> Particles::landmark(std::size_t slot, std::size_t at) const {
-  const double* row = map[5 * slot] + at;
-  const std::size_t stride = map.stride();
-  return {load(row), load(row + stride), load(row + 2 * stride), load(row + 3 * stride), load(row + 4 * stride)};
-}
-
-void Particles::set_landmark(std::size_t slot, std::size_t at, const Landmark<Pack>& landmark) {
-  double* row = map[5 * slot] + at;
-  for (const Pack& each : {landmark.x, landmark.y, landmark.xx, landmark.xy, landmark.yy}) {
-    store(row, each);
-    row += map.stride();
-  }
-}
-
-se2::Pose<Pack> Particles::pose_at(std::size_t at) const {
-  return {load(pose[0] + at), load(pose[1] + at), load(pose[2] + at)};
-}
-
 void Particles::forget_weights() {
   std::fill_n(log_weights.begin(), count(), -elementary::log(double(count())));
 }

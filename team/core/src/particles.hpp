@@ -43,9 +43,22 @@ struct Particles {
   // The slot of a landmark; as many as there are landmarks where it is not known.
   std::size_t slot_of(std::uint32_t id) const;
 
-  Landmark<pack::Pack> landmark(std::size_t slot, std::size_t at) const;
-  void set_landmark(std::size_t slot, std::size_t at, const Landmark<pack::Pack>& landmark);
-  se2::Pose<pack::Pack> pose_at(std::size_t at) const;
+  Landmark<pack::Pack> landmark(std::size_t slot, std::size_t at) const {
+    const double* row = map[5 * slot] + at;
+    const std::size_t stride = map.stride();
+    const auto load = [&](std::size_t k) { return pack::load(row + k * stride); };
+    return {load(0), load(1), load(2), load(3), load(4)};
+  }
+  void set_landmark(std::size_t slot, std::size_t at, const Landmark<pack::Pack>& landmark) {
+    double* row = map[5 * slot] + at;
+    for (const pack::Pack& each : {landmark.x, landmark.y, landmark.xx, landmark.xy, landmark.yy}) {
+      pack::store(row, each);
+      row += map.stride();
+    }
+  }
+  se2::Pose<pack::Pack> pose_at(std::size_t at) const {
+    return {pack::load(pose[0] + at), pack::load(pose[1] + at), pack::load(pose[2] + at)};
+  }
 
   // Equal weights.
   void forget_weights();

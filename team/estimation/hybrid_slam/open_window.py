@@ -12,7 +12,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.gaussian import CoreErrors, NotACovarianceError
+from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from teamslam.team.estimation.hybrid_slam.redrawing import redraw_paths
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
@@ -38,6 +38,8 @@ AGAIN = 8
 """The window is computed again with this many times the particles."""
 
 
+UNSOLVED = (core.MotionError, core.NotFiniteError, NotACovarianceError, np.linalg.LinAlgError)
+"""Errors of a window that has no solution."""
 Solved = TypeVar("Solved")
 
 
@@ -119,7 +121,7 @@ class OpenWindow:
             return None
         try:
             return step(self.particles)
-        except (NotACovarianceError, np.linalg.LinAlgError):
+        except UNSOLVED:
             return None
 
     def is_sensible(self, submap: LocalMap | None) -> bool:
@@ -135,26 +137,29 @@ class OpenWindow:
         pairs = zip(self._keyframes, accepted, strict=True)
         return [each if taken is None else each.only(taken) for each, taken in pairs]
 
-    @np.errstate(all="ignore")
     def _settle(self) -> None:
         has_others = self._core.confirm()
-        keyframes: Sequence[Keyframe] = self._keyframes
-        has_unnamed = any(each.looks for each in keyframes)
+        has_unnamed = any(each.looks for each in self._keyframes)
         if not (has_others or has_unnamed or self._is_depleted):
             return
         keyframes = self._accepted()
         if has_unnamed:
-            config = self._config
-            self.settled = associate_keyframes(
-                keyframes, config.front_end.association, config.sensor, self._most
-            )
-            keyframes = self.settled.keyframes
-        if has_unnamed or has_others:
+            with np.errstate(all="ignore"):
+                self._associate(keyframes)
+            return
+        if has_others:
             self._take_all(keyframes)
-        if has_unnamed:
-            redraw_paths(self.particles, keyframes, self._core.random)
-        elif self._is_depleted:
+        if self._is_depleted:
             self._take_all(keyframes, AGAIN)
+
+    def _associate(self, keyframes: Sequence[Keyframe]) -> None:
+        """Give the window's detections identities, and compute it again with them."""
+        config = self._config
+        self.settled = associate_keyframes(
+            keyframes, config.front_end.association, config.sensor, self._most
+        )
+        self._take_all(self.settled.keyframes)
+        redraw_paths(self.particles, self.settled.keyframes, self._core.random)
 
     @property
     def _is_depleted(self) -> bool:
@@ -170,7 +175,6 @@ class OpenWindow:
     def _try(self, step: Callable[..., None], *arguments: object) -> None:
         if self._solvable:
             try:
-                with CoreErrors():
-                    step(*arguments)
-            except (NotACovarianceError, np.linalg.LinAlgError):
+                step(*arguments)
+            except UNSOLVED:
                 self._solvable = False

@@ -165,7 +165,7 @@ class HybridSlam:
             found = self._open.settled
             closed = replace(
                 closed,
-                local=replace(submap, unnamed=found.unnamed),
+                local=replace(submap, unnamed=found.unnamed) if found.keyframes else submap,
                 became=found.became,
                 slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),

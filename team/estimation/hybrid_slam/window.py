@@ -217,7 +217,12 @@ def running(window: Window) -> RunningWindow:
 
 
 def of_base(window: Window) -> Window:
-    """Convert particles and paths to the base, in the frame of its start pose."""
+    """Convert particles and paths to the base, in the frame of its start pose.
+
+    With the sensor at the base's origin it is the window itself, not a copy.
+    """
+    if not window.sensor.is_mounted:
+        return window
     return msgspec.structs.replace(window, core=window.core.of_base())
 
 
