@@ -42,7 +42,6 @@ class StreamAccount:
     incarnations. acknowledged: by the centre. unreported: measurements since the last report.
     """
 
-    robot: str
     incarnation: int = 0
     consumed: int = 0
     steps: int = 0
@@ -67,33 +66,6 @@ class StreamAccount:
         """Note the number of submaps that the centre has."""
         if progress.incarnation == self.incarnation:
             self.acknowledged = max(self.acknowledged, progress.submaps)
-
-    def progress(self, mapper: Mapper) -> m.Progress:
-        """Numbers of measurements consumed and submaps sent, and the time passed."""
-        since_ns = mapper.submaps.since_ns
-        return m.Progress(
-            stamp_ns=mapper.passed_ns if since_ns is None else since_ns,
-            node=ch.robot_node(self.robot),
-            robot=self.robot,
-            incarnation=self.incarnation,
-            measurements=self.consumed,
-            submaps=mapper.submaps.sent,
-        )
-
-    def statement(self, mapper: Mapper, last: int | None) -> m.Done:
-        """The account of the incarnation up to its end.
-
-        last: its number of measurements, once it has ended.
-        """
-        return m.Done(
-            stamp_ns=mapper.now_ns,
-            robot=self.robot,
-            incarnation=self.incarnation,
-            measurements=self.consumed if last is None else min(self.consumed, last),
-            steps=self.steps,
-            submaps=mapper.submaps.sent,
-            ledger=mapper.ledger.entries(),
-        )
 
 
 AHEAD = 64
@@ -148,7 +120,7 @@ class RobotNode:
             config, exchange, digest, poses, replaced, on_window, on_disposition
         )
         self.out, self.warnings = self.mapper.out, self.mapper.warnings
-        self.account = StreamAccount(config.id)
+        self.account = StreamAccount()
         self._centre_alive: bool | None = None
         self.done = self._has_sent_done = False
         self.finished = False
@@ -371,7 +343,15 @@ class RobotNode:
 
     def progress(self) -> m.Progress:
         """Numbers of measurements consumed and submaps sent, and the time passed."""
-        return self.account.progress(self.mapper)
+        since_ns = self.mapper.submaps.since_ns
+        return m.Progress(
+            stamp_ns=self.mapper.passed_ns if since_ns is None else since_ns,
+            node=ch.robot_node(self.robot),
+            robot=self.robot,
+            incarnation=self.account.incarnation,
+            measurements=self.account.consumed,
+            submaps=self.submaps,
+        )
 
     # An incarnation begins and ends.
 
@@ -406,8 +386,17 @@ class RobotNode:
 
     def statement(self) -> m.Done:
         """The account of the incarnation up to its end."""
-        last = self.stream_end.last_of(self.account.incarnation)
-        return self.account.statement(self.mapper, last)
+        account = self.account
+        last = self.stream_end.last_of(account.incarnation)
+        return m.Done(
+            stamp_ns=self.mapper.now_ns,
+            robot=self.robot,
+            incarnation=account.incarnation,
+            measurements=account.consumed if last is None else min(account.consumed, last),
+            steps=account.steps,
+            submaps=self.submaps,
+            ledger=self.ledger.entries(),
+        )
 
 
 def robot_node(config: RobotConfig, exchange: Exchange = "continuous", **options: Any) -> RobotNode:

@@ -16,7 +16,7 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import UNSOLVABLE, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import RunningWindow
 from teamslam.team.estimation.plausibility import prior_beyond
-from teamslam.team.robot.maps import OwnMap, TeamMap
+from teamslam.team.robot.maps import TeamMap
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps
 from teamslam.team.wire import channels as ch
@@ -41,13 +41,6 @@ class PoseEstimator(Protocol):
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
         """The pose by own measurements."""
-
-
-@runtime_checkable
-class SelfPlacing(Protocol):
-    """A mapper whose own map can be laid on landmarks of the team's map."""
-
-    own_map: OwnMap
 
 
 class RunningPoses:
@@ -149,9 +142,8 @@ class RunningPoses:
                 if prior.in_team_frame:
                     posed = self.team_map.pose(prior, estimator.submaps, window).pose
                 else:
-                    if not isinstance(estimator, SelfPlacing):
-                        return out
-                    placed = self.team_map.place(prior, estimator.own_map, window)
+                    own_map = getattr(estimator, "own_map", None)  # not every one joins a map
+                    placed = self.team_map.place(prior, own_map, window) if own_map else None
                     if placed is None:
                         return out
                     posed = placed
