@@ -15,18 +15,8 @@ FINAL_S = 3.0
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
 """Environment variable: start of the run [ns, wall clock], if earlier than that of the process."""
-_LOG = logging.getLogger("teamslam")
-
-
 _STARTED = time.monotonic()
-
-
-def _note_fork() -> None:
-    global _STARTED
-    _STARTED = time.monotonic()
-
-
-os.register_at_fork(after_in_child=_note_fork)
+_LOG = logging.getLogger("teamslam")
 
 
 class EndQuery:
@@ -52,7 +42,6 @@ class EndQuery:
         self._due = 0.0
         began = os.environ.get(SINCE)
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
-        self._began = _STARTED
 
     def find_missed(self) -> list[Sample]:
         """Return the samples that end the team, as published; query every FINAL_S."""
@@ -61,7 +50,7 @@ class EndQuery:
             return []
         self._due = now + FINAL_S
         # Before the query: ages are counted at its arrival, which may take its time.
-        run_s = time.monotonic() - self._began + max(self._before_s, 0.0)
+        run_s = time.monotonic() - _STARTED + max(self._before_s, 0.0)
         request = KeptRequest(
             stamp_ns=0, channels=self._ends, node=self._node, run_ns=round(1e9 * run_s)
         )

@@ -13,7 +13,7 @@ import msgspec
 from teamslam.team.peers.exchange import is_oversized, list_requested, make_answer, make_request
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.proofs import Proofs
-from teamslam.team.peers.replica import SHARE, RefusedError, Replica
+from teamslam.team.peers.replica import RefusedError, Replica
 from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -109,11 +109,9 @@ class PeerNode:
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
 
-    def __init__(
-        self, node: str, robots: Sequence[str], proofs: Proofs | None = None, share: int = SHARE
-    ) -> None:
+    def __init__(self, node: str, robots: Sequence[str], proofs: Proofs | None = None) -> None:
         self.node = node
-        self.replica = Replica(robots, share)
+        self.replica = Replica(robots)
         self.proofs = proofs
         self._now_s = 0.0
         self._serial = 0

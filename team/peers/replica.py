@@ -7,6 +7,7 @@ Bytes are limited per robot, so none can fill another's disk.
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from typing import Literal, NamedTuple, TypeVar
 
 from teamslam.team.config import MAP
@@ -14,6 +15,7 @@ from teamslam.team.door import MOST_COUNT, MOST_LIVES
 from teamslam.team.peers.members import Member, about
 from teamslam.team.store import Stream
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.intervals import IntervalSet
 
 MOST_SEQUENCES = 200_000
 MOST_STREAMS = 64
@@ -359,13 +361,11 @@ def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
 
     count: the sequences have no gap from 0 to count − 1.
     """
-    ends: list[int] = [0, count - 1] if count else []
-    for each in sorted(s for s in sequences if s >= count):
-        if ends and ends[-1] == each - 1:
-            ends[-1] = each
-        else:
-            ends += [each, each]
-    return tuple(ends[: 2 * MOST_INTERVALS])
+    found = IntervalSet()
+    found.add(0, count - 1)
+    for each in sorted(sequences):
+        found.add(each, each)
+    return tuple(chain.from_iterable(islice(found, MOST_INTERVALS)))
 
 
 def _sum(members: Iterable[Member]) -> int:

@@ -11,9 +11,9 @@ import os
 import struct
 import time
 import zlib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,12 +21,11 @@ import msgpack
 
 from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.intervals import IntervalSet, describe_intervals
 
 MAGIC = b"tmsset1\n"
 RETRY_S = 5.0
 """Interval [s] between attempts to write after an error."""
-SHOWN = 3
-"""Gaps listed per stream."""
 _HEAD = struct.Struct("<II")
 _BODY = b"\x93"
 """First byte of each body: an array of three."""
@@ -101,20 +100,17 @@ def _member_in(body: bytes) -> Member | None:
 
 def missing_in(members: Iterable[Member]) -> list[str]:
     """Report the submaps that a set lacks before the last one of each stream."""
-    found: dict[tuple[str, int], set[int]] = {}
+    found: defaultdict[tuple[str, int], IntervalSet] = defaultdict(IntervalSet)
     for member in members:
         message = member.message
         if isinstance(message, m.Submap):
-            found.setdefault((message.robot, message.incarnation), set()).add(message.sequence)
-    texts = []
-    for (robot, incarnation), numbers in sorted(found.items()):
-        there = [-1, *sorted(numbers)]
-        gaps = [(a + 1, b - 1) for a, b in pairwise(there) if b - a > 1]
-        if gaps:
-            named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in gaps[:SHOWN])
-            more = f" and {len(gaps) - SHOWN} more gaps" * (len(gaps) > SHOWN)
-            texts.append(f"submaps {named}{more} of {robot}, incarnation {incarnation}")
-    return texts
+            stream = found[message.robot, message.incarnation]
+            stream.add(message.sequence, message.sequence)
+    return [
+        f"submaps {describe_intervals(gaps)} of {robot}, incarnation {incarnation}"
+        for (robot, incarnation), numbers in sorted(found.items())
+        if (gaps := numbers.gaps(0, numbers.last))
+    ]
 
 
 class SetFile:

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from teamslam.team.recording.inventory import intervals
 from teamslam.team.shapes import Int64
 from teamslam.team.wire.bus import NO_COUNTER, Sample
-from teamslam.team.wire.intervals import Interval, IntervalSet
+from teamslam.team.wire.intervals import Interval, IntervalSet, describe_intervals
 
 Life = Int64[np.ndarray, "_"]
 """Positions of one life's publications, by counter."""
@@ -64,7 +63,7 @@ class Counters:
                 gaps += [(behind, total - 1)] if behind < total else []
         lost = sum(last - first + 1 for first, last in gaps)
         if lost > self._replies:
-            found.append(f"{_messages(lost)} missing: {intervals(gaps)}")
+            found.append(f"{_messages(lost)} missing: {describe_intervals(gaps)}")
         return found
 
 

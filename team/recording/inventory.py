@@ -17,6 +17,7 @@ import msgspec
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, try_open
+from teamslam.team.wire.intervals import describe_intervals
 
 NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 """Channels with numbered messages, which the recorder reports as progress."""
@@ -245,31 +246,16 @@ class Inventory:
         """Yield missing numbers, and numbers with different contents: key and description."""
         for (kind, robot, incarnation), found in sorted(self.streams.items()):
             key = ch.SUBMAP.key(robot) if kind == "submaps" else f"source/{robot}"
-            of = f"of {incarnation_named(incarnation)}"
+            of = f"of incarnation {incarnation}"
             if missing := found.missing:
                 lost = sum(last - first + 1 for first, last in missing)
-                yield key, f"{lost} {kind} {of} missing: {intervals(missing)}"
+                yield key, f"{lost} {kind} {of} missing: {describe_intervals(missing)}"
             if found.contradicted:
                 yield key, f"{found.contradicted} {kind} {of} present twice with different contents"
 
 
 def _name(sample: Sample) -> int:
     return hash((sample.key, sample.counter % 2**32, sample.wall_ns))
-
-
-def incarnation_named(incarnation: int) -> str:
-    """Name an incarnation."""
-    return f"incarnation {incarnation}"
-
-
-SHOWN = 3
-"""Intervals that a finding lists; it counts the others."""
-
-
-def intervals(of: list[tuple[int, int]]) -> str:
-    """List intervals as text."""
-    named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in of[:SHOWN])
-    return named + (f" and {len(of) - SHOWN} more gaps" if len(of) > SHOWN else "")
 
 
 class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):

@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 import msgspec
 
 from teamslam.team.end_query import EndQuery
-from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream, intervals
+from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream
 from teamslam.team.recording.part_files import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
@@ -37,6 +37,7 @@ from teamslam.team.wire.channels import (
     row_of,
 )
 from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.intervals import describe_intervals
 from teamslam.team.wire.messages import (
     Configuration,
     KeptRequest,
@@ -266,7 +267,7 @@ class RecordLoop:
         """Missing messages, as text."""
         numbered = [f"{key}: {what}" for key, what in self._inventory.findings()]
         others = [
-            f"{key}: {intervals(lost)}"
+            f"{key}: {describe_intervals(lost)}"
             for key, lost in self._bus.find_missing().items()
             if (found := channel_of(key)) is None or found[0] not in (*SENSORS, SUBMAP)
         ]

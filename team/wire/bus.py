@@ -98,7 +98,7 @@ class Tap(Protocol):
 
 @runtime_checkable
 class Bus(Protocol):
-    """The bus as a shell uses it.
+    """The bus as a shell uses it; by default no sample is lost.
 
     dropped: number of received samples without a valid attachment, or under another key.
     """
@@ -143,12 +143,15 @@ class Bus(Protocol):
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
         """Return the missing samples: by key, intervals of a publisher's counters."""
+        return {}
 
     def find_awaited(self) -> set[str]:
         """Return the keys with missing samples that their publisher may still have."""
+        return set()
 
     def publish_totals(self) -> Tally | None:
         """Publish the number of published samples of each key; None if no sample can be lost."""
+        return None
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed."""
@@ -327,7 +330,7 @@ class MemoryNetwork:
                 bus.queue(sample)
 
 
-class MemoryBus:
+class MemoryBus(Bus):
     """A bus within one process: synchronous and deterministic.
 
     number: its position among the buses of the network.
@@ -404,18 +407,6 @@ class MemoryBus:
                 continue
             if found[0].delivery == "all" or found[0].name in self._whole:
                 self._arrived.extend(sample for source, sample in stored if source is not self)
-
-    def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return nothing: no sample is lost in memory."""
-        return {}
-
-    def find_awaited(self) -> set[str]:
-        """Return nothing: no sample is lost in memory."""
-        return set()
-
-    def publish_totals(self) -> Tally | None:
-        """Publish nothing: no sample is lost in memory."""
-        return None
 
     def declare_alive(self, node: str) -> None:
         """Hold a token."""

@@ -1,7 +1,7 @@
 """Sets of integers as sorted, disjoint, closed intervals."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 Interval = tuple[int, int]
 """First and last number, both included."""
@@ -75,3 +75,14 @@ class IntervalSet:
             first = max(first, self._ends[at] + 1)
             at += 1
         return found
+
+
+SHOWN = 3
+"""Intervals that are named; the others are counted."""
+
+
+def describe_intervals(intervals: Sequence[Interval]) -> str:
+    """Name intervals, as `2–4, 7`."""
+    named = ", ".join(f"{a}" if a == b else f"{a}–{b}" for a, b in intervals[:SHOWN])
+    more = len(intervals) - SHOWN
+    return named + (f" and {more} more gaps" if more > 0 else "")
