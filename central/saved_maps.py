@@ -1,6 +1,5 @@
 """Saved maps and the fold: save its final map, and list changes since earlier days."""
 
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib import metadata
 
@@ -22,6 +21,7 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     FALSE_ALARM,
     SEQUENTIAL,
     displacements,
+    is_confirmed,
     maps_of,
     replaced_sensors,
 )
@@ -30,10 +30,6 @@ from teamslam.team.saved_map import datum_bytes
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
-
-LEAST_SUBMAPS = 2
-"""Submaps that place a landmark elsewhere, for it to have moved while its former place is empty."""
-
 
 SCALE = 3e-4
 """Share of all distances in a map by which the windows of every day may be off alike, so that more
@@ -205,7 +201,8 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
 
     Of several maps the one with the largest change counts. A landmark that one submap places
     elsewhere, while none sees it at its former place, is gone: a single wrong number does not move
-    it.
+    it. An unnamed one has moved if its former place is empty; else the other place is a new
+    landmark's. One that chance does not explain, but one wrong association, is not listed.
     """
     if fold.main_key is None:
         return ()
@@ -222,36 +219,54 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
         if not is_map(each.contribution.stream)
         for node in each.landmarks.tolist()
     }
-    placed = Counter(node for each in graph.submaps for node in each.landmarks.tolist())
-    condensed = set() if graph.condensed is None else {*graph.condensed.nodes.tolist()}
     former: dict[int, int] = {}
     old: set[int] = {id_ for stream, id_ in graph.former if not is_absolute(stream)}
     for saved in earlier:
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
         for each in displacements(island, saved):
-            node = graph.landmarks[each.landmark]
-            if each.is_apart and placed[node] < LEAST_SUBMAPS and node not in condensed:
+            is_beyond, is_unnamed = each.is_apart or each.chi2 > limit, each.landmark >= UNNAMED
+            is_sure = not is_beyond or is_confirmed(graph, saved, each.landmark)
+            if is_unnamed and not is_sure:
+                continue
+            if each.is_apart and (is_unnamed or not is_sure):
                 former[each.landmark] = graph.former[saved.contribution.stream, each.landmark]
             before = found.get(each.landmark)
             if before is None or before.chi2 < each.chi2:
                 found[each.landmark] = m.LandmarkChange(
                     landmark=each.landmark,
-                    state="moved" if each.is_apart or each.chi2 > limit else "unchanged",
+                    state="moved" if is_beyond else "unchanged",
                     dx=float(each.by[0]),
                     dy=float(each.by[1]),
                     sigma=each.sigma_m,
                     chi2=max(each.chi2, 0.0),
                 )
     unseen = sorted(id_ for id_ in old & {*shown} if island.graph.landmarks.get(id_) not in own)
-    lost = [*unseen, *former]
-    at = graph.offset[[*former.values()]].astype(np.intp)
-    places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
-    for id_, absence in zip(lost, absences(island, np.concatenate(places)), strict=True):
-        if absence.chance < FALSE_ALARM:
-            dx, dy = (found[id_].dx, found[id_].dy) if id_ in former else (0.0, 0.0)
-            found[id_] = m.LandmarkChange(
-                landmark=id_, state="gone", dx=dx, dy=dy, expected=absence.expected
-            )
+    found |= {x.landmark: x for x in _judge_former_places(island, unseen, former, found)}
     for id_ in {*shown} - old:
         found[id_] = m.LandmarkChange(landmark=id_, state="new")
     return tuple(found[id_] for id_ in sorted(found))
+
+
+def _judge_former_places(
+    island: Island,
+    unseen: Sequence[int],
+    former: Mapping[int, int],
+    moved: Mapping[int, m.LandmarkChange],
+) -> Iterator[m.LandmarkChange]:
+    """List the landmarks that are gone, and the unnamed ones that are new beside a former place
+    which may not be empty.
+    """
+    at = island.graph.offset[[*former.values()]].astype(np.intp)
+    places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
+    for id_, absence in zip(
+        [*unseen, *former], absences(island, np.concatenate(places)), strict=True
+    ):
+        is_empty = absence.chance < FALSE_ALARM
+        if id_ in former and id_ >= UNNAMED:
+            if not is_empty:
+                yield m.LandmarkChange(landmark=id_, state="new")
+        elif is_empty:
+            dx, dy = (moved[id_].dx, moved[id_].dy) if id_ in former else (0.0, 0.0)
+            yield m.LandmarkChange(
+                landmark=id_, state="gone", dx=dx, dy=dy, expected=absence.expected
+            )

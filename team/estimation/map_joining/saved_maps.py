@@ -8,7 +8,8 @@ to its place z_i in it lowers the joint cost by
 with the map's residual r, information W and Jacobian J, and the island's covariance Σ; e = M_ii⁻¹
 g_i with covariance M_ii⁻¹ (Baarda 1968). Without a displacement χ²_i has two degrees of freedom. A
 landmark beyond the limit gets a second node, its former place, which the map alone has; the others
-are tested again, the worst first.
+are tested again, the worst first. An unnamed landmark is known by its place alone, and a submap may
+have associated its neighbour: two submaps are needed to move it.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import RobotBias, Stream, is_map, named
@@ -40,6 +42,10 @@ SEQUENTIAL = 1e-6
 """The same of one test in a running map, which repeats it with every tick."""
 NEGLIGIBLE = 1e-9
 """Share of a landmark's information that the rest of a map must test for a test to count."""
+LEAST_SUBMAPS = 2
+"""Fewest submaps that place a landmark elsewhere for it to have moved, if it has no number or its
+former place is empty: one may have another landmark's place, or number.
+"""
 LEAST_AGREEING = 3
 """Fewest landmarks that must agree where others disagree."""
 MOST_PAIRS = 2000
@@ -104,6 +110,17 @@ def displacements_apart(island: Island, stream: Stream) -> list[Displacement]:
         for (of, id_), former in island.graph.former.items()
         if of == stream and id_ in landmarks
     ]
+
+
+def is_confirmed(graph: Graph, saved: Joined, id_: int) -> bool:
+    """Return whether LEAST_SUBMAPS submaps beside a saved map have a landmark, or a condensed
+    one.
+    """
+    node = graph.landmarks[id_]
+    if graph.condensed is not None and (graph.condensed.nodes == node).any():
+        return True
+    others = (each.landmarks == node for each in graph.submaps if each is not saved)
+    return sum(bool(each.any()) for each in others) >= LEAST_SUBMAPS
 
 
 def _observed_by_others(graph: Graph, saved: Joined) -> set[int]:
@@ -206,13 +223,16 @@ def reunite(island: Island, stream: Stream, id_: int) -> Island:
 def next_change(
     island: Island, chance: float, nodes: Collection[int] | None = None
 ) -> tuple[Joined, Displacement] | None:
-    """Find the landmark that disagrees most with its place in a saved map, beyond chance."""
-    limit = chi2_limit(2, chance)
+    """Find the landmark that disagrees most with its place in a saved map, beyond chance and wrong
+    associations.
+    """
+    limit, graph = chi2_limit(2, chance), island.graph
     found = [
         (each.chi2, saved, each)
-        for saved in maps_of(island.graph)
+        for saved in maps_of(graph)
         for each in displacements(island, saved, nodes)
         if not each.is_apart and each.chi2 > limit
+        if each.landmark < UNNAMED or is_confirmed(graph, saved, each.landmark)
     ]
     if not found:
         return None
