@@ -272,7 +272,8 @@ def priors(
         else:
             is_alone = gets_landmarks_alone(fold, shown, fused, stream)
             landmarks = _landmarks_alone(fold, shown) if is_alone else NO_LANDMARKS
-            message = translate.landmark_prior_message(fused, stream, landmarks, fold.frame)
+            factor = fold.main.settings.covariance_factor if is_alone else 1.0
+            message = translate.landmark_prior_message(fused, stream, landmarks, fold.frame, factor)
         out.append(Outgoing(ch.PRIOR, stream[0], message))
     return out
 

@@ -63,10 +63,14 @@ def in_saved_map(fold: Fold) -> Fold:
     return replace(fold, home=home, starts={})
 
 
-def lone_newcomer(fold: Fold) -> Stream | None:
-    """Return the robot that is alone in the main island, without a start, beside a saved map."""
-    there = [stream for stream, key in fold.home.items() if key == fold.main_key]
-    return there[0] if len(there) == 1 and there[0] not in fold.starts else None
+def seeks_saved_map(fold: Fold, stream: Stream) -> bool:
+    """Return whether a robot is to be placed by a saved map's landmarks: no robot of the main
+    island has a start or is in a saved map, and this one is outside it or alone in it.
+    """
+    there = [each for each, key in fold.home.items() if key == fold.main_key]
+    if any(each in fold.starts or is_map(each) for each in there):
+        return False
+    return len(there) == 1 or stream not in there
 
 
 def saved_landmarks(fused: m.FusedMap, saved: m.SavedMap) -> m.FusedMap:

@@ -22,9 +22,9 @@ from teamslam.central.join_messages import (
 )
 from teamslam.central.localising import (
     in_saved_map,
-    lone_newcomer,
     restricted,
     saved_landmarks,
+    seeks_saved_map,
 )
 from teamslam.central.monitor import NOTHING, finding
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
@@ -300,12 +300,11 @@ class SubmapFold:
         for robot, own in self._apart.items():
             ids = shown_landmarks(own, self.config, "closed").ids
             parts.append((own, ids, [each for each in streams if each[0] == robot]))
-        lone = lone_newcomer(fold) if fold.has_maps else None
-        if lone is not None and lone[0] not in self._apart:
-            parts[0] = (fold, shown, [each for each in parts[0][2] if each != lone])
+        seekers = [s for s in parts[0][2] if fold.has_maps and seeks_saved_map(fold, s)]
+        if seekers:
+            parts[0] = (fold, shown, [each for each in parts[0][2] if each not in seekers])
             of_map = in_saved_map(fold)
-            ids = shown_landmarks(of_map, self.config, "closed").ids
-            parts.append((of_map, ids, [each for each in streams if each == lone]))
+            parts.append((of_map, shown_landmarks(of_map, self.config, "closed").ids, seekers))
         for of, ids, requested in parts:
             if recorded is None:
                 news = self._sent_priors

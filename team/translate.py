@@ -424,7 +424,11 @@ def prior_of(message: m.Prior) -> RobotPrior:
 
 
 def landmark_prior_message(
-    fused: m.FusedMap, stream: Stream, landmarks: LandmarkGaussian, frame: Stream | None
+    fused: m.FusedMap,
+    stream: Stream,
+    landmarks: LandmarkGaussian,
+    frame: Stream | None,
+    covariance_factor: float = 1.0,
 ) -> m.Prior:
     """Make the prior of a robot outside the team's map: landmarks in a frame, or an empty one."""
     of_team = frame is not None and len(landmarks.ids) > 0
@@ -435,6 +439,7 @@ def landmark_prior_message(
         ids=from_ids(landmarks.ids),
         mean=from_floats(landmarks.means.ravel()),
         covariance=joint_bytes(landmarks.covariance) if of_team else b"",
+        covariance_factor=covariance_factor,
         frame=frame_name(*(frame if of_team and frame else stream)),
         in_team_frame=False,
     )

@@ -156,7 +156,7 @@ class TeamMap:
         local = None
         if window is not None:
             local = LocalMap(window.map.ids, window.map.mean, window.map.covariance)
-        posed = locate_robot(team, own.whole, local)
+        posed = locate_robot(team, own.whole, local, given.shared.covariance_factor)
         if isinstance(posed, str):
             return None
         self.known, self.refused = posed.known, posed.refused

@@ -24,6 +24,13 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.message_order import is_newer_prior
 
+TELLING = 3
+"""Fewest landmarks of a first pose, one less for each that is refused, among which a wrong range
+shows.
+"""
+PATIENCE_NS = 4_000_000_000
+"""Longest time that a first pose by fewer awaits them."""
+
 
 @runtime_checkable
 class PoseEstimator(Protocol):
@@ -58,6 +65,8 @@ class RunningPoses:
         self._own: Outgoing | None = None
         self._claimed: str | None = None
         """The team's frame by this process's last message on team/pose; None: it was not in it."""
+        self._pair_ns: int | None = None
+        """Time of this incarnation's first pose by fewer landmarks than TELLING."""
         self._is_first = True
         """No message on team/pose is this process's; there may be one of an earlier process."""
         self.team_map = TeamMap()
@@ -112,6 +121,7 @@ class RunningPoses:
 
     def begin_incarnation(self, incarnation: int) -> None:
         """Forget the prior of an earlier incarnation."""
+        self._pair_ns = None
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
 
@@ -123,11 +133,20 @@ class RunningPoses:
         prior = self._placing(estimator.writer.incarnation)
         out = self.estimate(stamp_ns, prior, estimator)
         self._own = out[0]
-        if len(out) == 1:
-            return [*out, *self._withdrawn_pose()]
+        if len(out) == 1 or self._awaits_more(stamp_ns):
+            return [out[0], *self._withdrawn_pose()]
         assert prior is not None
         self._claimed, self._is_first = prior.frame, False
         return out
+
+    def _awaits_more(self, stamp_ns: int) -> bool:
+        """Whether a first pose by landmarks alone needs another landmark to show a wrong one."""
+        is_placed = self.has_prior or self._claimed is not None
+        if is_placed or self.team_map.known - 2 * self.team_map.refused >= TELLING:
+            return False
+        if self._pair_ns is None:
+            self._pair_ns = stamp_ns
+        return stamp_ns - self._pair_ns < PATIENCE_NS
 
     def estimate(
         self, stamp_ns: int, prior: m.Prior | None, estimator: PoseEstimator

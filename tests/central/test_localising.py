@@ -1,5 +1,6 @@
 """Robots without a start are placed in a saved map; `localise` leaves the map unchanged."""
 
+import dataclasses
 import json
 from functools import cache
 
@@ -144,3 +145,57 @@ def test_the_command_localises_a_log_again(tmp_path):
     without = run(app, ["launch", "thesis-b", "--localise"])
     assert without.exit_code == 2
     assert "one saved map" in without.output
+
+
+def without(world, robot, until_ns):
+    """The world without a robot's measurements of landmarks until a time."""
+    streams = []
+    for each in world.streams:
+        seen = each.landmark_detections
+        first = int(np.searchsorted(seen.stamps_ns, until_ns)) if each.robot == robot else 0
+        own = seen.only(first, len(seen.stamps_ns))
+        streams.append(dataclasses.replace(each, landmark_detections=own))
+    return dataclasses.replace(world, streams=tuple(streams))
+
+
+def test_a_robot_is_placed_by_the_saved_map_while_another_has_seen_nothing():
+    """The one that has seen nothing is the team's map, for want of a start."""
+    scenario = with_options(load("thesis-b"), seed=1001)
+    whole = streams_of(scenario)
+    first_ns = min(first for first, _ in whole.spans_ns.values())
+    streams = part(whole, first_ns, first_ns + 60 * SECOND_NS, begins=False)
+    streams = without(without(streams, "r1", 2**62), "r2", first_ns + 30 * SECOND_NS)
+    samples, _, _ = day(0, [first_day()[1]], scenario=scenario, streams=streams)
+    of_r2 = [each for each in messages_of(samples, m.Prior) if each.robot == "r2"]
+    assert {each.frame for each in of_r2} == {"map-site/0"}
+    assert {len(ids(each.ids, "ids")) for each in of_r2} == {18}
+
+
+def of_first_landmarks(world, count):
+    """The world with each robot's measurements of its first `count` landmarks alone."""
+    streams = []
+    for each in world.streams:
+        seen = each.landmark_detections
+        message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
+        known = list(dict.fromkeys(seen.ids.tolist()))[:count]
+        chosen = np.isin(seen.ids, known)
+        counts = np.bincount(message[chosen], minlength=len(seen.stamps_ns))
+        own = dataclasses.replace(
+            seen,
+            offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            ids=seen.ids[chosen],
+            ranges=seen.ranges[chosen],
+            bearings=seen.bearings[chosen],
+        )
+        streams.append(dataclasses.replace(each, landmark_detections=own))
+    return dataclasses.replace(world, streams=tuple(streams))
+
+
+def test_two_landmarks_await_a_third_that_would_show_a_wrong_range():
+    start = next(simulated(1))
+    two, three = (
+        judge(start._replace(world=of_first_landmarks(start.world, count))) for count in (2, 3)
+    )
+    assert [each["placed"] for each in two] == [True, True]
+    assert all(4.0 <= each["delay_s"] < 10.0 for each in two)
+    assert min(each["delay_s"] for each in three) < 4.0

@@ -35,16 +35,27 @@ FLAT = 1e4
 """Factor by which the covariance of the alignment is raised for the prior of the start: the
 landmarks that give it are counted in the solution.
 """
+HEADING_SIGMA = 0.5
+"""Largest `Alignment.heading_sigma` [rad], more than for a merge: nothing is fused by this pose,
+which states the covariance of its arc.
+"""
 
 
-def locate_robot(team: LandmarkGaussian, own: WholeMap, window: LocalMap | None) -> Posed | str:
+def locate_robot(
+    team: LandmarkGaussian,
+    own: WholeMap,
+    window: LocalMap | None,
+    covariance_factor: float = 1.0,
+) -> Posed | str:
     """Estimate a robot's pose in the frame of the team's landmarks, or give the reason why they do
     not determine it.
 
-    own: the robot's map; window: the open one. The largest set of landmarks of one rigid motion is
-    used, if it is most of them. Raises NotACovarianceError, NotDeterminedError.
+    own: the robot's map; window: the open one; covariance_factor: on both, as on all submaps. The
+    largest set of landmarks of one rigid motion is used, if it is most of them. Raises
+    NotACovarianceError, NotDeterminedError.
     """
     whole = own if window is None else join_submap(own, window.named)
+    whole = WholeMap(whole.ids, whole.mean, covariance_factor * whole.covariance)
     _, in_team, in_own = np.intersect1d(team.ids, whole.ids, return_indices=True)
     shared = _Shared.of(team, whole, in_team, in_own)
     fit, why = shared.fit()
@@ -104,7 +115,7 @@ class _Shared(NamedTuple):
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
             fit = align(self.a, self.A, self.b, self.P[3:, 3:])
-        why = refusal(shared, fit, SETTINGS.alignment_heading_sigma)
+        why = refusal(shared, fit, HEADING_SIGMA)
         if why is None and fit is not None:
             why = disagreement(shared, fit.chi2, SETTINGS.alignment_confidence)
         return fit, why

@@ -70,3 +70,14 @@ def test_a_landmark_that_has_moved_is_left_out():
     assert isinstance(found, Posed)
     assert (found.known, found.refused) == (6, 1)
     assert nees(found) < 14.2
+
+
+def test_the_covariance_factor_of_submaps_holds_for_the_robots_own_map():
+    team, window = drawn(1, range(6))
+    exact = team._replace(covariance=1e-8 * team.covariance)
+    one, four = (
+        locate_robot(exact, initial_map(np.zeros(3), None), window, factor) for factor in (1.0, 4.0)
+    )
+    assert isinstance(one, Posed)
+    assert isinstance(four, Posed)
+    assert np.allclose(four.pose.covariance, 4.0 * one.pose.covariance, rtol=1e-3)
