@@ -252,3 +252,25 @@ def test_each_baseline_says_how_it_is_measured_and_what_may_be_worse():
         for of in told["figures"].values():
             assert set(of) == {"value", "better", "tolerance"}
             assert of["better"] in ("less", "more")
+
+
+def test_commands_are_there_without_the_packages_of_extras(tmp_path):
+    """As after `pip install teamslam`: `dev` has more, which could hide an import."""
+    own = closure("teamslam") | {"teamslam"}
+    lent = [
+        module
+        for module, of in metadata.packages_distributions().items()
+        if own.isdisjoint(map(canonicalize_name, of))
+    ]
+    assert {"joblib", "scipy", "gtsam"} <= set(lent)
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({lent!r}))\n"
+        "import teamslam.sim.in_memory.team, teamslam.central.desk.report.page\n"
+        "import teamslam.sim.recorded.changed_run\n"
+        "sys.argv = ['teamslam', 'experiment', '--help']\n"
+        "from teamslam.sim.cli.entry import main; main()"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path
+    )
+    assert "accuracy" in ran.stdout, ran.stderr

@@ -8,25 +8,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from teamslam.sim.cli.help import Command, Group
 from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
-from teamslam.sim.studies.experiments.cases import Done
 from teamslam.sim.studies.experiments.runner import ENTRIES, Entry
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
+    from teamslam.sim.studies.experiments.cases import Done
     from teamslam.sim.studies.experiments.runner import Plan
 
 LINE_S = 10.0
 
 
 @contextmanager
-def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
+def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[["Done"], None]]:
     """Yield a function to call with every finished task."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     console = Console(stderr=True)
     of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
     # The bar advances by expected cost, which differs widely between runs.
@@ -43,7 +50,7 @@ def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done]
     )
     finished, due = 0, time.monotonic()
 
-    def hear(done: Done) -> None:
+    def hear(done: "Done") -> None:
         nonlocal finished, due
         finished += 1
         bar.update(whole, advance=done.task.cost, runs=f"{finished} of {of}")

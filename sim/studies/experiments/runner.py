@@ -9,13 +9,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
 
 from teamslam.sim.datasets.tables import open_data_set
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.studies.experiments.cases import Cases, Done
 from teamslam.sim.studies.experiments.experiment import (
     Dataset,
     Experiment,
@@ -24,6 +23,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Results,
 )
 from teamslam.sim.studies.experiments.task import Task
+
+if TYPE_CHECKING:  # joblib, which is not a part of every install
+    from teamslam.sim.studies.experiments.cases import Done
 
 IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots.id"})
 """Parameters in the run's label, or different for every robot."""
@@ -166,7 +168,7 @@ class Plan:
     tasks: tuple[Task, ...]
 
 
-Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[[Done], None]]]
+Progress = Callable[[Sequence[Task], int], AbstractContextManager[Callable[["Done"], None]]]
 """Given the tasks and the number of stored results, returns the function to call per finished
 task.
 """
@@ -201,9 +203,11 @@ def compute_runs(
     folder: Path,
     jobs: int,
     progress: Progress,
-) -> tuple[Results, Mapping[str, Done]]:
+) -> tuple[Results, Mapping[str, "Done"]]:
     """Results of these tasks, and the failed ones."""
     folder.mkdir(parents=True, exist_ok=True)
+    from teamslam.sim.studies.experiments.cases import Cases
+
     cases = Cases(folder)
     cached = {name: cases.found(task) for name, task in tasks.items()}
     results = {name: result for name, result in cached.items() if result is not None}
@@ -220,14 +224,14 @@ def compute_runs(
     return Results(results), failures
 
 
-def _conclude(plan: Plan, results: Results, failures: Mapping[str, Done]) -> Concluded:
+def _conclude(plan: Plan, results: Results, failures: Mapping[str, "Done"]) -> Concluded:
     failed = {task.label: failures[task.name].error for task in plan.tasks if task.name in failures}
     outcome = plan.experiment.outcome(plan.options, results)
     kinds = kinds_of(plan.tasks)
     return Concluded(plan.entry, plan.options, outcome, len(plan.tasks), failed, kinds)
 
 
-def _write_failures(path: Path, failures: Sequence[Done]) -> None:
+def _write_failures(path: Path, failures: Sequence["Done"]) -> None:
     path.unlink(missing_ok=True)
     if failures:
         texts = [f"{done.task.label}\n{done.details or done.error}\n" for done in failures]
