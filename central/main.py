@@ -22,28 +22,21 @@ from teamslam.team.wire.request_times import RequestTimes
 _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
 
 
-class StoredSet:
-    """A centre's set on disk: the messages of robots and operators
-    (`teamslam.team.peers.set_file`).
+class StoredSet(Keeper):
+    """A centre's set on disk: the messages of robots and operators.
 
     A restarted centre continues from it with the same map. Raises SetFileError.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self.path = path
-        self._keeper = Keeper(path)
-        self._found = self._keeper.members
-        self._known = {member.hash for member in self._found}
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The members missing in the file."""
-        return self._keeper.warnings
+        self._known = {member.hash for member in self.members}
 
     def samples(self) -> list[Sample]:
-        """Return the members as samples that arrive now."""
-        now_ns, found = time.time_ns(), self._found
-        self._found = []
+        """Return the members as samples that arrive now, once."""
+        now_ns, found = time.time_ns(), self.members
+        self.members = []
         return [member.as_sample(now_ns) for member in found]
 
     def note(self, samples: Iterable[Sample]) -> None:
@@ -60,11 +53,7 @@ class StoredSet:
             if member.hash not in self._known:
                 self._known.add(member.hash)
                 news.append(member)
-        self._keeper.append(news)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._keeper.close()
+        self.append(news)
 
 
 LOST_S = 3.0

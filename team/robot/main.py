@@ -120,20 +120,28 @@ class RobotShell:
             used = min(last, self.node.next_measurement - 1) if here else last
             if first <= used:
                 lost = True
-                requested = m.MeasurementsRequest(
-                    stamp_ns=0,
-                    robot=self.node.robot,
-                    incarnation=incarnation,
-                    first=first,
-                    last=used,
-                    only=True,
-                )
-                try:
-                    self.bus.ask(ch.MEASUREMENTS, self.node.robot, requested, ASK_TIMEOUT_S)
-                except BusError as error:
-                    _LOG.warning("its own log lacks measurements %d to %d: %s", first, used, error)
+                if self._ask_source(incarnation, first, used, only=True) is None:
                     break
         return lost
+
+    def _ask_source(
+        self, incarnation: int, first: int, last: int, *, only: bool = False
+    ) -> list[m.Measurement] | None:
+        """Request measurements first … last of the stream; None without a sound answer."""
+        request = m.MeasurementsRequest(
+            stamp_ns=0,
+            robot=self.node.robot,
+            incarnation=incarnation,
+            first=first,
+            last=last,
+            only=only,
+        )
+        try:
+            replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
+            return [reply_of(reply, m.Measurement) for reply in replies]
+        except (BusError, WireError) as error:
+            _LOG.warning("measurements %d to %d of its source: %s", first, last, error)
+            return None
 
     def _look_for_driver(self) -> None:
         driver = ch.source_node(self.node.robot)
@@ -273,21 +281,11 @@ class RobotShell:
         self._ends_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
         for (incarnation, count), sample in doubted.items():
-            request = m.MeasurementsRequest(
-                stamp_ns=0,
-                robot=self.node.robot,
-                incarnation=incarnation,
-                first=max(count - 1, 0),
-                last=count,
-                only=True,
-            )
-            try:
-                replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
-                numbers = {reply_of(each, m.Measurement).number for each in replies}
-            except (BusError, WireError) as error:
-                _LOG.warning("%s", error)
+            there = self._ask_source(incarnation, max(count - 1, 0), count, only=True)
+            if there is None:
                 self._doubted[incarnation, count] = sample
                 continue
+            numbers = {each.number for each in there}
             if count and numbers == {count - 1}:
                 self.node.stream_end.at_source = incarnation, count
             elif numbers or (count and self._source_is_there):
@@ -302,16 +300,8 @@ class RobotShell:
 
     def _beginning_at_source(self) -> m.InitialPose | None:
         """The source's initial pose of the stream's current incarnation."""
-        request = m.MeasurementsRequest(
-            stamp_ns=0, robot=self.node.robot, incarnation=0, first=0, last=0
-        )
-        try:
-            replies = self.bus.ask(ch.MEASUREMENTS, self.node.robot, request, ASK_TIMEOUT_S)
-            starts = [reply_of(reply, m.InitialPose) for reply in replies]
-            return max(starts, key=lambda start: start.incarnation, default=None)
-        except (BusError, WireError) as error:
-            _LOG.warning("%s", error)
-            return None
+        starts = [x for x in self._ask_source(0, 0, 0) or () if isinstance(x, m.InitialPose)]
+        return max(starts, key=lambda start: start.incarnation, default=None)
 
 
 def _beginning(sample: Sample, robot: str) -> int | None:
