@@ -55,7 +55,8 @@ class Checkpoints:
         number = 1 if last is None else last.number + 1
         older = () if last is None else (*before, _compacted(last))
         keep = thinned((*older, Checkpoint(tick, fold, self.tested, number)))
-        self.kept = (*(replace(each, ahead=None) for each in keep[:-NEAR]), *keep[-NEAR:])
+        far = (each if each.ahead is None else replace(each, ahead=None) for each in keep[:-NEAR])
+        self.kept = (*far, *keep[-NEAR:])
 
     def condense(self, fold: Fold, limits: Limits) -> Fold:
         """Condense a fold, the newest checkpoint's once."""

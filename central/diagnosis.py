@@ -7,6 +7,7 @@ accepted causes.
 """
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from statistics import median
 from typing import Final, NamedTuple
@@ -27,7 +28,7 @@ from teamslam.team.estimation.map_joining.hypotheses import (
     explain,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.landmark_view import known, points_of
+from teamslam.team.estimation.map_joining.landmark_view import points_of
 from teamslam.team.estimation.map_joining.marginals import (
     Agreement,
     BiasEstimate,
@@ -140,7 +141,7 @@ def diagnose(
             if each.subject not in mirrored and not _is_bent(each, shared)
         ]
         costs = unbounded_costs(island) if final else terms(island).submaps
-        left = finding(Agreement(0.0, 0.0, {}, tuple(costs)), normal, final=final)
+        left = finding(Agreement(0.0, 0.0, {}, costs), normal, final=final)
         noise = [_noise(*each) for each in left.misscaled if each.robot not in mirrored]
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
@@ -216,26 +217,24 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
     leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
     """
-    seen_by: dict[int, set[str]] = {}
     own: dict[str, list[Contribution]] = {}
     for each in fold.contributions:
         own.setdefault(each.robot, []).append(each)
+    seen_by: dict[str, set[int]] = {}
     for joined in fold.main.graph.submaps:
-        robot = joined.contribution.robot
-        for id_ in joined.contribution.local.ids.tolist():
-            seen_by.setdefault(id_, set()).add(robot)
-    sole: dict[str, set[int]] = {}
-    for id_, robots in seen_by.items():
-        if len(robots) == 1:
-            sole.setdefault(min(robots), set()).add(id_)
-    named = [id_ for id_ in known(fold.main) if id_ < UNNAMED and id_ in seen_by]
+        of = joined.contribution
+        seen_by.setdefault(of.robot, set()).update(of.local.ids.tolist())
+    observers = Counter(id_ for ids in seen_by.values() for id_ in ids)
+    landmarks = fold.main.graph.landmarks
+    named = [id_ for id_ in sorted(observers) if id_ < UNNAMED and id_ in landmarks]
     points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
     places = dict(zip(named, points, strict=True))
     for robot, chain in sorted({**own, **withdrawn}.items()):
         gains: list[float] = []
         wrong = 0
+        sole = {id_ for id_ in seen_by.get(robot, ()) if observers[id_] == 1}
         for each in chain:
-            gain = _gain_of_reflection(places, each, sole.get(robot, ()))
+            gain = _gain_of_reflection(places, each, sole)
             if gain is not None:
                 gains.append(gain)
                 wrong += not gain > 0.0

@@ -16,9 +16,9 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Bias
-from teamslam.team.estimation.consistency import Scale, covariance_scale
-from teamslam.team.estimation.map_joining.condensed_factor import SubmapCost
-from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, columns_of
+from teamslam.team.estimation.consistency import Scale
+from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
+from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
 
 SCALE_WARN = math.sqrt(2.0)
 """Bound of the team's covariance scale; its inverse is the lower one."""
@@ -103,13 +103,9 @@ def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) ->
     return Finding(figures, _misscaled(scales, small=final))
 
 
-def _scales(submaps: Sequence[SubmapCost], normal: float) -> dict[str, Scale]:
-    rows = columns_of(submaps)
-    places: dict[str, list[int]] = {}
-    for place, each in enumerate(submaps):
-        places.setdefault(each.stream[0], []).append(place)
-    found = {"": covariance_scale(*rows)}
-    found |= {robot: covariance_scale(*rows[:, places[robot]]) for robot in sorted(places)}
+def _scales(submaps: SubmapCosts, normal: float) -> dict[str, Scale]:
+    found = {"": scale_of(submaps)}
+    found |= {robot: scale_of(submaps, of) for robot, of in submaps.of_robots.items()}
     return {
         who: Scale(each.value / normal, each.log_sigma)
         for who, each in found.items()

@@ -17,7 +17,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 
+import numpy as np
+
 from teamslam.team.estimation.map_joining.marginals import Agreement
+from teamslam.team.shapes import Float
 
 LEAST_SUBMAPS = 8
 """Least submaps of a robot for a median over all of them, and for its withdrawal before the final
@@ -103,17 +106,15 @@ def disagreement(
 
     chance: costs of a probability above e^−chance do not count. least: fewest submaps.
     """
-    costs: dict[str, list[tuple[float, float]]] = {}
-    for (robot, _), _, chi2, dof, *_ in agreement.submaps:
-        if dof >= 1.0:
-            costs.setdefault(robot, []).append((chi2, dof))
+    submaps = agreement.submaps
     seen: dict[str, list[tuple[float, float]]] = {}
     for observer, teammate, chi2 in agreement.sightings:
         for robot in (observer, teammate):
             seen.setdefault(robot, []).append((chi2, 2.0))
     found = {}
-    for robot in sorted({*costs, *agreement.robots}):
-        of_submaps = _most(costs.get(robot, []), chance, least)
+    for robot in sorted({*submaps.of_robots, *agreement.robots}):
+        costs = submaps.table[:2, submaps.of_robots.get(robot, [])]
+        of_submaps = _most(costs[:, costs[1] >= 1.0], chance, least)
         of_sightings = _most_of_newest(seen.get(robot, []), chance, NEWEST)
         share = _share(*agreement.robots.get(robot, (0.0, 0.0)), chance)
         values = [each for each in (of_submaps, of_sightings, share) if each is not None]
@@ -122,14 +123,15 @@ def disagreement(
     return found
 
 
-def _most(costs: Sequence[tuple[float, float]], chance: float, least: int = FEWEST) -> float | None:
+def _most(costs: Float[np.ndarray, "2 n"], chance: float, least: int = FEWEST) -> float | None:
     """χ²/dof that most submaps exceed, at most 1 where chance explains it; None with too few.
 
     costs: χ² and dof of each, oldest first.
     """
-    if len(costs) >= LEAST_SUBMAPS:
-        return median(chi2 / dof for chi2, dof in costs)
-    return _most_of_newest(costs, chance, least)
+    chi2, dof = costs
+    if len(dof) >= LEAST_SUBMAPS:
+        return median((chi2 / dof).tolist())
+    return _most_of_newest(list(zip(*costs.tolist(), strict=True)), chance, least)
 
 
 def _most_of_newest(
@@ -235,8 +237,9 @@ def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bo
     """Whether one of a robot's submaps, however light, contradicts its others."""
     if alone is None:
         return False
-    chance = SUSPICION + math.log(max(len(alone.submaps), 1))
-    costs = [cost_share(each.chi2, each.dof, chance) for each in alone.submaps]
+    pairs = alone.submaps.table[:2].T.tolist()
+    chance = SUSPICION + math.log(max(len(pairs), 1))
+    costs = [cost_share(*each, chance) for each in pairs]
     return max([*costs, disagreement(alone).get(robot, 0.0)]) > limit
 
 

@@ -20,7 +20,6 @@ from teamslam.central.desk.evaluation.errors import map_errors, rigid_alignment,
 from teamslam.central.tick_fold import join_settings
 from teamslam.sim.calibration.figures import Figure, nest_figures
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.team.estimation.consistency import covariance_scale
 from teamslam.team.estimation.contribution import InitialPoseFactor, Stream
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
@@ -30,7 +29,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     solve_island,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.marginals import joint_cost
+from teamslam.team.estimation.map_joining.marginals import joint_cost, scale_of
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, add_submaps
 from teamslam.team.shapes import Float
 
@@ -179,9 +178,7 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
             continue
         island, _, _ = solve_island(replace(fold.main, settings=settings))
         solved = replace(fold, islands={**fold.islands, key: island})
-        submaps = joint_cost(solved).submaps
-        chi2, dof = np.array([(each.chi2, each.dof) for each in submaps]).reshape(-1, 2).T
-        found = covariance_scale(chi2, dof)
+        found = scale_of(joint_cost(solved).submaps)
         if found is not None:
             scales.append(np.log(found.value))
             sigmas.append(found.log_sigma)

@@ -116,13 +116,7 @@ def covariance_scale(
 
     Terms with dof < 1 are left out; None where none is left. medians: of χ²(dof), if available.
     """
-    judged = dof >= 1.0
-    if not judged.any():
-        return None
-    squared, dof = squared[judged], dof[judged]
-    ratio = squared / (chi2_quantile(0.5, dof) if medians is None else medians[judged])
-    order = np.argsort(ratio, kind="stable")
-    middle = np.cumsum(dof[order]) - 0.5 * dof[order]
-    total = float(dof.sum())
-    value = float(np.interp(0.5 * total, middle, ratio[order]))
-    return Scale(value, MEDIAN_PRICE * math.sqrt(2.0 / total))
+    if medians is None:
+        medians = np.atleast_1d(chi2_quantile(0.5, dof))
+    found = core.chi2_scale(squared, dof, medians)
+    return None if found is None else Scale(found[0], MEDIAN_PRICE * math.sqrt(2.0 / found[1]))

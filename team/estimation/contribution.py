@@ -200,15 +200,6 @@ class Contribution:
         return information(self.local.covariance, f"submap {self.sequence} of {named(self.stream)}")
 
     @cached_property
-    def with_errors(
-        self,
-    ) -> dict[
-        tuple[Bias | int | RobotBias, ...], tuple[Float[np.ndarray, "B _"], core.SubmapFactor]
-    ]:
-        """Sensitivity and factor by the errors of the last graph (`Joined`)."""
-        return {}
-
-    @cached_property
     def factor(self) -> core.SubmapFactor:
         """The submap as a factor. Raises NotACovarianceError that names it."""
         local = self.local

@@ -26,7 +26,7 @@ from teamslam.team.config import CALIBRATED, FrontEnd, MotionModel, MotionNoise,
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import (
     Agreement,
-    SubmapCost,
+    SubmapCosts,
     joint_cost,
     landmark_map,
 )
@@ -341,12 +341,13 @@ def test_a_log_with_a_withdrawal_is_computed_again_and_its_ledger_tells_of_it(tm
 
 
 def agreement(**ratios: float) -> Agreement:
-    submaps = tuple(
-        SubmapCost((robot, 0), k, 5.0 * ratio * (0.8 + 0.04 * k), 5.0, 1.0, 4.35)
-        for robot, ratio in ratios.items()
+    rows = [
+        (5.0 * ratio * (0.8 + 0.04 * k), 5.0, 1.0, 4.35)
+        for ratio in ratios.values()
         for k in range(10)
-    )
-    return Agreement(0.0, 1.0, {}, submaps)
+    ]
+    streams = tuple((robot, 0) for robot in ratios for _ in range(10))
+    return Agreement(0.0, 1.0, {}, SubmapCosts(streams, np.array(rows).T))
 
 
 def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
@@ -354,15 +355,21 @@ def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | 
 
 
 def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():
-    bad, good = agreement(a=9.0).submaps[:7], agreement(a=1.0).submaps[:5]
-    of_last_four = [0.92, 0.96, 1.0, 1.04]
-    found = disagreement(Agreement(0.0, 1.0, {}, bad))["a"]
-    assert np.isclose(found, 9.0 * sorted(of_last_four)[1])
-    for few in ((*good, *bad[-2:]), (*bad[:3], *good[:4])):
-        assert disagreement(Agreement(0.0, 1.0, {}, few))["a"] <= 1.0
-    assert np.isclose(disagreement(Agreement(0.0, 1.0, {}, bad[:3]))["a"], 9.0 * 0.8)
-    assert disagreement(Agreement(0.0, 1.0, {}, (bad[0], *good[:2])))["a"] <= 1.0
-    assert disagreement(Agreement(0.0, 1.0, {}, bad[:1])) == {}
+    bad, good = (agreement(a=ratio).submaps for ratio in (9.0, 1.0))
+
+    def judged(first: SubmapCosts, last: SubmapCosts) -> float | None:
+        return disagreement(Agreement(0.0, 1.0, {}, first.followed_by(last))).get("a")
+
+    def of_last_four(k: int) -> float:
+        return 9.0 * (0.8 + 0.04 * (k + 3))
+
+    none = SubmapCosts()
+    assert np.isclose(judged(none, bad.select(range(7))), of_last_four(1))
+    assert judged(good.select(range(5)), bad.select((5, 6))) <= 1.0
+    assert judged(bad.select(range(3)), good.select(range(4))) <= 1.0
+    assert np.isclose(judged(none, bad.select(range(3))), 9.0 * 0.8)
+    assert judged(bad.select((0,)), good.select((0, 1))) <= 1.0
+    assert judged(none, bad.select((0,))) is None
 
 
 def test_a_withdrawn_robots_pose_is_taken_back_and_all_of_it_is_recomputed(tmp_path):

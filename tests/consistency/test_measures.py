@@ -7,6 +7,7 @@ from teamslam.team.estimation.consistency import (
     chi2_interval,
     chi2_limit,
     chi2_quantile,
+    covariance_scale,
     coverage,
     nees,
     state_error,
@@ -88,3 +89,20 @@ def test_limits_and_quantiles_of_any_degrees_of_freedom_are_the_librarys():
     for many in (601, 2_500, 40_000):
         assert chi2_limit(many, 1e-5) == pytest.approx(chdtri(many, 1e-5), rel=1e-11)
     assert np.isnan(chi2_quantiles(0.5, 0.5, np.array([0.0, -1.0, 0.9]))).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 300])
+def test_a_covariance_scale_is_the_median_of_the_ratios_weighted_by_degrees_of_freedom(count):
+    rng = np.random.default_rng(count)
+    dof = rng.uniform(0.5, 20.0, count)
+    dof[0] = 3.0
+    squared = np.round(4.0 * rng.chisquare(dof))  # some ratios are equal
+    judged = dof >= 1.0
+    ratio, weight = squared[judged] / chi2_quantile(0.5, dof[judged]), dof[judged]
+    order = np.argsort(ratio, kind="stable")
+    middle = np.cumsum(weight[order]) - 0.5 * weight[order]
+    expected = np.interp(0.5 * weight.sum(), middle, ratio[order])
+    found = covariance_scale(squared, dof)
+    assert found.value == expected
+    assert found.log_sigma == pytest.approx(1.3 * np.sqrt(2.0 / weight.sum()))
+    assert covariance_scale(squared, np.full(count, 0.9)) is None

@@ -217,6 +217,17 @@ void bind_dense(nb::module_& m) {
       "below"_a, "above"_a, "dof"_a,
       "Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one "
       "degree of freedom.");
+  m.def(
+      "chi2_scale",
+      [](std::span<const double> squares, std::span<const double> dof, std::span<const double> medians) -> std::optional<std::tuple<double, double>> {
+        check(squares.size() == dof.size() && medians.size() == dof.size(), "each term has its degrees of freedom and median");
+        const auto found = chi2::estimate_scale(squares, dof, medians);
+        if (!found) return {};
+        return std::tuple{found->value, found->total};
+      },
+      "squares"_a, "dof"_a, "medians"_a,
+      "Estimate the scale s of terms s chi2(dof): the median of squares / medians, weighted by dof, and the sum of dof.\n\n"
+      "medians: of chi2(dof). Terms with dof < 1 are left out; None where none is left.");
 }
 
 }  // namespace teamslam::binding

@@ -4,6 +4,7 @@
 
 #include "binding.hpp"
 #include "estimate.hpp"
+#include "scan.hpp"
 
 namespace teamslam::binding {
 
@@ -48,6 +49,12 @@ Submap made_submap(const graph::Numbers& mean, const Matrix& information, const 
   for (std::size_t l = 0; l < L; l++) submap.landmarks.push_back({landmarks[l][0], landmarks[l][1], landmarks[l][2]});
   set_errors(submap, sensitivity, range_power, curvature);
   return submap;
+}
+
+scan::Observed observed_of(const Table& points, const Table& spread, double most) {
+  check(points.shape(1) == 2 && spread.shape(1) == 3 && points.shape(0) == spread.shape(0),
+        "an observation has a point (x, y) and a covariance (xx, xy, yy)");
+  return {matrix_of(points), matrix_of(spread), most};
 }
 
 // The indices of a submap's members in a state.
@@ -188,6 +195,26 @@ void bind_graph(nb::module_& m) {
           return made<double, nb::ndim<3>>(std::move(blocks), {count, 2, 2});
         },
         "upper"_a, "spread"_a, "Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.");
+
+  m.def("scatter_of_landmarks",
+        [](const Table& points, const Table& spread, Indices of, std::size_t count, double most) {
+          const scan::Observed observed = observed_of(points, spread, most);
+          check(of.size() == points.shape(0), "each observation has a landmark");
+          for (const Index each : of) check(each >= 0 && std::size_t(each) < count, "a landmark is beyond the count");
+          return scan::scatter(observed, of, count);
+        },
+        "points"_a, "spread"_a, "of"_a, "count"_a, "most"_a,
+        "Sum chi2 of each landmark's observations N(points, spread (xx, xy, yy)) about their median, each at most `most`.");
+  m.def("change_of",
+        [](const Table& points, const Table& spread, std::size_t least, double most) -> std::optional<std::pair<Index, double>> {
+          check(least > 0, "each place has an observation");
+          const auto found = scan::change(observed_of(points, spread, most), least);
+          if (!found) return {};
+          return std::pair{found->before, found->gain};
+        },
+        "points"_a, "spread"_a, "least"_a, "most"_a,
+        "Find where the place of a landmark changes most: the number of observations before, and by how much chi2 about\n"
+        "two medians, each of at least `least`, is smaller than about one. None with too few.");
 
   nb::class_<Graph>(m, "SubmapGraph",
                     "The factor graph of one frame, independent of the state.\n\n"

@@ -3,7 +3,12 @@
 // et al. 2007, section 6.2). Its inverse is found by Halley's steps within a bracket, to some 1e-15.
 #include "chi2.hpp"
 
+#include <algorithm>
+#include <utility>
+#include <vector>
+
 #include "elementary.hpp"
+#include "linalg.hpp"
 
 namespace teamslam::chi2 {
 
@@ -82,6 +87,35 @@ double quantile(double below, double above, double dof) {
     if (!(low < x && x < high)) x = high == elementary::INF ? 2.0 * low : 0.5 * (low + high);
   }
   return 2.0 * x;
+}
+
+std::optional<Scale> estimate_scale(std::span<const double> squares, std::span<const double> dof,
+                                    std::span<const double> medians) {
+  std::vector<double> weights;
+  std::vector<std::pair<double, double>> terms;  // ratio and weight
+  for (std::size_t k = 0; k < dof.size(); k++)
+    if (dof[k] >= 1.0) {
+      weights.push_back(dof[k]);
+      terms.emplace_back(squares[k] / medians[k], dof[k]);
+    }
+  if (terms.empty()) return {};
+  std::stable_sort(terms.begin(), terms.end(),  // what is not a number comes last
+                   [](const auto& a, const auto& b) { return a.first < b.first || (a.first == a.first && b.first != b.first); });
+  const double total = linalg::pairwise_sum(weights), half = 0.5 * total;
+  double sum = 0.0, middle = 0.0, ratio = terms[0].first;
+  for (std::size_t k = 0; k < terms.size(); k++) {
+    const auto [next_ratio, weight] = terms[k];
+    sum += weight;
+    const double next = sum - 0.5 * weight;
+    if (half <= next) {
+      if (k == 0 || half == next) return Scale{next_ratio, total};
+      const double slope = (next_ratio - ratio) / (next - middle);
+      return Scale{slope * (half - middle) + ratio, total};
+    }
+    middle = next;
+    ratio = next_ratio;
+  }
+  return Scale{ratio, total};
 }
 
 }  // namespace teamslam::chi2

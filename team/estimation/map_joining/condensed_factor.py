@@ -33,19 +33,48 @@ PATH_BLOCK = 64
 """Number of poses in each run of an eliminated path."""
 
 
-class SubmapCost(NamedTuple):
-    """Agreement of one submap with the rest of the map: χ² should be close to dof.
+@dataclass(frozen=True, eq=False)
+class SubmapCosts:
+    """Agreement of submaps with the rest of the map, oldest first: χ² should be close to dof.
 
-    chi2: without discounts. dof: dim − w tr(JᵀP⁻¹J Σ), its redundancy (Baarda 1968). weight: the
-    robust weight w. median: of χ² with `dof` degrees of freedom; NaN for less than one.
+    streams: of each submap. table: rows χ² without discounts; dof, dim − w tr(JᵀP⁻¹J Σ), its
+    redundancy (Baarda 1968); the robust weight w; the median of χ² with `dof` degrees of freedom,
+    NaN for less than one.
     """
 
-    stream: Stream
-    sequence: int
-    chi2: float
-    dof: float
-    weight: float
-    median: float
+    streams: tuple[Stream, ...] = ()
+    table: Float[np.ndarray, "4 n"] = field(default_factory=lambda: np.empty((4, 0)))
+
+    @property
+    def chi2(self) -> Values:
+        """χ² of each."""
+        return self.table[0]
+
+    @property
+    def dof(self) -> Values:
+        """Degrees of freedom of each."""
+        return self.table[1]
+
+    @property
+    def weight(self) -> Values:
+        """Robust weight of each."""
+        return self.table[2]
+
+    @cached_property
+    def of_robots(self) -> Mapping[str, list[int]]:
+        """Places of each robot's submaps, robots by name."""
+        places: dict[str, list[int]] = {}
+        for place, (robot, _) in enumerate(self.streams):
+            places.setdefault(robot, []).append(place)
+        return {robot: places[robot] for robot in sorted(places)}
+
+    def select(self, places: Sequence[int]) -> "SubmapCosts":
+        """Select some, by place."""
+        return SubmapCosts(tuple(self.streams[k] for k in places), self.table[:, places])
+
+    def followed_by(self, later: "SubmapCosts") -> "SubmapCosts":
+        """Append later ones."""
+        return SubmapCosts(self.streams + later.streams, np.hstack([self.table, later.table]))
 
 
 class EliminatedPath(NamedTuple):
@@ -79,29 +108,28 @@ class Departed(NamedTuple):
     """
 
     robots: Mapping[str, tuple[float, float]]
-    submaps: tuple[SubmapCost, ...]
+    submaps: SubmapCosts
     believed: Mapping[int, int]
     paths: Mapping[Stream, EliminatedPath]
 
 
-def select_newest(submaps: Sequence[SubmapCost]) -> tuple[SubmapCost, ...]:
+def select_newest(submaps: SubmapCosts) -> SubmapCosts:
     """Select the costs of the last HISTORY submaps of each stream."""
-    counts = Counter(each.stream for each in submaps)
-    older = {stream: count - HISTORY for stream, count in counts.items() if count > HISTORY}
-    found: list[SubmapCost] = []
-    for at, each in enumerate(submaps):
-        if not older:
-            return (*found, *submaps[at:])
-        if each.stream not in older:
-            found.append(each)
-        elif older[each.stream] > 1:
-            older[each.stream] -= 1
-        else:
-            del older[each.stream]
-    return tuple(found)
+    counts, older = Counter(submaps.streams), []
+    beyond = sum(max(count - HISTORY, 0) for count in counts.values())
+    for place, stream in enumerate(submaps.streams):
+        if len(older) == beyond:
+            break
+        if counts[stream] > HISTORY:
+            counts[stream] -= 1
+            older.append(place)
+    streams = list(submaps.streams)
+    for place in reversed(older):
+        del streams[place]
+    return SubmapCosts(tuple(streams), np.delete(submaps.table, older, axis=1))
 
 
-NOBODY = Departed({}, (), {}, {})
+NOBODY = Departed({}, SubmapCosts(), {}, {})
 
 
 @dataclass(frozen=True, eq=False)

@@ -236,7 +236,7 @@ def _sum_departed(
             believed[id_] = believed.get(id_, 0) + 1
     for node in given_up.tolist():
         believed.pop(id_of[node], None)
-    submaps = (*before.submaps, *_select(now.submaps, leaving))
+    submaps = before.submaps.followed_by(now.submaps.select(np.flatnonzero(leaving).tolist()))
     robots = _sums(before, now, leaving, seen, prior)
     return Departed(robots, select_newest(submaps), believed, _paths(island, before, leaving))
 

@@ -15,7 +15,6 @@ single submap resolves.
 """
 
 import math
-from bisect import insort
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -80,8 +79,6 @@ ROUNDS = 6
 """Most causes that are accepted."""
 
 
-NO_ID = -1
-"""In place of an id: a node that is no named landmark."""
 ALL = slice(None)
 """Every observation."""
 
@@ -118,41 +115,22 @@ def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
     """Tabulate the observations of each named landmark whose χ² about one place is
     above a bound.
     """
-    graph = island.graph
+    graph, nodes = island.graph, island.graph.landmark_nodes
     points, spread = island.estimate.observations
-    id_of = np.full(len(graph.fixed), NO_ID)
-    for id_, node in graph.landmarks.items():
-        if id_ < UNNAMED:
-            id_of[node] = id_
-    of = np.repeat(np.arange(len(graph.submaps)), np.diff(graph.landmark_start))
-    keys = [each.contribution.key for each in graph.submaps]
-    rank = np.argsort(sorted(range(len(keys)), key=keys.__getitem__))
-    ids = id_of[graph.landmark_nodes]
-    order = np.lexsort((rank[of], ids))[int((ids == NO_ID).sum()) :]
-    if not len(order):
-        return {}
-    ids, of, points, spread = ids[order], of[order], points[order], spread[order]
-    first = np.flatnonzero(np.diff(ids, prepend=NO_ID))
-    counts = np.diff(first, append=len(ids))
-    about = np.repeat(_medians(points, first, counts), counts, axis=0)
-    one = np.add.reduceat(_chi2_of(points - about, spread), first)
-    end_ns = np.array([key[0] for key in keys], np.int64)[of]
+    scatter = core.scatter_of_landmarks(points, spread, nodes, len(graph.fixed), FAR)
+    scattered = set(np.flatnonzero(scatter > beyond).tolist())
     found = {}
-    for k in np.flatnonzero(one > beyond).tolist():
-        own = slice(first[k], first[k] + counts[k])
-        found[int(ids[first[k]])] = Sights(of[own], end_ns[own], points[own], spread[own])
+    for id_, node in sorted(graph.landmarks.items()):
+        if node not in scattered or id_ >= UNNAMED:
+            continue
+        at = np.flatnonzero(nodes == node)
+        of = np.searchsorted(graph.landmark_start, at, side="right") - 1
+        keys = [graph.submaps[place].contribution.key for place in of.tolist()]
+        order = sorted(range(len(keys)), key=keys.__getitem__)
+        if order:
+            end_ns = np.array([keys[k][0] for k in order], np.int64)
+            found[id_] = Sights(of[order], end_ns, points[at[order]], spread[at[order]])
     return found
-
-
-def _medians(
-    values: Float[np.ndarray, "n k"],
-    first: Int64[np.ndarray, " g"],
-    counts: Int64[np.ndarray, " g"],
-) -> Float[np.ndarray, "g k"]:
-    group = np.repeat(np.arange(len(first)), counts)
-    ordered = np.column_stack([each[np.lexsort((each, group))] for each in values.T])
-    middle: Values = 0.5 * (ordered[first + (counts - 1) // 2] + ordered[first + counts // 2])
-    return middle
 
 
 class _Two(NamedTuple):
@@ -186,15 +164,6 @@ def median(values: Float[np.ndarray, "..."]) -> Values:
     ordered, n = np.sort(values, axis=0), len(values)
     middle: Values = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
     return middle
-
-
-def _running_medians(values: Values) -> Values:
-    ordered: list[float] = []
-    medians = []
-    for k, value in enumerate(values.tolist()):
-        insort(ordered, value)
-        medians.append(0.5 * (ordered[k // 2] + ordered[(k + 1) // 2]))
-    return np.array(medians)
 
 
 def _least_side(n: int) -> int:
@@ -243,22 +212,9 @@ def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _
 
 def change_of(sights: Sights) -> _Two | None:
     """Find the time at which a landmark's place changes most."""
-    n, least = len(sights.places), _least_side(len(sights.places))
-    if n < 2 * least:
-        return None
-    before = np.column_stack([_running_medians(each) for each in sights.points.T])
-    behind = np.column_stack([_running_medians(each[::-1])[::-1] for each in sights.points.T])
-    two: list[float] = []
-    for at in range(least, n - least + 1, AT_ONCE):
-        stop = min(at + AT_ONCE, n - least + 1)
-        early = _chi2_about(sights, before[at - 1 : stop - 1, None], slice(stop - 1))
-        late = _chi2_about(sights, behind[at:stop, None], slice(at, None))
-        two += [
-            float(early[k, : at + k].sum()) + float(late[k, k:].sum()) for k in range(stop - at)
-        ]
-    one = float(_chi2_about(sights, before[-1]).sum())
-    best = int(np.argmax(one - np.array(two)))
-    return _Two(np.arange(n) >= least + best, one - two[best])
+    n = len(sights.places)
+    found = core.change_of(sights.points, sights.spread, _least_side(n), FAR)
+    return None if found is None else _Two(np.arange(n) >= found[0], found[1])
 
 
 def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
@@ -390,11 +346,9 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
-    worst = sorted(
-        (-each.chi2 / each.dof, at)
-        for at, each in enumerate(costs)
-        if each.dof >= 1.0 and each.chi2 > base.scale * (each.dof + level)
-    )
+    chi2, dof = costs.chi2, costs.dof
+    beyond = np.flatnonzero((dof >= 1.0) & (chi2 > base.scale * (dof + level)))
+    worst = sorted(zip((-chi2[beyond] / dof[beyond]).tolist(), beyond.tolist(), strict=True))
     for _, at in worst[:PROPOSED]:
         joined = graph.submaps[at]
         start, end = int(joined.nodes[0]), int(joined.nodes[1])
@@ -561,10 +515,10 @@ def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list
 def _is_beside_sound(jump: Hypothesis, base: _Solved, level: float) -> bool:
     """Whether a submap beside a jump agrees with the map; the other may have a scan beyond it."""
     island = base.island
-    costs = zip(island.graph.submaps, terms(island).submaps, strict=True)
+    costs = terms(island).submaps
+    is_sound = (costs.chi2 <= base.scale * (costs.dof + level)).tolist()
     return any(
-        cost.chi2 <= base.scale * (cost.dof + level)
-        for at, (joined, cost) in enumerate(costs)
-        if joined.contribution.robot == jump.subject
-        and jump.at_ns in (joined.contribution.end_ns, _begin_ns(island, at))
+        is_sound[at]
+        for at in costs.of_robots.get(str(jump.subject), ())
+        if jump.at_ns in (island.graph.submaps[at].contribution.end_ns, _begin_ns(island, at))
     )

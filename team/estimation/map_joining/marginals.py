@@ -16,7 +16,7 @@ from teamslam.team.config import UNNAMED, Bias
 from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
-from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, SubmapCost
+from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, SubmapCosts
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal, solve_island
 from teamslam.team.estimation.map_joining.joining import Fold
@@ -36,6 +36,8 @@ STEP = 0.1
 """Step of a derivative along a bias, in its standard deviations."""
 FAR_TOO_SMALL = 3.0
 """Covariance scale from which the robust loss distorts it: at 4 by a few per cent, at 25 by 1.7."""
+ALL = slice(None)
+"""Every submap."""
 MOST_CORRELATED = 0.97
 """Largest correlation of a submap's error with that of the next one."""
 
@@ -105,7 +107,7 @@ class Agreement(NamedTuple):
     chi2: float
     dof: float
     robots: dict[str, tuple[float, float]]
-    submaps: tuple[SubmapCost, ...]
+    submaps: SubmapCosts
     sightings: tuple[SightingCost, ...] = ()
 
 
@@ -328,7 +330,7 @@ class Terms(NamedTuple):
     submaps: without discounts. counted, priors, sightings: (robot, w χ², dof) of the joint cost.
     """
 
-    submaps: list[SubmapCost]
+    submaps: SubmapCosts
     counted: list[tuple[str, float, float]]
     priors: list[tuple[str, float, float]]
     sightings: list[tuple[str, float, float]]
@@ -354,30 +356,25 @@ def _terms(island: Island) -> Terms:
     taken = weight * now.explained
     of = [each.contribution for each in graph.submaps]
     left = graph.dimensions - taken
-    costs = now.whole_chi2, left, weight, np.asarray(chi2_quantile(0.5, left))
+    costs = np.array([now.whole_chi2, left, weight, chi2_quantile(0.5, left)])
     counted = (weight * now.counted_chi2).tolist(), (now.dimensions - taken).tolist()
     return Terms(
-        [
-            SubmapCost(each.stream, each.sequence, *rest)
-            for each, *rest in zip(of, *(column.tolist() for column in costs), strict=True)
-        ],
+        SubmapCosts(tuple(each.stream for each in of), costs),
         [(each.robot, *rest) for each, *rest in zip(of, *counted, strict=True)],
         _priors(island),
         _sightings(island),
     )
 
 
-def scale_of(costs: Sequence[SubmapCost]) -> Scale | None:
-    """Estimate the covariance scale; None with too few degrees of freedom."""
-    return covariance_scale(*columns_of(costs))
+def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | None:
+    """Estimate the covariance scale of some submaps, by place; None with too few degrees of
+    freedom.
+    """
+    chi2, dof, _, medians = costs.table[:, of]
+    return covariance_scale(chi2, dof, medians)
 
 
-def columns_of(costs: Sequence[SubmapCost]) -> Float[np.ndarray, "3 n"]:
-    """List χ², degrees of freedom, and the median of χ²."""
-    return np.array([(each.chi2, each.dof, each.median) for each in costs]).reshape(-1, 3).T.copy()
-
-
-def unbounded_costs(island: Island) -> list[SubmapCost]:
+def unbounded_costs(island: Island) -> SubmapCosts:
     """Evaluate the agreement of the submaps without distortion by the robust loss.
 
     Covariances far too small put sound submaps beyond their gates. The island is therefore solved
@@ -391,7 +388,7 @@ def unbounded_costs(island: Island) -> list[SubmapCost]:
         again = terms(_widened(island, scale.value)).submaps
     except UNSOLVABLE:
         return found
-    return [each._replace(chi2=scale.value * each.chi2) for each in again]
+    return replace(again, table=again.table * [[scale.value], [1.0], [1.0], [1.0]])
 
 
 def _widened(island: Island, factor: float) -> Island:
@@ -420,8 +417,9 @@ def widen_covariances(fold: Fold, factor: float) -> Fold:
 
 def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
     """Replace the submaps' costs by `unbounded_costs`."""
-    condensed = len(agreement.submaps) - len(fold.main.graph.submaps)
-    return agreement._replace(submaps=(*agreement.submaps[:condensed], *unbounded_costs(fold.main)))
+    condensed = len(agreement.submaps.streams) - len(fold.main.graph.submaps)
+    before = agreement.submaps.select(range(condensed))
+    return agreement._replace(submaps=before.followed_by(unbounded_costs(fold.main)))
 
 
 def joint_cost(fold: Fold) -> Agreement:
@@ -438,12 +436,11 @@ def joint_cost(fold: Fold) -> Agreement:
         robots[robot] = (before[0] + chi2, before[1] + own)
     chi2 = sum(robots[robot][0] for robot in sorted(robots))
     total = sum(robots[robot][1] for robot in sorted(robots))
-    submaps = (*departed.submaps, *found.submaps)
     return Agreement(
         chi2,
         total,
         {robot: robots[robot] for robot in sorted(robots)},
-        submaps,
+        departed.submaps.followed_by(found.submaps),
         tuple(_sighting_costs(fold.main)),
     )
 

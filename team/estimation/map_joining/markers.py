@@ -88,8 +88,9 @@ def _add_rows(
     for row, k in zip(rows, places, strict=True):
         at = slice(first + 2 * k, first + 2 * k + 2)
         row[at] = scale[at]
-    return submap._replace(
-        nodes=np.append(submap.nodes, [nodes[error] for error in errors]),
-        biases=(*submap.biases, *errors),
-        sensitivity=np.concatenate((submap.sensitivity, rows)),
+    return Joined.with_rows(
+        submap.contribution,
+        np.append(submap.nodes, [nodes[error] for error in errors]),
+        (*submap.biases, *errors),
+        np.concatenate((submap.sensitivity, rows)),
     )

@@ -68,10 +68,8 @@ def find_idle(graph: Graph, stays: Marks, apart: Collection[int], first: int) ->
 
     None while no landmark rests yet and fewer than `first` could.
     """
-    seen = np.zeros(len(graph.fixed), np.bool_)
-    for f in np.flatnonzero(stays):
-        seen[graph.submaps[f].nodes] = True
-    found = sorted(n for id_, n in graph.landmarks.items() if not seen[n] and id_ not in apart)
+    seen = {*graph.landmark_nodes[np.repeat(stays, np.diff(graph.landmark_start))].tolist()}
+    found = sorted(n for id_, n in graph.landmarks.items() if n not in seen and id_ not in apart)
     some_rest = graph.condensed is not None and graph.condensed.resting is not None
     return np.array(found if some_rest or len(found) >= first else [], np.int64)
 

@@ -89,7 +89,7 @@ class Prior(NamedTuple):
 
 
 class Joined(NamedTuple):
-    """A submap in the graph: its start, end and pose nodes, landmarks by id, biases.
+    """A submap in the graph: its start, end and pose nodes, landmarks by id, biases; its factor.
 
     biases: the error of each row of `sensitivity`, the team's last. sensitivity: ∂mean/∂b: a
     robot's own error and the team's add up. A marker's row is that of the ranges' scale, restricted
@@ -100,6 +100,7 @@ class Joined(NamedTuple):
     nodes: Indices
     biases: tuple[SharedError, ...]
     sensitivity: Float[np.ndarray, "B _"]
+    factor: core.SubmapFactor
 
     @classmethod
     def of(
@@ -110,37 +111,29 @@ class Joined(NamedTuple):
         common: tuple[CommonError, ...],
     ) -> "Joined":
         """Make a submap; its `common` errors, those of single robots in a saved map first, have a
-        node of the team.
+        node of the team. Raises NotACovarianceError that names the submap.
         """
         biases = (*own, *common)
         rows = _sensitivity(contribution.local, biases)
         if contribution.own.errors:
             rows = np.vstack([contribution.by_own, rows]) if biases else contribution.by_own
-        return cls(contribution, nodes, (*contribution.own.errors, *biases), rows)
+        return cls.with_rows(contribution, nodes, (*contribution.own.errors, *biases), rows)
 
-    @property
-    def factor(self) -> core.SubmapFactor:
-        """The factor. Raises NotACovarianceError that names the submap."""
-        of = self.contribution
-        if self.biases == of.local.biases:
-            return of.factor
-        made = of.with_errors.get(self.biases)
-        if made is None or made[0] is not self.sensitivity:
-            powers = [RANGE_POWER[_scaling(each)] for each in self.biases]
-            factor = of.factor.with_errors(
-                self.sensitivity, np.array(powers, np.int64), self.curvature
-            )
-            made = of.with_errors[self.biases] = self.sensitivity, factor
-        return made[1]
-
-    @property
-    def curvature(self) -> Float[np.ndarray, "B _"]:
-        """∂²mean/∂b² of each bias; zero of common errors."""
-        local, rows = self.contribution.local, np.zeros_like(self.sensitivity)
-        for at, error in enumerate(self.biases):
-            if isinstance(error, str) and self.biases.count(error) == 1:
-                rows[at] = local.curvature[local.biases.index(error)]
-        return rows
+    @classmethod
+    def with_rows(
+        cls,
+        contribution: Contribution,
+        nodes: Indices,
+        biases: tuple[SharedError, ...],
+        sensitivity: Float[np.ndarray, "B _"],
+    ) -> "Joined":
+        """Make a submap with these errors."""
+        factor = contribution.factor
+        if biases != contribution.local.biases:
+            powers = [RANGE_POWER[_scaling(each)] for each in biases]
+            curvature = _curvature(contribution.local, biases, sensitivity)
+            factor = factor.with_errors(sensitivity, np.array(powers, np.int64), curvature)
+        return cls(contribution, nodes, biases, sensitivity, factor)
 
     @property
     def landmarks(self) -> Indices:
@@ -159,6 +152,17 @@ def _sensitivity(local: LocalMap, biases: Sequence[CommonError]) -> Float[np.nda
         if isinstance(error, int):
             at = first + 2 * int(np.searchsorted(local.ids, error))
             row[:at] = row[at + 2 :] = 0.0
+    return rows
+
+
+def _curvature(
+    local: LocalMap, biases: Sequence[SharedError], sensitivity: Float[np.ndarray, "B _"]
+) -> Float[np.ndarray, "B _"]:
+    """∂²mean/∂b² of each bias; zero of common errors."""
+    rows = np.zeros_like(sensitivity)
+    for at, error in enumerate(biases):
+        if isinstance(error, str) and biases.count(error) == 1:
+            rows[at] = local.curvature[local.biases.index(error)]
     return rows
 
 
@@ -217,7 +221,7 @@ class Graph:
 
     @cached_property
     def factors(self) -> core.SubmapGraph:
-        """The factors. Raises NotACovarianceError that names a submap."""
+        """The factors."""
         return core.SubmapGraph(
             self.offset,
             self.fixed,

@@ -6,6 +6,11 @@ import pytest
 from teamslam.team.estimation.map_joining import (
     marginals,
 )
+from teamslam.team.estimation.map_joining.condensed_factor import (
+    HISTORY,
+    SubmapCosts,
+    select_newest,
+)
 from teamslam.team.estimation.map_joining.condensing import Limits, condense_submaps
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -66,7 +71,7 @@ def test_the_bounded_fold_is_close_to_the_full_one(seed, settings):
     mine, theirs = marginals.joint_cost(full), marginals.joint_cost(bounded)
     assert theirs.dof == pytest.approx(mine.dof, rel=0.08)
     assert theirs.chi2 / theirs.dof == pytest.approx(mine.chi2 / mine.dof, rel=0.05)
-    assert {each.stream for each in theirs.submaps} == {("r0", 0), ("r1", 0)}
+    assert {*theirs.submaps.streams} == {("r0", 0), ("r1", 0)}
     assert marginals.confirmed(bounded, 3) == marginals.confirmed(full, 3)
 
 
@@ -103,3 +108,13 @@ def test_an_inter_robot_measurement_that_was_left_out_is_not_restored():
     raw = restore_submaps(fold, world.submaps, world.sightings)
     assert raw.condensed_count == 0
     assert len(raw.main.graph.sightings) == len(others)
+
+
+def test_the_costs_of_the_newest_submaps_of_each_stream_are_stored():
+    streams = [(f"r{k % 3}", 0) for k in range(3 * HISTORY)] + [("r1", 0)] * 4
+    costs = SubmapCosts(tuple(streams), np.arange(4.0 * len(streams)).reshape(4, -1))
+    expected = [k for k in range(len(streams)) if k not in (1, 4, 7, 10)]
+    found = select_newest(costs)
+    assert found.streams == tuple(streams[k] for k in expected)
+    np.testing.assert_array_equal(found.table, costs.table[:, expected])
+    assert select_newest(found).streams == found.streams

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
-from teamslam.team.estimation.map_joining.hypotheses import FAR, sights_of
+from teamslam.team.estimation.map_joining.hypotheses import FAR, change_of, sights_of
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import solved, team
 
@@ -58,3 +58,25 @@ def test_landmarks_whose_observations_scatter_beyond_a_bound_are_tabulated(islan
     assert beyond.keys() == {id_ for id_, chi2 in scatter.items() if chi2 > bound}
     for id_, own in beyond.items():
         np.testing.assert_array_equal(own.points, everything[id_].points)
+
+
+def test_a_landmark_changes_its_place_where_two_medians_leave_least(island):
+    def left(own, part):
+        away = own.points[part] - np.median(own.points[part], axis=0)
+        blocks = own.spread[part][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        chi2 = np.einsum("ni,nij,nj->n", away, np.linalg.inv(blocks), away)
+        return np.minimum(chi2, FAR).sum()
+
+    for own in sights_of(island).values():
+        n = len(own.places)
+        found = change_of(own)
+        if n < 4:
+            assert found is None
+            continue
+        gains = {
+            at: left(own, slice(n)) - left(own, slice(at)) - left(own, slice(at, n))
+            for at in range(2, n - 1)
+        }
+        best = max(gains, key=gains.get)
+        assert found.evidence == pytest.approx(gains[best])
+        np.testing.assert_array_equal(found.second, np.arange(n) >= best)
