@@ -130,8 +130,8 @@ def _most(costs: Float[np.ndarray, "2 n"], chance: float, least: int = FEWEST) -
     """
     chi2, dof = costs
     if len(dof) >= LEAST_SUBMAPS:
-        return median((chi2 / dof).tolist())
-    return _most_of_newest(list(zip(*costs.tolist(), strict=True)), chance, least)
+        return float(median((chi2 / dof).tolist()))
+    return _most_of_newest(list(zip(chi2.tolist(), dof.tolist(), strict=True)), chance, least)
 
 
 def _most_of_newest(
@@ -237,9 +237,9 @@ def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bo
     """Whether one of a robot's submaps, however light, contradicts its others."""
     if alone is None:
         return False
-    pairs = alone.submaps.table[:2].T.tolist()
-    chance = SUSPICION + math.log(max(len(pairs), 1))
-    costs = [cost_share(*each, chance) for each in pairs]
+    chi2, dof, *_ = alone.submaps.table.tolist()
+    chance = SUSPICION + math.log(max(len(chi2), 1))
+    costs = [cost_share(*each, chance) for each in zip(chi2, dof, strict=True)]
     return max([*costs, disagreement(alone).get(robot, 0.0)]) > limit
 
 

@@ -171,6 +171,13 @@ def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> N
     Compute the values that chi-squared exceeds with the probability above = 1 - below; NaN for less than one degree of freedom.
     """
 
+def chi2_scale(squares: NDArray[numpy.float64], dof: NDArray[numpy.float64], medians: NDArray[numpy.float64]) -> tuple[float, float] | None:
+    """
+    Estimate the scale s of terms s chi2(dof): the median of squares / medians, weighted by dof, and the sum of dof.
+
+    medians: of chi2(dof). Terms with dof < 1 are left out; None where none is left.
+    """
+
 @overload
 def sin_and_cos(angle: float) -> tuple[float, float]:
     """
@@ -349,6 +356,17 @@ def add_product(a: NDArray[numpy.float64], b: NDArray[numpy.float64], c: NDArray
 def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.
+    """
+
+def scatter_of_landmarks(points: NDArray[numpy.float64], spread: NDArray[numpy.float64], of: NDArray[numpy.int64], count: int, most: float) -> NDArray[numpy.float64]:
+    """
+    Sum chi2 of each landmark's observations N(points, spread (xx, xy, yy)) about their median, each at most `most`.
+    """
+
+def change_of(points: NDArray[numpy.float64], spread: NDArray[numpy.float64], least: int, most: float) -> tuple[int, float] | None:
+    """
+    Find where the place of a landmark changes most: the number of observations before, and by how much chi2 about
+    two medians, each of at least `least`, is smaller than about one. None with too few.
     """
 
 class SubmapGraph:

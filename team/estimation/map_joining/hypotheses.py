@@ -346,9 +346,10 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
-    chi2, dof = costs.chi2, costs.dof
-    beyond = np.flatnonzero((dof >= 1.0) & (chi2 > base.scale * (dof + level)))
-    worst = sorted(zip((-chi2[beyond] / dof[beyond]).tolist(), beyond.tolist(), strict=True))
+    beyond = (costs.dof >= 1.0) & (costs.chi2 > base.scale * (costs.dof + level))
+    ratios = (costs.chi2[beyond] / costs.dof[beyond]).tolist()
+    places = np.flatnonzero(beyond).tolist()
+    worst = sorted((-ratio, at) for ratio, at in zip(ratios, places, strict=True))
     for _, at in worst[:PROPOSED]:
         joined = graph.submaps[at]
         start, end = int(joined.nodes[0]), int(joined.nodes[1])
