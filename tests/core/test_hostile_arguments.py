@@ -126,6 +126,12 @@ EXAMPLES = {
     "damping": lambda: 0.0,
     "halvings": lambda: 4,
     "most_damping": lambda: 1e6,
+    "squares": lambda: np.array([4.0, 1.0]),
+    **dict.fromkeys(("medians", "chi2_scale.dof"), lambda: np.array([4.35, 1.4])),
+    "points": lambda: np.tile(ROWS, (2, 1)),
+    "of": lambda: np.array([0, 1, 0, 2]),
+    "least": lambda: 2,
+    "most": lambda: 50.0,
     # sparse
     "sizes": lambda: np.array([3, 2]),
     "column_start": lambda: np.array([0, 2, 3]),
