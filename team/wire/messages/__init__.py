@@ -11,11 +11,9 @@ units, radians, bearings in (−π, π].
 
 from teamslam.team.wire.messages.base import *
 from teamslam.team.wire.messages.base import Message
-from teamslam.team.wire.messages.estimates import *
 from teamslam.team.wire.messages.maps import *
 from teamslam.team.wire.messages.measurements import *
 from teamslam.team.wire.messages.nodes import *
-from teamslam.team.wire.messages.orders import *
 from teamslam.team.wire.messages.peers import *
 from teamslam.team.wire.messages.submaps import *
 from teamslam.team.wire.messages.truth import *

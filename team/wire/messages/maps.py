@@ -27,7 +27,7 @@ from teamslam.team.wire.messages.base import (
     check_landmarks,
     check_sorted,
 )
-from teamslam.team.wire.messages.orders import Judgement
+from teamslam.team.wire.messages.nodes import Judgement
 
 ChangeState = Literal["unchanged", "moved", "gone", "new"]
 MOST_SAVED = 2000
