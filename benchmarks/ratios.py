@@ -132,9 +132,9 @@ def driving(
 
     def taken() -> None:
         node = RobotNode(config)
-        node.handle(start, 0)
+        node.handle(start)
         for payload in inputs:
-            node.handle(decoded(payload), 0)
+            node.handle(decoded(payload))
 
     return taken
 

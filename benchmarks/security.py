@@ -136,7 +136,7 @@ class Sink:
 
     taken = 0
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         self.taken += 1
         return []
 
@@ -149,7 +149,7 @@ def measure_boundary(count: int) -> tuple[float, float]:
     node, boundary = Sink(), Boundary("robot/r1")
 
     def plainly(sample: Sample) -> list[Outgoing]:
-        return node.handle(opened(sample)[2], sample.stamp_ns)
+        return node.handle(opened(sample)[2])
 
     def within(sample: Sample) -> list[Outgoing]:
         return boundary.take(node, sample)

@@ -127,8 +127,8 @@ class CentralNode:
             self.attendance.admit(robot)
             self._admitted.append(robot)
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Process one message; `now_ns` is unused: stamps are time."""
+    def handle(self, message: m.Message) -> list[Outgoing]:
+        """Process one message; its stamp is the time."""
         if isinstance(message, m.FusedMap):
             return self._take_final(message)
         self._credit = None

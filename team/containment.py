@@ -35,7 +35,7 @@ class Handler(Protocol):
     replace the answer after an exception, such as the sender's credit.
     """
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Handle one message; return the answers."""
 
 
@@ -95,7 +95,7 @@ class Boundary:
             if handle_sample is not None:
                 out: list[Outgoing] = handle_sample(message, sample or _sample_of(message))
                 return out
-            return node.handle(message, 0 if sample is None else sample.stamp_ns)
+            return node.handle(message)
         except Exception as error:
             return self._set_aside(node, message, sample or _sample_of(message), error)
 

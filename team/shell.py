@@ -78,14 +78,14 @@ _PR_SET_PDEATHSIG = 1
 
 @runtime_checkable
 class Node(Protocol):
-    """The interface of a node to its shell: messages and time in, messages out."""
+    """The interface of a node to its shell: messages in, messages out."""
 
     finished: bool
 
     def begin(self) -> list[Outgoing]:
         """Return the node's first messages."""
 
-    def handle(self, message: Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: Message) -> list[Outgoing]:
         """Handle one message; return the answers."""
 
     def status(self) -> Status:

@@ -128,7 +128,7 @@ def driven(
     node: RobotNode, measurements: Sequence[m.Message], *, end: bool = True
 ) -> list[Outgoing]:
     """Run a robot without a centre; `end`: with the end of the stream."""
-    out = [o for measurement in measurements for o in node.handle(measurement, 0)]
+    out = [o for measurement in measurements for o in node.handle(measurement)]
     if end:
         last = measurements[-1]
         ends = (
@@ -136,7 +136,7 @@ def driven(
                 robot=node.robot, incarnation=last.incarnation, measurements=last.number + 1
             ),
         )
-        out += node.handle(m.End(stamp_ns=last.stamp_ns, streams=ends), 0)
+        out += node.handle(m.End(stamp_ns=last.stamp_ns, streams=ends))
     return out
 
 
@@ -257,7 +257,7 @@ class Team:
             return self.mend()
         to, key = self.rng.choice(ready)
         message = self.queues[(to, key)].popleft()
-        self.send(to, self.nodes[to].handle(message, 0))
+        self.send(to, self.nodes[to].handle(message))
         return True
 
     def mend(self) -> bool:
@@ -273,7 +273,7 @@ class Team:
                 continue
             for reply in self.world.measurements(encoded(wanted)):
                 found = True
-                self.send(name, node.handle(decoded(reply), 0))
+                self.send(name, node.handle(decoded(reply)))
         return found
 
     def run(self, limit: int = 100_000) -> None:

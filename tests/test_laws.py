@@ -139,13 +139,11 @@ def test_a_rule_with_feedback_breaks_law_1_and_this_can_be_seen():
     for shift in (0.0, 1.0):
         node, out = robot_node(robot), []
         for measurement in measurements:
-            new = node.handle(measurement, 0)
+            new = node.handle(measurement)
             while new:
                 out += new
                 new = [
-                    answer
-                    for x in of(new, ch.OWN_MAP)
-                    for answer in node.handle(_answer(x, shift), 0)
+                    answer for x in of(new, ch.OWN_MAP) for answer in node.handle(_answer(x, shift))
                 ]
         maps.append([encoded(x) for x in of(out, ch.OWN_MAP)])
     assert maps[0][0] == maps[1][0]
@@ -234,7 +232,7 @@ def test_the_centre_gives_the_same_map_for_any_order_duplicates_and_delays(order
             heard.insert(at, messages()[i])
     node, out = CentralNode(CENTRE, ["r1", "r2"]), []
     for message in heard:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == expected_final()
 
@@ -248,13 +246,13 @@ def test_a_submap_that_comes_behind_the_watermark_changes_no_bit_of_the_final_ma
     ]
     first.sort(key=lambda x: not isinstance(x, m.Liveliness))
     for message in [*first[:2], lost, *first[2:]]:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     closed = of(out, ch.FUSED_MAP)[-1]
     assert [member.robot for member in closed.members] == ["r1"]
     assert not closed.provisional
     rest = [x for x in messages() if x not in first and x not in late]
     for message in [late[0], build.liveliness(node="robot/r2"), *rest, *late[1:]]:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == expected_final()
 

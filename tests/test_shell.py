@@ -21,7 +21,7 @@ class Waiting:
     def begin(self) -> list[Outgoing]:
         return []
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         return []
 
     def status(self) -> m.Status:

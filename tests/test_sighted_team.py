@@ -79,16 +79,16 @@ def test_a_submap_enters_the_map_when_its_last_sighting_has_come(first):
     mine = [x for x in sightings if x.sequence == whole.sequence]
     assert len(mine) == whole.sightings
     centre = Team(STREAMS, SCENARIO.robots, random.Random(4), CENTRE).centre
-    centre.handle(first.sent[ch.START.key(robot)][0], 0)
+    centre.handle(first.sent[ch.START.key(robot)][0])
     for submap in submaps[: whole.sequence]:
-        centre.handle(submap, 0)
+        centre.handle(submap)
     for each in (whole, *mine[:-1]):
-        centre.handle(each, 0)
+        centre.handle(each)
     before = centre.store.processed((robot, whole.incarnation))
-    out = centre.handle(mine[-1], 0)
+    out = centre.handle(mine[-1])
     assert before == whole.sequence
     assert [x.submaps for x in of(out, ch.CENTRAL_PROGRESS)] == [whole.sequence + 1]
-    assert of(centre.handle(mine[-1], 0), ch.CENTRAL_PROGRESS) == []
+    assert of(centre.handle(mine[-1]), ch.CENTRAL_PROGRESS) == []
 
 
 def test_a_run_with_sightings_is_computed_again_to_the_last_bit(samples, tmp_path):

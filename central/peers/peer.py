@@ -90,7 +90,7 @@ class Peer:
         members, self.peer.unsaved = self.peer.unsaved, []
         return members
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Process a message without a key, such as a reply."""
         return self.handle_sample(message, reply_sample(m.tag_of(type(message)), encoded(message)))
 

@@ -179,7 +179,7 @@ class World(Protocol):
     def publish(self, clock_s: float) -> list[Outgoing]:
         """Next measurements; none while it waits or after its end."""
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Handle one message."""
 
 

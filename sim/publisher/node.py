@@ -213,7 +213,7 @@ class WorldNode:
                 pass
         return None
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Process progress, liveliness, configurations and final map; return nothing to send."""
         match message:
             case m.Liveliness():

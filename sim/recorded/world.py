@@ -147,7 +147,7 @@ class RecordedWorld:
             )
         return out or self.publish(clock_s)
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Ignore a message: a log's measurements do not depend on it."""
         return []
 

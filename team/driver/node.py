@@ -191,7 +191,7 @@ class SourceNode:
             )
         return None
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Update the state by progress, liveliness, orders and the final map."""
         if isinstance(message, m.Status) and message.node == "recorder":
             self.run = message.run or self.run

@@ -146,7 +146,7 @@ class RobotShell:
     def _look_for_driver(self) -> None:
         driver = ch.source_node(self.node.robot)
         there = m.Liveliness(stamp_ns=0, node=driver, alive=self.bus.is_alive(driver))
-        self.node.handle(there, 0)
+        self.node.handle(there)
         self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:

@@ -231,8 +231,8 @@ class RobotNode:
 
     # Receive.
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        """Process one message; `now_ns` is unused: stamps are time."""
+    def handle(self, message: m.Message) -> list[Outgoing]:
+        """Process one message; its stamp is the time."""
         if m.is_measurement(message):
             self.inbox.put(message)
         else:

@@ -70,8 +70,8 @@ class Liar(RobotNode):
     def begin(self) -> list[Outgoing]:
         return list(self._spoilt(super().begin()))
 
-    def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
-        return list(self._spoilt(super().handle(message, now_ns)))
+    def handle(self, message: m.Message) -> list[Outgoing]:
+        return list(self._spoilt(super().handle(message)))
 
     def _spoilt(self, out: list[Outgoing]) -> Iterator[Outgoing]:
         for each in out:

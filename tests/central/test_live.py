@@ -34,7 +34,7 @@ class Live:
     def tell(self, *messages):
         for message in messages:
             if self.centre.refusal(message) is None:
-                self.said += self.centre.handle(message, 0)
+                self.said += self.centre.handle(message)
         return self
 
     def robot(self, name, *, state="ended"):
@@ -42,8 +42,8 @@ class Live:
         self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
         node = RobotNode(config(name))
         out = driven(node, measured, end=False)
-        out += node.handle(head(name, len(measured), state), 0)
-        out += [] if state == "ended" else node.handle(ORDER, 0)
+        out += node.handle(head(name, len(measured), state))
+        out += [] if state == "ended" else node.handle(ORDER)
         self.tell(measured[0], head(name, len(measured), state), *(o.message for o in out))
         return self
 
@@ -114,18 +114,18 @@ def test_nothing_waits_for_a_robot_whose_driver_has_not_come_or_is_away():
 def robot_with(count):
     node = RobotNode(config("r1"))
     measured = published(STREAMS["r1"])
-    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=True), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=True))
     for each in measured[:count]:
-        node.handle(each, 0)
+        node.handle(each)
     return node, measured
 
 
 def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
     node, measured = robot_with(5)
     assert node.request() is None
-    node.handle(head("r1", 12, "open"), 0)
+    node.handle(head("r1", 12, "open"))
     assert (node.request().first, node.request().last) == (5, 11)
-    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False))
     assert node.request() is None
     assert "its driver is away after measurement 4" in node.status().warnings[0]
     assert len(measured) > 12
@@ -133,14 +133,14 @@ def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
 
 def test_a_robot_that_is_told_to_end_waits_for_its_driver_and_ends_without_one():
     node, measured = robot_with(5)
-    assert of(node.handle(ORDER, 0), ch.ROBOT_DONE) == []
+    assert of(node.handle(ORDER), ch.ROBOT_DONE) == []
     (done,) = of(
-        node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False), 0), ch.ROBOT_DONE
+        node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False)), ch.ROBOT_DONE
     )
     assert done.measurements == 5
     node, measured = robot_with(len(STREAMS["r1"]))
-    node.handle(ORDER, 0)
-    out = node.handle(head("r1", len(measured)), 0)
+    node.handle(ORDER)
+    out = node.handle(head("r1", len(measured)))
     (done,) = of(out, ch.ROBOT_DONE)
     assert done.measurements == len(measured)
     assert of(out, ch.ROBOT_HEAD) == [head("r1", len(measured))]  # when its driver has gone

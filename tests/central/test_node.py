@@ -50,7 +50,7 @@ class Centre:
         self.said = self.node.begin()
 
     def hears(self, *messages):
-        out = [o for message in messages for o in self.node.handle(message, 0)]
+        out = [o for message in messages for o in self.node.handle(message)]
         self.said += out
         return out
 

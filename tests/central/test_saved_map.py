@@ -189,8 +189,8 @@ def test_a_running_centre_saves_the_map_of_its_present_set():
         half.answer_site(request)
     for number, sample in enumerate(members):
         message = opened(sample)[2]
-        assert [encoded(o.message) for o in half.handle(message, 0)] == [
-            encoded(o.message) for o in undisturbed.handle(message, 0)
+        assert [encoded(o.message) for o in half.handle(message)] == [
+            encoded(o.message) for o in undisturbed.handle(message)
         ]
         if number == len(members) // 2:
             early = decoded(half.answer_site(request)[0], m.SavedMap)

@@ -71,14 +71,14 @@ class Team:
             measurement = self.coming[name].popleft()
             if isinstance(measurement, m.InitialPose):
                 self.sent[name].append(measurement)
-            self.take(self.robots[name].handle(measurement, 0))
+            self.take(self.robots[name].handle(measurement))
 
     def deliver(self, name: str) -> None:
         if self.sent[name]:
             self.to_centre(self.sent[name].popleft())
 
     def to_centre(self, message: m.Message) -> None:
-        self.take(self.centre.handle(message, 0))
+        self.take(self.centre.handle(message))
         self.take(self.centre.refresh())
 
     def take(self, out: list[Outgoing]) -> None:
@@ -89,12 +89,12 @@ class Team:
             if each.channel is ch.TEAM_POSE:
                 self.poses[each.name] = each.message
             if each.channel is ch.PRIOR:
-                self.take(self.robots[each.name].handle(each.message, 0))
+                self.take(self.robots[each.name].handle(each.message))
             elif each.channel is ch.ROBOT_DONE:
                 self.sent[each.name].append(each.message)
             elif each.channel is ch.SUBMAP:
                 self.sent[each.name].append(each.message)
-                self.take(self.robots[each.name].handle(self.credit(each.message), 0))
+                self.take(self.robots[each.name].handle(self.credit(each.message)))
 
     def credit(self, submap: m.Submap) -> m.Progress:
         return build.progress(node="central", robot=submap.robot, submaps=submap.sequence + 1)
@@ -166,7 +166,7 @@ def end_of(team: Team) -> m.End:
         ends.append(end)
     message = m.End(stamp_ns=0, streams=tuple(ends))
     for node in team.robots.values():
-        team.take(node.handle(message, 0))
+        team.take(node.handle(message))
     for name in team.robots:
         while team.sent[name]:
             team.deliver(name)
@@ -252,10 +252,10 @@ def test_a_restarted_process_withdraws_what_the_one_before_it_has_claimed(restar
         withdrawn = newest_prior(team)
         assert not withdrawn.in_team_frame
         again = RobotNode(config("bravo"))
-        out = [o for late in (withdrawn, prior) for o in again.handle(late, 0)]
+        out = [o for late in (withdrawn, prior) for o in again.handle(late)]
         assert not out
         for measurement in measured("bravo", started=False, apart=True)[:6]:
-            out += again.handle(measurement, 0)
+            out += again.handle(measurement)
         first, *more = [o.message for o in out if o.channel is ch.TEAM_POSE]
         assert not first.in_team_frame
         assert not more

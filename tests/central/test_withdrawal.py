@@ -213,9 +213,9 @@ def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
     node = CentralNode(CentralConfig(), ["r1", "r2", "r3", "r4"])
     for robot in ("r1", "r2", "r3", "r4"):
         report = build.withdrawal_heard(robot=robot, withdrawn="r2", reason="it never was")
-        assert node.handle(report, 0) == []
+        assert node.handle(report) == []
     order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="a flat wheel")
-    (repeated,) = node.handle(order, 0)
+    (repeated,) = node.handle(order)
     assert (repeated.key, repeated.message) == ("central/withdrawal/r2", order)
 
 

@@ -427,15 +427,15 @@ def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):
     node = driver._node
     assert node.waits_for == "robot/r1 and central"
     count = driver._journal.count(1)
-    node.handle(build.done(measurements=count, submaps=2), 0)  # fmt: skip
+    node.handle(build.done(measurements=count, submaps=2))  # fmt: skip
     assert not node.is_delivered, "its submaps are in no map yet"
     over = {"stamp_ns": 0, "serial": 1, "digest": bytes(8)}
     final = over | {"sha256": bytes(32), "submaps": 2}
-    node.handle(build.concluded(robot="r2", **final), 0)
+    node.handle(build.concluded(robot="r2", **final))
     assert not node.is_delivered
-    node.handle(build.concluded(robot="r1", **final), 0)
+    node.handle(build.concluded(robot="r1", **final))
     assert node.is_delivered
-    node.handle(build.set_summary(node="robot/r1", holdings=(), statements=(), **over), 0)
+    node.handle(build.set_summary(node="robot/r1", holdings=(), statements=(), **over))
     assert node.waits_for == "robot/r1"
     driver.close()
 

@@ -231,9 +231,9 @@ def centre_session(
     centre = CentralNode(config or CentralConfig(), list(ROBOTS))
     out = centre.begin()
     for robot in ROBOTS:
-        out += centre.handle(build.liveliness(node=f"robot/{robot}"), 0)
+        out += centre.handle(build.liveliness(node=f"robot/{robot}"))
     for message in messages:
-        out += centre.handle(message, 0)
+        out += centre.handle(message)
     for each in [*out, Outgoing(out[0].channel, "central", centre.status())]:
         decoded(encoded(each.message), type(each.message))
     return centre, out
@@ -344,11 +344,11 @@ def robot_session(
         found = valid(message)
         if found is None:
             continue
-        out += node.handle(found, 0)
+        out += node.handle(found)
         answers = [each.message for each in out if isinstance(each.message, m.Submap)]
         if answers:
             out += node.handle(
-                build.progress(node="central", robot=node.robot, submaps=len(answers)), 0
+                build.progress(node="central", robot=node.robot, submaps=len(answers))
             )
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
         decoded(encoded(each.message), type(each.message))

@@ -97,7 +97,7 @@ def test_a_robot_that_was_put_back_says_what_one_says_that_never_had_the_measure
         if measurement is broken:
             without.inbox.next_measurement += 1
         else:
-            said[1] += submaps(without.handle(measurement, 0))
+            said[1] += submaps(without.handle(measurement))
     assert boundary.faults == 1
     assert said[0] == said[1]
     assert len(said[0]) > 5
@@ -212,7 +212,7 @@ def test_an_interrupt_within_native_code_ends_the_run_and_is_no_fault():
     """A callback from native code turns it into a SystemError."""
 
     class Interrupted:
-        def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+        def handle(self, message: m.Message) -> list[Outgoing]:
             raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
     boundary = Boundary("central")

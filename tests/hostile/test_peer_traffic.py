@@ -103,7 +103,7 @@ def test_who_is_not_in_the_team_is_neither_asked_nor_answered_nor_counted():
     assert "not in this team" in node.last_refused
     centre = PeerCentre(CentralConfig(), ROBOTS)
     for name in ("robot/x1", "robot/r2", "recorder"):
-        centre.handle(build.liveliness(node=name), 0)
+        centre.handle(build.liveliness(node=name))
     assert centre.others == {"robot/r2"}
 
 

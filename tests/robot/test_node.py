@@ -91,11 +91,11 @@ noise = st.one_of(
 def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections):
     node, out = RobotNode(config()), []
     for i, measurement in enumerate(MEASUREMENTS):
-        out += node.handle(measurement, 0)
+        out += node.handle(measurement)
         for at, message in interjections:
-            out += node.handle(message, 0) if at == i else []
-    out += node.handle(END, 0)
-    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
+            out += node.handle(message) if at == i else []
+    out += node.handle(END)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
     assert payloads(out) == lonely()
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -105,9 +105,9 @@ def test_the_prior_does_change_the_team_pose():
     poses = []
     for at in (0.0, 3.0):
         node = RobotNode(config())
-        out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
-        out += node.handle(prior(at=at), 0)
-        out += [o for r in MEASUREMENTS[10:] for o in node.handle(r, 0)]
+        out = [o for r in MEASUREMENTS[:10] for o in node.handle(r)]
+        out += node.handle(prior(at=at))
+        out += [o for r in MEASUREMENTS[10:] for o in node.handle(r)]
         poses.append(payloads(out, ch.TEAM_POSE))
     assert len(poses[0]) == len(poses[1]) > 0
     assert poses[0] != poses[1]
@@ -116,8 +116,8 @@ def test_the_prior_does_change_the_team_pose():
 def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
     node = RobotNode(config())
     flat = msgspec.structs.replace(prior(), covariance=packed(-100.0 * np.eye(7)))
-    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
-    out += node.handle(flat, 0)
+    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r)]
+    out += node.handle(flat)
     out += driven(node, MEASUREMENTS[10:])
     assert payloads(out) == lonely()
     assert not of(out, ch.TEAM_POSE)
@@ -128,8 +128,8 @@ def test_a_prior_that_can_not_be_solved_is_a_warning_and_the_robot_goes_on():
 @given(st.permutations(range(len(MEASUREMENTS))), st.lists(st.integers(0, len(MEASUREMENTS) - 1)))
 def test_any_order_of_arrival_and_duplicates_give_the_same_submaps(order, again):
     node = RobotNode(config())
-    out = [o for i in [*order, *again] for o in node.handle(MEASUREMENTS[i], 0)]
-    assert payloads(out + node.handle(END, 0)) == lonely()
+    out = [o for i in [*order, *again] for o in node.handle(MEASUREMENTS[i])]
+    assert payloads(out + node.handle(END)) == lonely()
 
 
 STREAMS = {
@@ -151,10 +151,9 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
     node = node_for(config(front_end=front_end, estimator=estimator, fusion=fusion))
-    node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
     node.handle(
         m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0])),
-        0,
     )
     out = driven(node, measurements)
     (done,) = of(out, ch.ROBOT_DONE)
@@ -235,11 +234,11 @@ def test_submaps_and_maps_name_the_configuration_that_was_announced():
 
 def test_everything_it_sends_passes_the_door():
     node = RobotNode(config())
-    out = [*node.begin(), *node.handle(CENTRE, 0)]
+    out = [*node.begin(), *node.handle(CENTRE)]
     for measurement in MEASUREMENTS:
-        out += node.handle(measurement, 0)
-        out += node.handle(prior(), 0)
-    out += node.handle(END, 0)
+        out += node.handle(measurement)
+        out += node.handle(prior())
+    out += node.handle(END)
     for o in out:
         assert decoded(encoded(o.message), *o.channel.kinds) == o.message
     assert {o.channel for o in out} >= {ch.SUBMAP, ch.OWN_MAP, ch.OWN_POSE, ch.TEAM_POSE}
@@ -248,42 +247,40 @@ def test_everything_it_sends_passes_the_door():
 def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeypatch):
     monkeypatch.setattr(robot_node, "CREDIT_SUBMAPS", 1)
     node = RobotNode(config())
-    node.handle(CENTRE, 0)
-    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
+    node.handle(CENTRE)
+    out = [o for r in MEASUREMENTS for o in node.handle(r)] + node.handle(END)
     assert len(of(out, ch.SUBMAP)) == 2
     out += node.handle(
         m.Progress(
             stamp_ns=0, node="central", robot="r1", incarnation=7, measurements=0, submaps=9
         ),
-        0,
     )
     assert len(of(out, ch.SUBMAP)) == 2, "credit of another incarnation is none"
     out += node.handle(
         m.Progress(
             stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=1
         ),
-        0,
     )
     assert len(of(out, ch.SUBMAP)) == 3
-    out += node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
     assert len(of(out, ch.SUBMAP)) == 3, "another node's token is not the centre's"
-    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False), 0)
+    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
     assert payloads(out) == lonely()
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
 
 def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
     node = RobotNode(config())
-    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r, 0)]
+    out = [o for r in MEASUREMENTS[:10] for o in node.handle(r)]
     second = [
         msgspec.structs.replace(r, incarnation=2, number=r.number - 15) for r in MEASUREMENTS[15:]
     ]
     second[0] = m.InitialPose(
         stamp_ns=second[0].stamp_ns, robot="r1", incarnation=2, number=0, pose=b"", covariance=b""
     )
-    out += [o for r in second for o in node.handle(r, 0)]
+    out += [o for r in second for o in node.handle(r)]
     ends = (m.StreamEnd(robot="r1", incarnation=2, measurements=len(second)),)
-    out += node.handle(m.End(stamp_ns=0, streams=ends), 0)
+    out += node.handle(m.End(stamp_ns=0, streams=ends))
     submaps = of(out, ch.SUBMAP)
     names = [(s.incarnation, s.sequence) for s in submaps]
     assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]
@@ -305,13 +302,13 @@ def feedback(**options):
 
 def test_under_feedback_a_robot_waits_for_the_answer_of_each_exchange():
     node = feedback()
-    out = [o for r in MEASUREMENTS for o in node.handle(r, 0)] + node.handle(END, 0)
+    out = [o for r in MEASUREMENTS for o in node.handle(r)] + node.handle(END)
     assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1]
     before = node.next_measurement
-    assert node.handle(fused(exchange=0), 0) == []
+    assert node.handle(fused(exchange=0)) == []
     assert node.next_measurement == before, "an old answer is none"
     for number in range(1, 5):
-        out += node.handle(fused(ids=(1, 2), at=2.0, exchange=number), 0)
+        out += node.handle(fused(ids=(1, 2), at=2.0, exchange=number))
     assert [x.exchange for x in of(out, ch.OWN_MAP)] == [1, 2, 3, 4]
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -376,12 +373,12 @@ def test_measurements_far_from_their_predictions_are_reported_unless_they_are_ga
 def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
     first, sent = RobotNode(config()), []
     for measurement in MEASUREMENTS[: len(MEASUREMENTS) // 2]:
-        sent += first.handle(measurement, 0)
+        sent += first.handle(measurement)
     kept = [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
     node = RobotNode(config())
     node.take_over(kept)
     for measurement in MEASUREMENTS[node.next_measurement :]:
-        sent += node.handle(measurement, 0)
+        sent += node.handle(measurement)
 
     def answer(**wanted):
         request = encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
@@ -396,7 +393,7 @@ def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
 def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     node = RobotNode(config(), "rendezvous")
     for measurement in MEASUREMENTS:
-        node.handle(measurement, 0)
+        node.handle(measurement)
     assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r1"))) == [
         encoded(MEASUREMENTS[0])
     ]

@@ -78,7 +78,7 @@ def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else():
             submaps=0,
             waited_s=0.0,
         )
-        out = node.handle(seen, 0)
+        out = node.handle(seen)
         assert (len(of(out, ch.SUBMAP)) > 0) == (len(of(out, ch.RENDEZVOUS)) == 1) == bool(count)
         if count:
             assert of(out, ch.RENDEZVOUS)[0].teammates == ()

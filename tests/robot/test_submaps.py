@@ -67,7 +67,7 @@ def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages():
         mean=np.zeros(3).tobytes(),
         covariance=np.eye(3)[np.triu_indices(3)].tobytes(),
     )
-    node.handle(prior, 0)
+    node.handle(prior)
     driven(node, published(stream("r1", 70))[len(published(stream("r1", 60))) :], end=False)
     assert 0 < local_maps() - before <= 2 * CONDENSED
 

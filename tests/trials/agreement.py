@@ -158,7 +158,7 @@ def central_map(scenario: Scenario, samples: list[Sample], order: Member | None)
     for sample in [Sample(order.key, order.payload, 0, 0, 0), *inputs, *ends]:
         found = ch.channel_of(sample.key)
         if found is not None and (found[0] in CHANNELS or found[0] is ch.END):
-            node.handle(opened(sample)[2], 0)
+            node.handle(opened(sample)[2])
     assert node.final is not None
     return encoded(node.final)
 

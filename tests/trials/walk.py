@@ -47,12 +47,12 @@ class Walk:
         """Profile a node's `handle`."""
         handle = node.handle
 
-        def profiled(message: m.Message, now_ns: int) -> Any:
+        def profiled(message: m.Message) -> Any:
             if not self.final and _ends(message):
-                return handle(message, now_ns)
+                return handle(message)
             sys.setprofile(self._note)
             try:
-                return handle(message, now_ns)
+                return handle(message)
             finally:
                 sys.setprofile(None)
 

@@ -187,17 +187,17 @@ class TimedRun:
             node = robot_node(config, exchange)
             handle = node.handle
 
-            def timed(message: m.Message, now_ns: int) -> list[Outgoing]:
+            def timed(message: m.Message) -> list[Outgoing]:
                 with robots:
-                    return handle(message, now_ns)
+                    return handle(message)
 
             node.handle = timed  # type: ignore[method-assign]
             return node
 
         class TimedCentre(node_class(config)):  # type: ignore[misc]
-            def handle(self, message: m.Message, now_ns: int) -> list[Outgoing]:
+            def handle(self, message: m.Message) -> list[Outgoing]:
                 with centre:
-                    out: list[Outgoing] = super().handle(message, now_ns)
+                    out: list[Outgoing] = super().handle(message)
                     return out
 
         return timed_robot, TimedCentre

@@ -95,7 +95,7 @@ def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(mo
     def centre() -> None:
         while not over.wait(0.01):
             for sample in bus.receive(0.0):
-                node.handle(opened(sample)[2], 0)
+                node.handle(opened(sample)[2])
             bus.publish(Outgoing(ch.STATUS, "central", node.status()))
 
     thread = threading.Thread(target=centre, daemon=True)

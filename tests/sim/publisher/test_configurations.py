@@ -23,7 +23,7 @@ def world() -> WorldNode:
     announced = build.configuration(node="world", incarnation=0)
     node = WorldNode(STREAMS, expected, announced, configurations=configurations)
     for name in expected:
-        node.handle(m.Liveliness(stamp_ns=0, node=name, alive=True), 0)
+        node.handle(m.Liveliness(stamp_ns=0, node=name, alive=True))
     return node
 
 
@@ -31,7 +31,7 @@ def announced(node: WorldNode, *others: str) -> None:
     """Announce the world's scenario, or another one by `others`."""
     here, there = expected_configurations(SCENARIO), expected_configurations(OTHER)
     for name in here:
-        node.handle((there if name in others else here)[name], 0)
+        node.handle((there if name in others else here)[name])
 
 
 def test_with_one_configuration_for_all_the_world_begins():

@@ -20,7 +20,7 @@ def world(streams=STREAMS, expected=frozenset(), **options):
 
 
 def alive(node, name, *, here=True):
-    node.handle(m.Liveliness(stamp_ns=0, node=name, alive=here), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node=name, alive=here))
 
 
 def all_of(node, clock=0.0):
@@ -102,17 +102,17 @@ def test_it_is_never_more_than_its_credit_ahead_of_a_living_robot(monkeypatch, s
             assert sent[measurement.robot] - consumed[measurement.robot] <= 5
         (other,) = {"r1", "r2"} - {slow}
         consumed[other] = sent[other]
-        node.handle(progress(other, sent[other]), 0)
+        node.handle(progress(other, sent[other]))
     assert sent[slow] == 5
     assert not node.ended
-    node.handle(progress(slow, 3), 0)
-    node.handle(progress(slow, 1), 0)
+    node.handle(progress(slow, 3))
+    node.handle(progress(slow, 1))
     for measurement in measurements(node.publish(0.0)):
         sent[measurement.robot] += 1
     assert sent[slow] == 8, "progress that comes late takes no credit back"
-    node.handle(progress(slow, 100, incarnation=9), 0)
+    node.handle(progress(slow, 100, incarnation=9))
     assert measurements(node.publish(0.0)) == [], "nor does another incarnation's give any"
-    node.handle(progress(other, 1000), 0)
+    node.handle(progress(other, 1000))
     alive(node, f"robot/{slow}", here=False)
     all_of(node)
     assert node.ended, "a dead robot's credit is freed"
@@ -124,8 +124,8 @@ def test_the_recorder_is_waited_for_while_it_lives(monkeypatch):
     alive(node, "recorder")
     assert len(measurements(node.publish(0.0))) == 10
     assert measurements(node.publish(0.0)) == []
-    node.handle(progress("r1", 2, node="recorder"), 0)
-    node.handle(progress("r2", 2, node="recorder"), 0)
+    node.handle(progress("r1", 2, node="recorder"))
+    node.handle(progress("r2", 2, node="recorder"))
     assert len(measurements(node.publish(0.0))) == 4
     alive(node, "recorder", here=False)
     all_of(node)
@@ -141,13 +141,13 @@ def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(m
         alive(node, "recorder")
         if cache is None:
             assert measurements(node.publish(0.0)) == [], "it has not said yet what its log has"
-            node.handle(progress("r1", sent, node="recorder"), 0)
+            node.handle(progress("r1", sent, node="recorder"))
             assert node.unrecorded == 0
         taken = len(measurements(node.publish(0.0)))
         assert 0 < taken <= 10
         sent += taken
         assert node.unrecorded > 0
-        node.handle(progress("r1", sent, node="recorder"), 0)
+        node.handle(progress("r1", sent, node="recorder"))
         assert node.unrecorded <= 0
         alive(node, "recorder", here=False)
         assert node.unrecorded == 0, "who is not there is not waited for"
@@ -244,9 +244,9 @@ def again(r1: int, r2: int, recorder=None, **options):
     for name in sorted(expected):
         alive(node, name)
     for robot, count in (("r1", r1), ("r2", r2)):
-        node.handle(progress(robot, count), 0)
+        node.handle(progress(robot, count))
         if recorder is not None:
-            node.handle(progress(robot, recorder, node="recorder"), 0)
+            node.handle(progress(robot, recorder, node="recorder"))
     return node
 
 
@@ -267,7 +267,7 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
 
 def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_ever():
     node = world(expected=expected_nodes(["r1", "r2"], recorder=False))
-    node.handle(progress("r1", 7), 0)
+    node.handle(progress("r1", 7))
     assert node.publish(100.0) == []
     assert measurements(node.publish(100.0 + world_node.RESUME_S))
 
@@ -276,7 +276,6 @@ def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot
     node = world()
     node.handle(
         build.progress(stamp_ns=5_000_000_000, incarnation=3, measurements=4),
-        0,
     )
     out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
     assert {r.incarnation for r in out} == {4}
@@ -288,5 +287,5 @@ def test_a_world_begins_without_a_node_that_is_given_up():
     node = world(expected=frozenset({"robot/r1", "recorder"}))
     alive(node, "robot/r1")
     assert node.publish(0.0) == []
-    node.handle(m.GivenUp(stamp_ns=0, node="recorder", by="launch", reason="it died 5 times"), 0)
+    node.handle(m.GivenUp(stamp_ns=0, node="recorder", by="launch", reason="it died 5 times"))
     assert measurements(node.publish(0.0))

@@ -131,7 +131,7 @@ def test_the_last_keyframe_is_used_at_the_end(keyframe_s):
 @pytest.mark.parametrize("estimator", LOCALISERS)
 def test_who_only_localises_himself_says_no_map(estimator):
     node = robot_node(of_name(estimator))
-    out = node.handle(TOLD, 0) + driven(node, MEASUREMENTS)
+    out = node.handle(TOLD) + driven(node, MEASUREMENTS)
     assert of(out, ch.OWN_POSE)
     assert not of(out, ch.OWN_MAP)
     (done,) = of(out, ch.ROBOT_DONE)

@@ -60,12 +60,12 @@ def heard(configs, **options):
     node = make_centre(CentralConfig(fusion="batch", broadcast_s=4.0, **options), sorted(configs))
     out = []
     for name, told in configs.items():
-        out += node.handle(announce_configuration(ch.robot_node(name), 0, 0, told), 0)
+        out += node.handle(announce_configuration(ch.robot_node(name), 0, 0, told))
         for measurement in MEASUREMENTS[name]:
-            out += node.handle(measurement, 0)
-        out += node.handle(build.done(robot=name, measurements=len(MEASUREMENTS[name])), 0)
+            out += node.handle(measurement)
+        out += node.handle(build.done(robot=name, measurements=len(MEASUREMENTS[name])))
     end = build.end(**{name: len(each) for name, each in MEASUREMENTS.items()})
-    return node, out + node.handle(end, 0)
+    return node, out + node.handle(end)
 
 
 def test_a_final_map_that_has_not_converged_says_so(monkeypatch):

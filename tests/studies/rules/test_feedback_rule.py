@@ -25,7 +25,7 @@ def centre(name="kalman", robots=ROBOTS):
 
 def give_up(found, robot):
     order = m.GivenUp(stamp_ns=0, node=f"robot/{robot}", by="operator", reason="lost")
-    return found.handle(order, 0)
+    return found.handle(order)
 
 
 def estimate(robot, number, at=0.0):
@@ -48,7 +48,7 @@ def test_each_round_is_fused_once_in_its_turn_when_nobody_is_missing(order):
     for i, robot in enumerate(order):
         number = order[: i + 1].count(robot)
         sent.add((robot, number))
-        new = of(found.handle(estimate(robot, number, at=float(robot[1:])), 0), ch.FUSED_MAP)
+        new = of(found.handle(estimate(robot, number, at=float(robot[1:]))), ch.FUSED_MAP)
         for fused in new:
             assert all((r, fused.exchange) in sent for r in ROBOTS)
         out += new
@@ -60,13 +60,13 @@ def _in_order():
     found, out = centre(), []
     for number in (1, 2, 3):
         for robot in ROBOTS:
-            out += found.handle(estimate(robot, number, at=float(robot[1:])), 0)
+            out += found.handle(estimate(robot, number, at=float(robot[1:])))
     return [encoded(fused) for fused in of(out, ch.FUSED_MAP)]
 
 
 def test_who_takes_no_part_is_not_waited_for():
     found = centre()
-    assert found.handle(estimate("r1", 1), 0) == []
+    assert found.handle(estimate("r1", 1)) == []
     assert give_up(found, "r2") == []
     (fused,) = of(give_up(found, "r3"), ch.FUSED_MAP)
     assert [member.robot for member in fused.members] == ["r1"]
@@ -74,17 +74,17 @@ def test_who_takes_no_part_is_not_waited_for():
 
 def test_a_centre_that_was_started_again_goes_on_where_the_robots_are():
     found = centre()
-    assert found.handle(estimate("r1", 7), 0) == []
-    assert found.handle(estimate("r2", 7), 0) == []
-    (fused,) = of(found.handle(estimate("r3", 7), 0), ch.FUSED_MAP)
+    assert found.handle(estimate("r1", 7)) == []
+    assert found.handle(estimate("r2", 7)) == []
+    (fused,) = of(found.handle(estimate("r3", 7)), ch.FUSED_MAP)
     assert fused.exchange == 7
 
 
 def test_the_last_map_of_one_who_ended_is_still_fused():
     found = centre(robots=["r1", "r2"])
-    found.handle(estimate("r1", 1, at=8.0), 0)
+    found.handle(estimate("r1", 1, at=8.0))
     give_up(found, "r1")
-    (fused,) = of(found.handle(estimate("r2", 1), 0), ch.FUSED_MAP)
+    (fused,) = of(found.handle(estimate("r2", 1)), ch.FUSED_MAP)
     assert [member.robot for member in fused.members] == ["r1", "r2"]
     assert translate.landmarks_of(fused)[1][0, 0] > 0.0
 
@@ -94,7 +94,7 @@ def test_the_final_map_is_the_last_rounds(name):
     found, out = centre(name), []
     for number in (1, 2):
         for robot in ROBOTS:
-            out += found.handle(estimate(robot, number, at=float(number)), 0)
+            out += found.handle(estimate(robot, number, at=float(number)))
     last = of(out, ch.FUSED_MAP)[-1]
     (final,) = of(found.publish_final(), ch.FINAL_MAP)
     assert final.final

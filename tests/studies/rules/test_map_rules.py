@@ -51,7 +51,7 @@ def value(message):
 def heard(rule, messages, robots=("r1", "r2"), **options):
     node, out = make_centre(CentralConfig(fusion=rule, **options), robots), []
     for message in messages:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     return node, out
 
 
@@ -86,10 +86,10 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     messages = [x for x in TEAM if x != LAST[1] and x != done("r2", 6)]
     node, _ = heard(rule, messages)
     assert not node.finished
-    node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False), 0)
+    node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
     assert not node.finished
     node.handle(
-        m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="it fell into the water"), 0
+        m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="it fell into the water")
     )
     assert (node.final.lost, node.final.provisional) == (("r2",), True)
     assert node.final.members[1] == m.VersionEntry(robot="r2", incarnation=1, sequence=3)

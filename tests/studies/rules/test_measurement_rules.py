@@ -50,7 +50,7 @@ def heard(fusion, messages, robots=("r1", "r2")):
     node = make_centre(CentralConfig(fusion=fusion, particles=PARTICLES, broadcast_s=4.0), robots)
     out: list[Outgoing] = []
     for message in messages:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     return node, out
 
 
@@ -121,7 +121,7 @@ def test_missing_measurements_are_asked_for(fusion):
         build.measurements_request(stamp_ns=node.status().stamp_ns, first=4, last=5)
     ]
     for measurement in MEASUREMENTS["r1"][4:6]:
-        node.handle(measurement, 0)
+        node.handle(measurement)
     assert node.finished
     assert node.requests() == []
 

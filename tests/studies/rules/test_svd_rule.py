@@ -43,7 +43,7 @@ def messages(submaps=SUBMAPS, starts=STARTS):
 def final(heard, rule):
     node, out = make_centre(CentralConfig(fusion=rule, broadcast_s=4.0), ["r1", "r2"]), []
     for message in heard:
-        out += node.handle(message, 0)
+        out += node.handle(message)
     (found,) = of(out, ch.FINAL_MAP)
     return found, out
 
