@@ -6,7 +6,7 @@ import pytest
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments.downs import TABLE_5_1
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
-from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results
+from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results, runs_of
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
@@ -36,7 +36,7 @@ def test_the_map_of_the_first_set_is_drawn_beside_the_errors(tmp_path):
         "truth": [[0.0, 0.0], [0.5, 0.0]],
     }
     robots = {f"r{k}": {"rmse": 0.1 * k, "rmse_aligned": 0.02 * k} for k in range(1, 6)}
-    results = {t.name: {"robots": robots, "sample": sample} for t in TABLE_5_1.tasks(options)}
+    results = {t.name: {"robots": robots, "sample": sample} for t in runs_of(TABLE_5_1, options)}
     outcome = TABLE_5_1.outcome(options, Results(results))
     assert [picture.name for picture in outcome.pictures] == ["errors", "sample-real"]
     for picture in outcome.pictures:

@@ -11,7 +11,7 @@ from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table, runs_of
 from teamslam.sim.studies.experiments.runner import FAILURES, Entry, Plan, compute_outcomes
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
@@ -45,16 +45,13 @@ class Mean:
     def __init__(self, *tasks: Task) -> None:
         self._tasks = list(tasks)
 
-    def tasks(self, _: Options) -> list[Task]:
-        return self._tasks
-
     def outcome(self, _: Options, results: Results) -> Outcome:
         return Outcome("means", {"means": [r["rmse"] for r in results.of_all(self._tasks)]})
 
 
 def plan(*tasks: Task) -> Plan:
-    entry = Entry("means", "", "Means.")
-    return Plan(entry, Options((1,)), Mean(*tasks), tasks)
+    entry, options, mean = Entry("means", "", "Means."), Options((1,)), Mean(*tasks)
+    return Plan(entry, options, mean, runs_of(mean, options))
 
 
 @contextmanager
@@ -100,6 +97,21 @@ def test_what_was_kept_is_not_computed_again_and_a_failed_run_is(tmp_path):
     assert concluded.outcome.figures["means"] == [1.0, 2.0]
 
 
+class Choosy:
+    def outcome(self, _: Options, results: Results) -> Outcome:
+        first = results.of(counted(1.0))
+        return Outcome("choosy", {"second": first and results.of(counted(2.0))})
+
+
+def test_an_outcome_that_asks_for_a_run_only_after_another_is_refused(tmp_path):
+    options = Options((1,))
+    runs = runs_of(Choosy(), options)
+    assert [run.label for run in runs] == ["run 1.0"]
+    hasty = Plan(Entry("choosy", "", "Choosy."), options, Choosy(), runs)
+    with pytest.raises(AssertionError, match=r"run 2\.0"):
+        compute_outcomes([hasty], tmp_path, 1, silent)
+
+
 def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     (done,) = Cases(tmp_path).run([counted(1.0)], 1)
     assert done.result == {"rmse": 1.0}
@@ -117,19 +129,16 @@ def task(value: float, cost: float = 1.0) -> Task:
 
 
 class Values:
-    def tasks(self, options: Options) -> list[Task]:
-        return [task(seed / 8, 1.0 + seed) for seed in options.seeds]
-
     def outcome(self, options: Options, results: Results) -> Outcome:
-        found = [results.of(each)["rmse"] for each in self.tasks(options) if results.of(each)]
+        tasks = [task(seed / 8, 1.0 + seed) for seed in options.seeds]
+        found = [run["rmse"] for run in results.of_all(tasks)]
         return Outcome("values", {"values": found}, (Table("t", ("v",), ((str(found),),)),))
 
 
 @pytest.fixture(autouse=True)
 def _values_instead_of_filters(monkeypatch):
     def planned(entry: Entry, options: Options) -> Plan:
-        experiment = Values()
-        return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
+        return Plan(entry, options, Values(), runs_of(Values(), options))
 
     monkeypatch.setattr(runner, "plan_runs", planned)
 

@@ -7,6 +7,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Goal,
     Options,
     Results,
+    runs_of,
 )
 from teamslam.sim.studies.experiments.team_runs import Figures, over_seeds
 
@@ -48,7 +49,7 @@ def test_a_goal_is_passed_within_its_bounds_only(value, passed):
 
 def test_a_team_that_counts_measurements_twice_misses_the_goals():
     options = Options((1,), quick=True)
-    tasks = accuracy_worlds.tasks(options)
+    tasks = runs_of(accuracy_worlds, options)
     honest = Results({task.name: run(0.5) | _POSES for task in tasks})
     twice = Results({task.name: run(0.5, 2.0) | _POSES for task in tasks})
     reached = [goal.passed for goal in accuracy_worlds.outcome(options, honest).goals]

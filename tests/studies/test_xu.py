@@ -8,7 +8,7 @@ import pytest
 from teamslam.sim.scenarios.scenario import Scenario, load, loads, with_options
 from teamslam.sim.studies.experiments import xu, xu_localisation
 from teamslam.sim.studies.experiments.curves import curves_run
-from teamslam.sim.studies.experiments.experiment import Options, Results
+from teamslam.sim.studies.experiments.experiment import Options, Results, runs_of
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import FIGURE_4_4, FIGURE_5_2
 
@@ -73,7 +73,7 @@ def test_the_coded_inputs_are_the_appendix_numbers():
 
 def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only():
     options = Options((1, 2))
-    task = xu_localisation.tasks(options)[0]
+    task = runs_of(xu_localisation, options)[0]
     run = task.run()
     predicted, weighed, resampled = (run[name] for name in xu_localisation.STAGES)
     assert predicted["effective"] == pytest.approx(xu_localisation.PARTICLES)
@@ -88,7 +88,7 @@ def test_a_measurement_narrows_the_cloud_and_resampling_changes_its_copies_only(
 
 def test_a_start_anywhere_is_found(tmp_path):
     options = Options((3,))
-    tasks = xu_localisation.tasks(options)[:2]
+    tasks = runs_of(xu_localisation, options)[:2]
     results = {task.name: task.run() for task in tasks}
     found = results[tasks[1].name]
     first, *_, last = (found[str(step)] for step in xu_localisation.ANYWHERE_STEPS)

@@ -14,7 +14,6 @@ from teamslam.sim.studies.experiments.experiment import (
     Results,
     combine_outcomes,
 )
-from teamslam.sim.studies.experiments.task import Task
 
 PARTS: tuple[Experiment, ...] = (
     accuracy_worlds,
@@ -29,12 +28,6 @@ _CHANCE = (
     "With so few seeds a mean NEES or a share of runs scatters by more than its goal allows: what "
     "is missed here may be missed by chance. `teamslam experiment accuracy` has 50."
 )
-
-
-def tasks(options: Options) -> list[Task]:
-    """List the runs of all parts, each once."""
-    found = {task.name: task for part in PARTS for task in part.tasks(options)}
-    return list(found.values())
 
 
 def outcome(options: Options, results: Results) -> Outcome:

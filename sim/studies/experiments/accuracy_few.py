@@ -43,11 +43,6 @@ SHOWN: Shown = (
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """Worlds by number of landmarks, and inter-robot measurements."""
-    return [task for case in _cases(options).values() for task in case]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Frequency of wrong maps, warned and silent."""
     figures: dict[str, Figures] = {}

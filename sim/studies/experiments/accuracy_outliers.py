@@ -43,11 +43,6 @@ SHOWN: Shown = (
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """Each world, kind of outlier and seed."""
-    return [task for world in WORLDS for kind in KINDS for task in _tasks(world, kind, options)]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Figures by kind of outlier beside the clean runs."""
     figures: dict[str, dict[str, Figures]] = {}

@@ -33,11 +33,6 @@ def is_wrong(chi2: float) -> bool:
     return chi2 > chi2_limit(3, 0.001)
 
 
-def tasks(options: Options) -> list[Task]:
-    """Each world and seed, with known and unknown starts."""
-    return [task for world in WORLDS for pair in _pairs(world, options) for task in pair]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Maps with and without known initial poses."""
     figures: dict[str, dict[str, Figures]] = {}
@@ -46,8 +41,9 @@ def outcome(options: Options, results: Results) -> Outcome:
     for world in WORLDS:
         pairs = [
             (before, after)
-            for known, unknown in _pairs(world, options)
-            if (before := results.of(known)) and (after := results.of(unknown))
+            for pair in _pairs(world, options)
+            for before, after in ((results.of(task) for task in pair),)
+            if before and after
         ]
         known = over_seeds([before for before, _ in pairs])
         unknown = over_seeds([after for _, after in pairs]) | _merges([after for _, after in pairs])

@@ -45,13 +45,6 @@ ROBOT: Shown = (
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """Each set with and without known starts."""
-    return [
-        task for dataset in options.datasets for task in (team_on(dataset), _unknown_task(dataset))
-    ]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Figures of sets and robots."""
     if not options.datasets:

@@ -71,11 +71,6 @@ SHOWN: Shown = (
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """All worlds, rules and seeds."""
-    return [task for cells in _cells(options).values() for runs in cells.values() for task in runs]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Figures of all worlds and rules; the default rule's goals."""
     worlds: dict[str, dict[str, Figures]] = {}

@@ -69,18 +69,6 @@ FIGURES = (
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """Each axis, value, system and seed; common runs once."""
-    runs = [
-        task
-        for axis in AXES
-        for value in _values(axis, options)
-        for system in SYSTEMS
-        for task in _tasks(axis, value, system, options)
-    ]
-    return list({task.name: task for task in runs}.values())
-
-
 def _values(axis: str, options: Options) -> Sequence[float]:
     values = AXES[axis]
     return values[:: max(len(values) // FEW, 1)] if options.quick else values

@@ -101,10 +101,9 @@ TEAM = "team"
 
 
 class Method(NamedTuple):
-    """Row of a table: name, runs, and a figure per robot or of the team."""
+    """Row of a table: name, and a figure per robot or of the team."""
 
     name: str
-    tasks: Callable[[Options, Dataset], list[Task]]
     row: Callable[[Options, Dataset, Results], Row]
     colour: str
 
@@ -112,14 +111,13 @@ class Method(NamedTuple):
 class Compared(NamedTuple):
     """A paired t-test: its text, its printed p, and its two sides by set.
 
-    before: the other table's row by method. tasks: its runs.
+    before: the other table's row by method.
     """
 
     text: str
     printed_p: float
     before: Mapping[str, Callable[[Options, Dataset, Results], Row]]
     printed_before: Mapping[str, Sequence[float]]
-    tasks: Callable[[Options, Dataset], list[Task]]
 
 
 class PrintedTable(NamedTuple):
@@ -135,16 +133,6 @@ class PrintedTable(NamedTuple):
     remarks: tuple[str, ...]
     compared: Compared | None = None
     sample: Callable[[Options, Dataset], Task] | None = None
-
-    def tasks(self, options: Options) -> list[Task]:
-        """Runs of every method."""
-        found = [
-            task
-            for dataset in options.datasets
-            for tasks in self._sources()
-            for task in tasks(options, dataset)
-        ]
-        return list({task.name: task for task in found}.values())
 
     def outcome(self, options: Options, results: Results) -> Outcome:
         """Rows and pictures of the sets, and the t-tests."""
@@ -184,10 +172,6 @@ class PrintedTable(NamedTuple):
         return Outcome(
             self.title, figures, tables, tuple(pictures), remarks=remarks, missing=missing
         )
-
-    def _sources(self) -> list[Callable[[Options, Dataset], list[Task]]]:
-        compared = [] if self.compared is None else [self.compared.tasks]
-        return [method.tasks for method in self.methods] + compared
 
     def _set(self, options: Options, dataset: Dataset, results: Results) -> dict[str, Row]:
         rows = {}
@@ -303,10 +287,6 @@ def _of_team(options: Options, dataset: Dataset, results: Results, name: str) ->
     return ((results.of(_team(options, dataset)) or {}).get(name),)
 
 
-def _each(task: Callable[[Options, Dataset], Task]) -> Callable[[Options, Dataset], list[Task]]:
-    return lambda options, dataset: [task(options, dataset)]
-
-
 def _number(dataset: Dataset) -> str:
     return "".join(each for each in dataset.name if each.isdigit())
 
@@ -393,16 +373,14 @@ _DIFFERS = (
 
 
 def _pair(
-    tasks: Sequence[Callable[[Options, Dataset], list[Task]]],
     rows: Callable[[int, str], Callable[[Options, Dataset, Results], Row]],
-    names: Sequence[str],
     figures: Sequence[str],
 ) -> tuple[Method, ...]:
     found: list[Method] = []
-    for k, name in enumerate(names):
+    for k, name in enumerate((HIS, OURS)):
         for source in figures:
             full = f"{name}, aligned" if source.endswith("aligned") else name
-            found.append(Method(full, tasks[k], rows(k, source), _COLOURS[len(found)]))
+            found.append(Method(full, rows(k, source), _COLOURS[len(found)]))
     return tuple(found)
 
 
@@ -412,12 +390,7 @@ TABLE_5_1 = PrintedTable(
     "Downs, table 5.1: maps of the EKF, one robot",
     _ROBOTS,
     EKF_MAPS,
-    _pair(
-        [_each(task) for task in _EKFS],
-        lambda k, name: _of_robots(_EKFS[k], name),
-        (HIS, OURS),
-        _MAPS,
-    ),
+    _pair(lambda k, name: _of_robots(_EKFS[k], name), _MAPS),
     (
         _DIFFERS,
         "Ours is the same filter with measurements sampled to half a second. The text explains "
@@ -430,22 +403,13 @@ TABLE_5_2 = PrintedTable(
     "Downs, table 5.2: paths of the EKF, one robot",
     _ROBOTS,
     EKF_PATHS,
-    _pair(
-        [_each(task) for task in _EKFS],
-        lambda k, _: _of_robots(_EKFS[k], "position_rmse"),
-        (HIS, OURS),
-        ("position_rmse",),
-    ),
+    _pair(lambda k, _: _of_robots(_EKFS[k], "position_rmse"), ("position_rmse",)),
     (
         _DIFFERS,
         "The printed paths are some eight times better than the printed maps that they were made "
         "with, in one frame; the source does not explain how a path can be right within 0.04 m in "
         "a map that is wrong by 0.3 m. Rows 3 and 8 of the printed table are equal.",
     ),
-)
-_JOINED = (
-    _each(_spherical),
-    _singles,
 )
 
 
@@ -457,7 +421,7 @@ TABLE_5_3 = PrintedTable(
     "Downs, table 5.3: joined maps, one robot",
     _ROBOTS,
     JOINED_MAPS,
-    _pair(_JOINED, _joined_row, (HIS, OURS), _MAPS),
+    _pair(_joined_row, _MAPS),
     (
         _DIFFERS,
         "A printed error of 0.0000 m is below the accuracy of the landmarks' survey, and rows 6 "
@@ -469,14 +433,13 @@ TABLE_5_3 = PrintedTable(
         P_EKF_JOINED,
         {HIS: _of_robots(_HIS_EKF, "rmse"), OURS: _of_robots(_OUR_EKF, "rmse")},
         EKF_MAPS,
-        lambda options, dataset: [task(options, dataset) for task in _EKFS],
     ),
 )
 TABLE_5_4 = PrintedTable(
     "Downs, table 5.4: smoothed paths, one robot",
     _ROBOTS,
     SMOOTHED_PATHS,
-    _pair(_JOINED, lambda k, _: _joined_row(k, "position_rmse"), (HIS, OURS), ("position_rmse",)),
+    _pair(lambda k, _: _joined_row(k, "position_rmse"), ("position_rmse",)),
     (
         _DIFFERS,
         "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's accuracy of a "
@@ -493,7 +456,7 @@ TABLE_5_5 = PrintedTable(
     "Downs, table 5.5: joined maps of five robots",
     (TEAM,),
     {number: (error,) for number, error in TEAM_MAPS.items()},
-    _pair((_each(_spherical), _each(_team)), _team_row, (HIS, OURS), _MAPS),
+    _pair(_team_row, _MAPS),
     (
         _DIFFERS,
         "He exchanges maps at each mutual sighting. Here the robots' whole maps are aligned once, "
@@ -505,6 +468,5 @@ TABLE_5_5 = PrintedTable(
         P_JOINED_TEAM,
         {HIS: _joined_row(0, "rmse"), OURS: _joined_row(1, "rmse")},
         JOINED_MAPS,
-        lambda options, dataset: [_spherical(options, dataset), *_singles(options, dataset)],
     ),
 )

@@ -44,17 +44,19 @@ class Options:
 
 @dataclass(frozen=True)
 class Results:
-    """Results by task name, without failed runs."""
+    """Results by task name, without failed runs. asked: the tasks asked for, by name."""
 
     by_name: Mapping[str, dict[str, Any]]
+    asked: dict[str, Task] = field(default_factory=dict)
 
     def of(self, task: Task) -> dict[str, Any] | None:
         """Result of one task; None if it failed."""
+        self.asked[task.name] = task
         return self.by_name.get(task.name)
 
     def of_all(self, tasks: Sequence[Task]) -> list[dict[str, Any]]:
         """Existing results, in task order."""
-        return [self.by_name[task.name] for task in tasks if task.name in self.by_name]
+        return [result for task in tasks if (result := self.of(task)) is not None]
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,18 @@ class Outcome:
 class Experiment(Protocol):
     """Interface of an experiment's module."""
 
-    def tasks(self, options: Options) -> list[Task]:
-        """The runs, each once."""
-
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """The outcome of the results."""
+        """The outcome of the results.
+
+        It asks for the same runs whatever their results are, none at first.
+        """
+
+
+def runs_of(experiment: Experiment, options: Options) -> tuple[Task, ...]:
+    """The runs that an experiment's outcome asks for, each once."""
+    results = Results({})
+    experiment.outcome(options, results)
+    return tuple(results.asked.values())
 
 
 def combine_outcomes(title: str, parts: Sequence[Outcome]) -> Outcome:

@@ -48,15 +48,6 @@ class ErrorFigure(NamedTuple):
     printed: Mapping[str, float]
     remarks: tuple[str, ...]
 
-    def tasks(self, options: Options) -> list[Task]:
-        """Every set, method and seed."""
-        return [
-            task
-            for dataset in options.datasets
-            for method in self.methods
-            for task in _runs(dataset, method, options)
-        ]
-
     def outcome(self, options: Options, results: Results) -> Outcome:
         """Medians and bands beside the printed figures, for each set."""
         if not options.datasets:
@@ -199,14 +190,6 @@ class PathFigure(NamedTuple):
     title: str
     methods: tuple[Method, ...]
     remark: str
-
-    def tasks(self, options: Options) -> list[Task]:
-        """One run per method and set."""
-        return [
-            ma_task(dataset, method, options.seeds[0])
-            for dataset in options.datasets
-            for method in self.methods
-        ]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
         """A picture per set, and mean errors."""

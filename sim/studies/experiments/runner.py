@@ -21,6 +21,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
+    runs_of,
 )
 from teamslam.sim.studies.experiments.task import Task
 
@@ -82,7 +83,7 @@ def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
 class Entry(NamedTuple):
     """Command, module, summary.
 
-    module: has `tasks` and `outcome`, or `module:object`. seeds: by default, with --quick, and at
+    module: has `outcome`, or `module:object`. seeds: by default, with --quick, and at
     most in `all`.
     """
 
@@ -179,7 +180,7 @@ def plan_runs(entry: Entry, options: Options) -> Plan:
     name, _, attribute = entry.module.partition(":")
     module = import_module(f"teamslam.sim.studies.experiments.{name}")
     experiment = cast(Experiment, getattr(module, attribute) if attribute else module)
-    return Plan(entry, options, experiment, tuple(experiment.tasks(options)))
+    return Plan(entry, options, experiment, runs_of(experiment, options))
 
 
 def compute_outcomes(
@@ -189,8 +190,12 @@ def compute_outcomes(
     progress: Progress,
 ) -> list[Concluded]:
     """Outcomes of all plans; common tasks run once."""
-    results, failures = compute_runs(tasks_by_name(plans), folder, jobs, progress)
-    return [_conclude(plan, results, failures) for plan in plans]
+    tasks = tasks_by_name(plans)
+    results, failures = compute_runs(tasks, folder, jobs, progress)
+    concluded = [_conclude(plan, results, failures) for plan in plans]
+    unplanned = [task.label for name, task in results.asked.items() if name not in tasks]
+    assert not unplanned, f"asked for only after other runs: {unplanned}"
+    return concluded
 
 
 def tasks_by_name(plans: Sequence[Plan]) -> dict[str, Task]:

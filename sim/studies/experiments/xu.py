@@ -84,15 +84,6 @@ class ErrorFigure(NamedTuple):
     panels: tuple[Panel, ...]
     remarks: tuple[str, ...]
 
-    def tasks(self, options: Options) -> list[Task]:
-        """Every panel, method and seed."""
-        return [
-            task(panel, method, seed)
-            for panel in self.panels
-            for method in panel.methods
-            for seed in options.seeds
-        ]
-
     def outcome(self, options: Options, results: Results) -> Outcome:
         """Medians and bands beside the printed figures."""
         found = {panel.name: self._curves(panel, options, results) for panel in self.panels}

@@ -72,15 +72,6 @@ ERRORS = ErrorFigure(
 )
 
 
-def tasks(options: Options) -> list[Task]:
-    """The three steps, an unknown start, the errors."""
-    return [
-        *(_stages_task(options, seed) for seed in options.seeds),
-        *(_anywhere_task(options, seed) for seed in options.seeds),
-        *ERRORS.tasks(options),
-    ]
-
-
 def outcome(options: Options, results: Results) -> Outcome:
     """Pictures of the steps, the unknown start, the errors."""
     stages = results.of_all([_stages_task(options, seed) for seed in options.seeds])

@@ -61,27 +61,16 @@ class MapFigure(NamedTuple):
     steps: tuple[int, ...]
     remarks: tuple[str, ...]
 
-    def tasks(self, options: Options) -> list[Task]:
-        """Drawn methods and the error figures."""
-        return [
-            each
-            for method, reading in self.shown
-            for each in (
-                self._drawn(method, reading, options),
-                *(_run(method, reading, seed) for seed in options.seeds),
-            )
-        ]
-
     def outcome(self, options: Options, results: Results) -> Outcome:
         """A picture and a row per method."""
         rows, pictures, figures = [], [], {}
         for method, reading in self.shown:
-            run = results.of(self._drawn(method, reading, options))
+            run = results.of(_run(method, reading, options.seeds[0], self.steps))
+            runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             if run is None:
                 continue
             label = _name_of(method, reading)
             pictures += self._pictures(label, run, options.seeds[0])
-            runs = results.of_all([_run(method, reading, seed) for seed in options.seeds])
             curves = [each["map"] for each in runs if each["map"]["time_s"]]
             times = STEP_S * np.array(self.steps, dtype=np.float64)
             errors = np.array(
@@ -103,9 +92,6 @@ class MapFigure(NamedTuple):
         return Outcome(
             self.title, {"rmse_m": figures}, (table,), tuple(pictures), remarks=self.remarks
         )
-
-    def _drawn(self, method: Method, reading: Reading, options: Options) -> Task:
-        return _run(method, reading, options.seeds[0], self.steps)
 
     def _pictures(self, label: str, run: Figures, seed: int) -> list[Picture]:
         name = label.replace(" ", "-").replace(",", "").lower()
@@ -177,21 +163,13 @@ class PathFigure(NamedTuple):
 
     errors: ErrorFigure
 
-    def tasks(self, options: Options) -> list[Task]:
-        """The error figure, and one per panel and method."""
-        drawn = [
-            self._run(panel, method, options)
-            for panel in self.errors.panels
-            for method in panel.methods
-        ]
-        return self.errors.tasks(options) + drawn
-
     def outcome(self, options: Options, results: Results) -> Outcome:
         """A picture per panel, then the errors."""
         pictures = []
         for panel in self.errors.panels:
             runs = [
-                (method, results.of(self._run(panel, method, options))) for method in panel.methods
+                (method, results.of(curves_of(panel, method, options.seeds[0], (STEPS,))))
+                for method in panel.methods
             ]
             drawn = [(method.name, run["shots"][0]) for method, run in runs if run is not None]
             if drawn:
@@ -206,9 +184,6 @@ class PathFigure(NamedTuple):
         return combine_outcomes(
             errors.title, (Outcome(errors.title, {}, pictures=tuple(pictures)), errors)
         )
-
-    def _run(self, panel: Panel, method: Method, options: Options) -> Task:
-        return curves_of(panel, method, options.seeds[0], (STEPS,))
 
 
 def _draw_side_by_side(title: str, drawn: Sequence[tuple[str, Figures]], path: Path) -> None:
