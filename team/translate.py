@@ -71,16 +71,17 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     Detections without identities have the numbers 2³¹ + their index in the message, until their
     window associates them.
     """
-    if isinstance(message, m.Detections):
-        seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
-    else:
-        seen = ids(message.ids, "ids")
     claimed = None
     if message.covariances:
-        claimed = floats(message.covariances, "covariances").astype(np.float64).reshape(-1, 3)
-    if isinstance(message, m.Points):
-        positions = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
-        return point_scan(seen, positions, claimed)
+        claimed = floats(message.covariances, "covariances").reshape(-1, 3)
+    match message:
+        case m.Observations():
+            seen = ids(message.ids, "ids")
+        case m.Points():
+            positions = floats(message.positions, "positions").reshape(-1, 2)
+            return point_scan(ids(message.ids, "ids"), positions, claimed)
+        case m.Detections():
+            seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
     ranges, bearings = floats(message.ranges, "ranges"), floats(message.bearings, "bearings")
     return polar_scan(seen, ranges, bearings, claimed)
 

@@ -41,16 +41,16 @@ class Ledger:
         number, disposition = measurement.number, self.used
         if rejected is not None:
             disposition = rejected.disposition
-        elif isinstance(measurement, m.AnyOdometry):  # first: most measurements are
+        elif m.is_odometry(measurement):  # first: most measurements are
             pass
-        elif isinstance(measurement, m.InitialPose):
+        elif type(measurement) is m.InitialPose:
             disposition = INITIAL_POSE
-        elif isinstance(measurement, m.Sightings | m.Fix):
+        elif type(measurement) in (m.Sightings, m.Fix):
             self._sighted.add(number)
             disposition = IN_SIGHTING
         else:
             self._scans[number] = measurement.stamp_ns
-            if isinstance(measurement, m.Detections):
+            if type(measurement) is m.Detections:
                 self._detections[number] = measurement.stamp_ns
         self.counts[disposition] += 1
         if self._on_disposition is not None:

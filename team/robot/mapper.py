@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.door import another_time
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
@@ -146,7 +146,7 @@ class Mapper:
         """Take the next measurement; return whether it closed a window."""
         self._taking = measurement
         self.note_input(measurement.number)
-        if isinstance(measurement, m.AnyOdometry):
+        if m.is_odometry(measurement):
             return self.drive(measurement)
         self.account(measurement, self._observe(measurement))
         return False
@@ -219,15 +219,15 @@ class Mapper:
     def _observe_landmarks(
         self, measurement: m.AnyScan | m.Detections, beyond: Rejection | None
     ) -> Rejection | None:
-        if isinstance(measurement, m.Detections) and not self.associates:
+        if type(measurement) is m.Detections and not self.associates:
             return Rejection.NO_ASSOCIATION
-        scan = translate.scan_of(measurement)
-        near = self._judge.near(scan.ranges)
-        if scan.own.size:
-            near &= sensible(scan.own, scan.ranges, self.config.bounds)
         if beyond is not None:
             return beyond
-        if not all(near.tolist()):  # so few are tested sooner as a list
+        scan, bounds = translate.scan_of(measurement), self.config.bounds
+        if scan.own.size or not core.largest(scan.ranges) <= bounds.extent_m:
+            near = self._judge.near(scan.ranges)
+            if scan.own.size:
+                near &= sensible(scan.own, scan.ranges, bounds)
             if not near.any():
                 return Rejection.RANGE
             scan = scan.only(near)

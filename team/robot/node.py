@@ -58,7 +58,7 @@ class StreamAccount:
     def count(self, measurement: m.Measurement) -> None:
         """Count a measurement that is consumed next."""
         self.consumed = measurement.number + 1
-        if isinstance(measurement, m.AnyOdometry):
+        if m.is_odometry(measurement):
             self.steps += 1
             self.all_steps += 1
 

@@ -194,11 +194,17 @@ class Fix(Measurement, frozen=True, kw_only=True, tag="fix/1"):
 
 
 _CLASSES = frozenset(Measurement.__subclasses__())
+_OF_ODOMETRY = frozenset({Odometry, Increment, Steering})
 
 
 def is_measurement(message: Message) -> TypeGuard[Measurement]:
     """Return whether a message is a measurement, in a tenth of the time of `isinstance`."""
     return type(message) in _CLASSES
+
+
+def is_odometry(message: Message) -> TypeGuard[AnyOdometry]:
+    """Return whether a message is an odometry interval, as fast as `is_measurement`."""
+    return type(message) in _OF_ODOMETRY
 
 
 class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
