@@ -9,8 +9,8 @@ from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, compa
 NEWEST = 4
 """Number of newest ticks whose checkpoints are all kept; of older ones as many per doubling of
 age."""
-NEAR = 4
-"""Number of newest checkpoints that keep their condensed fold."""
+NEAR = 2
+"""Number of newest checkpoints that keep their condensed fold, and all that they have computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,10 @@ class Checkpoints:
 
     def push(self, tick: int, fold: Fold) -> None:
         """Push the fold after a tick; compact older ones and thin them by age."""
-        *before, last = self.kept or (None,)
-        number = 1 if last is None else last.number + 1
-        older = () if last is None else (*before, _compacted(last))
-        keep = thinned((*older, Checkpoint(tick, fold, self.tested, number)))
-        far = (each if each.ahead is None else replace(each, ahead=None) for each in keep[:-NEAR])
-        self.kept = (*far, *keep[-NEAR:])
+        number = self.kept[-1].number + 1 if self.kept else 1
+        keep = (*self.kept, Checkpoint(tick, fold, self.tested, number))
+        gone_by = map(_compacted, keep[-NEAR - 1 : -NEAR])
+        self.kept = thinned((*keep[: -NEAR - 1], *gone_by, *keep[-NEAR:]))
 
     def condense(self, fold: Fold, limits: Limits) -> Fold:
         """Condense a fold, the newest checkpoint's once."""
@@ -80,8 +78,7 @@ class Checkpoints:
 
 
 def _compacted(checkpoint: Checkpoint) -> Checkpoint:
-    ahead = None if checkpoint.ahead is None else compact_fold(checkpoint.ahead)
-    return replace(checkpoint, fold=compact_fold(checkpoint.fold), ahead=ahead)
+    return replace(checkpoint, fold=compact_fold(checkpoint.fold), ahead=None)
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:

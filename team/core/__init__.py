@@ -114,6 +114,7 @@ from teamslam.team.core._core import (  # noqa: E402 - the level is chosen befor
     on_group,
     own_blocks,
     packed,
+    packed_upper,
     place,
     pose_bytes,
     predict,
@@ -135,6 +136,8 @@ from teamslam.team.core._core import (  # noqa: E402 - the level is chosen befor
     tangent,
     transformed,
     unpacked,
+    unpacked_upper,
+    upper_and_product,
     width,
     wrapped,
 )
@@ -214,6 +217,7 @@ __all__ = [
     "on_group",
     "own_blocks",
     "packed",
+    "packed_upper",
     "place",
     "pose_bytes",
     "predict",
@@ -235,6 +239,8 @@ __all__ = [
     "tangent",
     "transformed",
     "unpacked",
+    "unpacked_upper",
+    "upper_and_product",
     "width",
     "wrapped",
 ]

@@ -353,6 +353,20 @@ def add_product(a: NDArray[numpy.float64], b: NDArray[numpy.float64], c: NDArray
     lower triangular, entries above its diagonal count as zero.
     """
 
+def upper_and_product(U: NDArray[numpy.float64], among: NDArray[numpy.int64], size: int, A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """
+    Add the upper triangle of U among some ascending rows and columns and that of A B, at the corner of a square of
+    `size` rows. Below the diagonal U is not read and the result is undefined.
+    """
+
+def packed_upper(U: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
+    """Pack the upper triangle, row after row."""
+
+def unpacked_upper(packed: NDArray[numpy.float64], n: int) -> NDArray[numpy.float64]:
+    """
+    Unpack an upper triangle to a square matrix with zeros below the diagonal.
+    """
+
 def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.

@@ -136,6 +136,7 @@ Normal Submap::unbiased_normal(const Numbers& shifted, Values state, Indices at)
 
 Normal Submap::normal(Values state, Indices at) const {
   Normal found = unbiased_normal(shifted_mean(state, at), state, at);
+  if (!biases()) return found;
   dense::Matrix& H = found.hessian;
   const std::size_t n = size(), first = n + 3;
   const auto [s, c] = elementary::sin_cos(state[at[0] + 2]);
@@ -143,16 +144,14 @@ Normal Submap::normal(Values state, Indices at) const {
   for (std::size_t b = 0; b < biases(); b++) {
     double* row = turned[b];
     each_point(*this, [&, s = s, c = c](std::size_t i) { turn(row[i], row[i + 1], c, s); });
-    for (std::size_t a = 0; a < first; a++) {
-      double total = 0.0;
-      for (std::size_t j = 0; j < n; j++) total += H[a][3 + j] * row[j];
-      H[a][first + b] = H[first + b][a] = -total;
-    }
     for (std::size_t j = 0; j < n; j++) found.gradient[first + b] -= row[j] * found.gradient[3 + j];
   }
+  const dense::Matrix cross = dense::product(H.view().part(0, 3, first, n), dense::transposed(turned));
+  for (std::size_t a = 0; a < first; a++)
+    for (std::size_t b = 0; b < biases(); b++) H[a][first + b] = H[first + b][a] = -cross[a][b];
+  const dense::Matrix own = dense::product(turned, cross.view().part(3, 0, n, biases()));
   for (std::size_t b = 0; b < biases(); b++)
-    for (std::size_t other = 0; other < biases(); other++)
-      for (std::size_t j = 0; j < n; j++) H[first + other][first + b] -= turned[other][j] * H[3 + j][first + b];
+    for (std::size_t other = 0; other < biases(); other++) H[first + other][first + b] = own[other][b];
   return found;
 }
 

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -48,17 +47,20 @@ class SubmapCosts:
     @property
     def chi2(self) -> Values:
         """χ² of each."""
-        return self.table[0]
+        chi2: Values = self.table[0]
+        return chi2
 
     @property
     def dof(self) -> Values:
         """Degrees of freedom of each."""
-        return self.table[1]
+        dof: Values = self.table[1]
+        return dof
 
     @property
     def weight(self) -> Values:
         """Robust weight of each."""
-        return self.table[2]
+        weight: Values = self.table[2]
+        return weight
 
     @cached_property
     def of_robots(self) -> Mapping[str, list[int]]:
@@ -115,7 +117,7 @@ class Departed(NamedTuple):
 
 def select_newest(submaps: SubmapCosts) -> SubmapCosts:
     """Select the costs of the last HISTORY submaps of each stream."""
-    counts, older = Counter(submaps.streams), []
+    counts, older = Counter(submaps.streams), list[int]()
     beyond = sum(max(count - HISTORY, 0) for count in counts.values())
     for place, stream in enumerate(submaps.streams):
         if len(older) == beyond:
@@ -151,12 +153,14 @@ class Resting:
         """The upper triangle of a square matrix; the rest is not read."""
         if self.covariance.ndim == 2:
             return self.covariance
-        return unpacked_of(self.covariance, len(self.means))
+        return core.unpacked_upper(self.covariance, len(self.means))
 
     @property
     def packed(self) -> "Resting":
         """The same in half the memory."""
-        packed = packed_of(self.covariance) if self.covariance.ndim == 2 else self.covariance
+        packed = (
+            core.packed_upper(self.covariance) if self.covariance.ndim == 2 else self.covariance
+        )
         return replace(self, covariance=packed)
 
     @cached_property
@@ -263,35 +267,6 @@ def tie_nodes(
         cost=old.cost + float(2.0 * dense.product(old.slope, moved) + dense.product(moved, half)),
         departed=departed,
     )
-
-
-def upper_of(upper: Matrix, chosen: Indices, size: int) -> Float[np.ndarray, "m m"]:
-    """Return the upper triangle among ascending numbers, at the corner of a larger matrix.
-
-    Below the diagonal the result is undefined.
-    """
-    result = np.zeros((size, size))
-    begins = np.flatnonzero(np.diff(chosen, prepend=-2) != 1).tolist()
-    runs = [slice(begin, end) for begin, end in pairwise([*begins, len(chosen)])]
-    origins = [slice(chosen[run.start], chosen[run.stop - 1] + 1) for run in runs]
-    for k, (rows, of_rows) in enumerate(zip(runs, origins, strict=True)):
-        for columns, of_columns in zip(runs[k:], origins[k:], strict=True):
-            result[rows, columns] = upper[of_rows, of_columns]
-    return result
-
-
-def packed_of(upper: Matrix) -> Float[np.ndarray, " _"]:
-    """Pack the upper triangle, row after row."""
-    return np.concatenate([np.zeros(0), *(row[a:] for a, row in enumerate(upper))])
-
-
-def unpacked_of(packed: Float[np.ndarray, " _"], size: int) -> Matrix:
-    """Unpack to a square matrix with zeros below the diagonal."""
-    result, at = np.zeros((size, size)), 0
-    for a in range(size):
-        result[a, a:] = packed[at : at + size - a]
-        at += size - a
-    return result
 
 
 def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:

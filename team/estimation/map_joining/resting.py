@@ -14,7 +14,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.map_joining.condensed_factor import Resting, between, places, upper_of
+from teamslam.team.estimation.map_joining.condensed_factor import Resting, between, places
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.landmark_view import resting_of
 from teamslam.team.estimation.map_joining.submap_graph import Graph, append_nodes
@@ -100,8 +100,7 @@ def put_to_rest(
     covariance = dense.product(root.T, root)
     spread = dense.product(on_out, covariance)
     n, total = len(means), len(means) + 2 * len(nodes)
-    upper = upper_of(before.upper, np.arange(n), total)
-    core.add_product(spread, np.ascontiguousarray(on_out.T), upper, upper=True)
+    upper = core.upper_and_product(before.upper, np.arange(n), total, spread, on_out.T)
     upper[:n, n:] = spread[:, rests[at_rest]]
     upper[n:, n:] = covariance[np.ix_(rests[at_rest], rests[at_rest])]
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
@@ -135,8 +134,7 @@ def wake_landmarks(island: Island, ids: Collection[int]) -> Island:
     cross = between(rest.upper, left, out)
     share = dense.product(cross, precision)
     core.add_product(-share, np.ascontiguousarray(gain), remaining)
-    upper = upper_of(rest.upper, left, len(left))
-    core.add_product(-share, np.ascontiguousarray(cross.T), upper, upper=True)
+    upper = core.upper_and_product(rest.upper, left, len(left), -share, cross.T)
     points = rest.means[out] + dense.product(gain, old.moved(island.state, graph.boundary))
     grown, state, nodes = append_nodes(graph, island.state, [*points.reshape(-1, 2)])
     awake = dict(zip(rest.ids[wakes].tolist(), nodes, strict=True))
