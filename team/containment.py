@@ -58,14 +58,6 @@ class Boundary:
         message = self.let_in(sample, lambda: opened(sample)[2])
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
-    def take_reply(
-        self, node: Handler, key: str, payload: bytes, expected: type[m.Message]
-    ) -> list[Outgoing]:
-        """Handle a reply to a query on `key`, which must be of the expected type."""
-        sample = reply_sample(key, payload)
-        message = self.let_in(sample, lambda: reply_of(payload, expected))
-        return message if isinstance(message, list) else self.hand(node, message, sample)
-
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
         """Decode a sample; return its message, or the messages to publish if it is invalid."""
         try:
@@ -83,21 +75,21 @@ class Boundary:
 
         sample: the message as it arrived; None: encode it if needed.
         """
-        if self.aside and _name(sample or _sample_of(message)) in self.aside:
+        if self.aside and _name(sample or sample_of(message)) in self.aside:
             return []
         try:
             refusal = getattr(node, "refusal", None)
             refused = None if refusal is None else refusal(message)
             if refused is not None:
-                self.refuse(sample or _sample_of(message), refused)
+                self.refuse(sample or sample_of(message), refused)
                 return []
             handle_sample = getattr(node, "handle_sample", None)
             if handle_sample is not None:
-                out: list[Outgoing] = handle_sample(message, sample or _sample_of(message))
+                out: list[Outgoing] = handle_sample(message, sample or sample_of(message))
                 return out
             return node.handle(message)
         except Exception as error:
-            return self._set_aside(node, message, sample or _sample_of(message), error)
+            return self._set_aside(node, message, sample or sample_of(message), error)
 
     def _set_aside(
         self, node: Handler, message: m.Message, sample: Sample, error: Exception
@@ -158,13 +150,9 @@ class Boundary:
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
 
 
-def reply_sample(key: str, payload: bytes) -> Sample:
-    """Convert a reply to a sample without stamp and counter."""
-    return Sample(key, payload, 0, 0, -1)
-
-
-def _sample_of(message: m.Message) -> Sample:
-    return reply_sample(m.tag_of(type(message)), encoded(message))
+def sample_of(message: m.Message) -> Sample:
+    """Convert a message that came without a sample, on no key."""
+    return Sample(m.tag_of(type(message)), encoded(message), 0, 0, -1)
 
 
 def reply_of(payload: bytes, expected: type[M]) -> M:

@@ -63,5 +63,5 @@ class MissingMeasurements:
         for reply in replies:
             with suppress(WireError):  # the door counts it
                 self._confirm(reply_of(reply, m.Measurement))
-        self._shell.take_replies(ch.MEASUREMENTS, requested.robot, replies, m.Measurement)
+        self._shell.take_replies(ch.MEASUREMENTS, requested.robot, replies)
         return len(replies)

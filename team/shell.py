@@ -17,7 +17,7 @@ import msgspec
 from teamslam.team.config import MAP
 from teamslam.team.containment import Boundary
 from teamslam.team.end_query import EndQuery
-from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample
+from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample, read_reply
 from teamslam.team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.messages import FusedMap, Liveliness, Message, Status, Tally, tag_of
@@ -215,13 +215,15 @@ class Shell:
             if self._is_running:
                 self.report()
 
-    def take_replies(
-        self, channel: Channel, name: str, replies: Iterable[bytes], expected: type[Message]
-    ) -> None:
-        """Handle the replies to a query as `take` does; each must be of the expected type."""
+    def take_replies(self, channel: Channel, name: str, replies: Iterable[bytes]) -> None:
+        """Handle the replies to a query as `take` does."""
         for reply in replies:
-            key = channel.key(name)
-            self.publish(self.boundary.take_reply(self.node, key, reply, expected))
+            try:
+                sample = read_reply(channel, name, reply, 0)
+            except WireError as error:
+                self.boundary.refuse(Sample(channel.key(name), reply, 0, 0, -1), str(error))
+            else:
+                self.publish(self.boundary.take(self.node, sample))
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer queries; an exception is a fault and is reported to the sender of the query."""

@@ -17,7 +17,7 @@ from teamslam.team.containment import Boundary
 from teamslam.team.peers.members import Member
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.bus import Outgoing, Sample, read_reply
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
 from tests.air import Air
@@ -141,9 +141,8 @@ class PeerTeam:
                 stamp_ns=0, robot=config.id, incarnation=incarnation, first=first, last=-1
             )
             for reply in world.measurements(encoded(request)):
-                key = ch.MEASUREMENTS.key(config.id)
-                outgoing = seat.boundary.take_reply(seat.node, key, reply, m.Measurement)
-                self._say(config.id, outgoing)
+                sample = read_reply(ch.MEASUREMENTS, config.id, reply, 0)
+                self._say(config.id, seat.boundary.take(seat.node, sample))
             if seat.node.node.next_measurement == first:
                 break
         self._catch_up(config.id, seat)

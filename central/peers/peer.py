@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.peers.fold import FoldWhen, PeerFold
-from teamslam.team.containment import Boundary, reply_sample
+from teamslam.team.containment import Boundary, sample_of
 from teamslam.team.peers.members import CHANNELS, Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.peers.proofs import OPERATOR, Proofs
@@ -92,7 +92,7 @@ class Peer:
 
     def handle(self, message: m.Message) -> list[Outgoing]:
         """Process a message without a key, such as a reply."""
-        return self.handle_sample(message, reply_sample(m.tag_of(type(message)), encoded(message)))
+        return self.handle_sample(message, sample_of(message))
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
         """Process a message of a robot, a peer, the world or an operator."""

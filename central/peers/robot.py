@@ -136,9 +136,6 @@ class PeerRobot(Peer):
             if isinstance(message, m.InitialPose) and name == self.robot:
                 out += self._vouched(Outgoing(ch.START, name, message))
             out += self.grown()
-        elif isinstance(message, m.InitialPose) and message.robot == self.robot:
-            # a reply of the source has no key
-            out = self._vouched(Outgoing(ch.START, self.robot, message)) + self.grown()
         own = isinstance(message, m.Measurement) and message.robot == self.robot
         if own or isinstance(message, m.Rendezvous):
             out = self._to_estimator(message, sample) + out

@@ -10,8 +10,8 @@ from teamslam.team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing, Sample
-from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.bus import Outgoing, Sample, read_reply
+from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.support import example, submap
@@ -158,8 +158,8 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
         out += given(boundary, node, (channel, "r1", message))
         assert (boundary.refused, why in boundary.last_refused) == (count, True), why
     reply = encoded(msgspec.structs.replace(odometry, robot="r2"))
-    out += boundary.take_reply(node, "source/r1/measurements", reply, m.Measurement)
-    assert "a measurement of r2" in boundary.last_refused
+    with pytest.raises(WireError, match="of 'r2' is no reply to 'source/r1/readings'"):
+        read_reply(ch.MEASUREMENTS, "r1", reply, 0)
     out += given(boundary, node, *measurements[8:], (ch.END, "", END))
     assert [encoded(each) for each in of(out, ch.SUBMAP)] == [
         encoded(each) for each in of(wanted, ch.SUBMAP)
