@@ -31,13 +31,15 @@ class Checkpoint:
 class Checkpoints:
     """A stack of checkpoints by tick; a late input pops those that lack it."""
 
-    def __init__(self) -> None:
+    def __init__(self, empty: Fold = EMPTY_FOLD) -> None:
+        """Begin with a fold without submaps, which may have cuts."""
         self.kept: tuple[Checkpoint, ...] = ()
+        self._empty = empty
 
     @property
     def fold(self) -> Fold:
         """The fold over all ticks so far."""
-        return self.kept[-1].fold if self.kept else EMPTY_FOLD
+        return self.kept[-1].fold if self.kept else self._empty
 
     @property
     def tick(self) -> float:

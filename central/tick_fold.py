@@ -24,6 +24,7 @@ ticks again with nothing condensed (but see FULL_UNNAMED).
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
@@ -50,6 +51,7 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -57,6 +59,7 @@ from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
     solve_fold,
 )
+from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
 from teamslam.team.estimation.map_joining.saved_maps import contradiction
@@ -67,6 +70,8 @@ COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
 GROWTH = 1.25
 """Growth of the set after which suspects that were not withdrawn are tested again."""
+LATE_CUTS = 3
+"""Most seams that the final map cuts beside those of running maps."""
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
 ticks decide which observations are one landmark. With more, which would take hours, it starts from
@@ -351,9 +356,14 @@ class TickFold:
         return other
 
     def _fold_others(
-        self, robots: Collection[str], until_ns: float, limits: Limits | None
+        self,
+        robots: Collection[str],
+        until_ns: float,
+        limits: Limits | None,
+        cuts: tuple[Seam, ...] = (),
     ) -> "TickFold":
         other = TickFold(self._config, limits, self._inputs)
+        other.checkpoints = Checkpoints(replace(EMPTY_FOLD, cuts=cuts))
         other.convicts = other._tries = False
         other._ordered = self._gone.union(robots)
         other.fold_until(until_ns)
@@ -429,7 +439,19 @@ class TickFold:
                 return fold
             fold = solve_fold(fold, self.settings)
             if not self._convict(fold, math.inf) and not self.suspended:
-                return fold
+                return self._cut_late(fold)
+
+    def _cut_late(self, fold: Fold) -> Fold:
+        """Fold again with the seams that only later submaps show (`late_seams`)."""
+        for _ in range(LATE_CUTS):
+            if not fold.has_unnamed or fold.condensed_count:
+                break
+            seam = find_late_seam(fold.main)
+            if seam is None:
+                break
+            again = self._fold_others((), math.inf, None, (*fold.cuts, seam)).fold
+            fold = solve_fold(again, self.settings)
+        return fold
 
     def _fold_raw(self) -> Fold:
         fold = self.fold

@@ -1,8 +1,9 @@
-"""Landmarks of a saved map that today's robots should have observed and have not.
+"""Landmarks that robots should have observed and have not.
 
-The probability p(d) to observe a landmark at distance d from a submap's path is learnt from today's
-landmarks, at most that of a window beside it (`visibility.OVERLOOKED`). A landmark at distances d_s
-is expected Σ p(d_s) times and missed by all with probability Π (1 − p(d_s)).
+The probability p(d) to observe a landmark at distance d from a submap's path is learnt from the
+robots' own landmarks. One of a saved map at distances d_s is expected Σ p(d_s) times, each at most
+that of a window beside it (`visibility.OVERLOOKED`), and missed by all with probability
+Π (1 − p(d_s)).
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from teamslam.team.estimation.association.visibility import OVERLOOKED
 from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.submap_graph import Joined
-from teamslam.team.shapes import Float
+from teamslam.team.shapes import Bool, Float
 
 BINS = 8
 """Number of distances at which the probability of an observation is learnt."""
@@ -41,20 +42,45 @@ def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
         return [Absence(0.0, 1.0)] * len(points)
     at = island.graph.offset[nodes]
     own = np.column_stack([island.state[at], island.state[at + 1]])
-    paths = [_path(island, each) for each in submaps]
-    away = np.array([_distances(path, own) for path in paths])
+    paths = [path_of(island, each) for each in submaps]
+    away = np.array([distances(path, own) for path in paths])
     seen = np.array([np.isin(nodes, each.landmarks) for each in submaps])
-    edges = np.quantile(away[seen], REACH * np.arange(1, BINS + 1) / BINS)
-    of = np.searchsorted(edges, away)
-    total = np.bincount(of.ravel(), minlength=BINS + 1)[:BINS]
-    found = np.bincount(of.ravel(), seen.ravel(), minlength=BINS + 1)[:BINS]
-    rate = np.append(np.minimum(found / np.maximum(total, 1), 1.0 - OVERLOOKED), 0.0)
-    p = rate[np.searchsorted(edges, np.array([_distances(path, points) for path in paths]))]
+    rate = learn_rate(away.ravel(), seen.ravel())
+    p = np.array([rate.at(distances(path, points)) for path in paths])
+    p = np.minimum(p, 1.0 - OVERLOOKED)
     expected, missed = p.sum(axis=0), core.exp(core.log(1.0 - p).sum(axis=0))
     return [Absence(*each) for each in zip(expected.tolist(), missed.tolist(), strict=True)]
 
 
-def _path(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
+class DetectionRate(NamedTuple):
+    """Probability to observe a landmark by its distance from a path, between edges [m]; 0 beyond
+    the last.
+    """
+
+    edges: Float[np.ndarray, " bins"]
+    rates: Float[np.ndarray, " _"]
+
+    def at(self, away: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Return the probability at distances [m]."""
+        return np.asarray(self.rates[np.searchsorted(self.edges, away)])
+
+
+def learn_rate(
+    away: Float[np.ndarray, " N"], seen: Bool[np.ndarray, " N"], unseen: float = 0.0
+) -> DetectionRate:
+    """Learn the rate from distances [m] of landmarks and whether each was observed.
+
+    unseen: number of missed landmarks that each bin begins with.
+    """
+    edges = np.quantile(away[seen], REACH * np.arange(1, BINS + 1) / BINS)
+    of = np.searchsorted(edges, away)
+    total = np.bincount(of, minlength=BINS + 1)[:BINS]
+    found = np.bincount(of, seen, minlength=BINS + 1)[:BINS]
+    return DetectionRate(edges, np.append(found / np.maximum(total + unseen, 1.0), 0.0))
+
+
+def path_of(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
+    """Return points of a submap's path [m]."""
     poses = len(submap.contribution.local.node_stamps)
     start, end, *between = submap.nodes[: 2 + poses].tolist()
     at = island.graph.offset[[start, *between, end]]
@@ -64,9 +90,10 @@ def _path(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
     return np.concatenate([*parts, corners[-1:]])
 
 
-def _distances(
+def distances(
     path: Float[np.ndarray, "K 2"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, " n"]:
+    """Return the distance [m] of each point from the nearest one of a path."""
     x, y = (points[:, None] - path).transpose(2, 0, 1)
     nearest: Float[np.ndarray, " n"] = core.hypot(x, y).min(axis=1)
     return nearest

@@ -1,0 +1,248 @@
+"""Seams that later submaps show: landmarks that one side of a place should have observed.
+
+Among few landmarks a robot that is carried off loses sight of nothing at once (`continuity`). Later
+it misses the landmarks of places that it passes, and maps others where nothing was observed. The
+log-likelihood ratio of a stream elsewhere from a submap on, against one at its place, is
+
+    Σ min(Σ_s −ln(1 − p(d_ls)), −ln LEAST_OVERLOOKED) − PRESENT · (landmarks of both sides)
+
+over the landmarks l that one side has and the submaps s of the other side, unless another landmark
+of that side is within the gate. p(d) is the probability that a submap of the robot observes a
+landmark at distance d, learnt from the landmarks of its previous and next submap: they do not
+depend on the seam. It is averaged over the uncertainty of d.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from teamslam.team import core
+from teamslam.team.config import UNNAMED
+from teamslam.team.estimation.association.gating import Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation.association.visibility import LEAST_OVERLOOKED
+from teamslam.team.estimation.contribution import Stream, is_map
+from teamslam.team.estimation.map_joining.absence import distances, learn_rate, path_of
+from teamslam.team.estimation.map_joining.continuity import LEAST_BEFORE, PRESENT, Seam
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
+from teamslam.team.estimation.map_joining.submap_graph import Joined
+from teamslam.team.shapes import Bool, Float, Int64
+
+MOST_ABSENT = -core.log(LEAST_OVERLOOKED)
+"""Most evidence of one landmark: some are visible from one side only."""
+LATE_EVIDENCE = 3.0 * MOST_ABSENT
+"""Least evidence of a seam: three landmarks that are missed beyond doubt."""
+AMBIGUOUS = 1.0
+"""Evidence by which neighbouring seams are not told apart."""
+LEAST_COUNT = 4
+"""Least measurements of a landmark: fewer may be clutter."""
+MOST_TRACKED = 1
+"""Most landmarks that a robot observes on both sides of a seam, by chance."""
+NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
+"""Nodes and weights of the Gauss-Hermite rule of three points."""
+
+Misses = Float[np.ndarray, "K n"]
+
+
+class _Place(NamedTuple):
+    """A candidate: rows of the last submap before a seam and the first one behind it, in a stream;
+    evidence.
+    """
+
+    before: int
+    after: int
+    evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Sights:
+    """Which of K submaps observed which of n unnamed landmarks, by node.
+
+    counts: measurements of each landmark. away: distance [m] of each from each submap's path.
+    """
+
+    submaps: list[Joined]
+    nodes: Int64[np.ndarray, " n"]
+    points: Float[np.ndarray, "n 2"]
+    sees: Bool[np.ndarray, "K n"]
+    counts: Int64[np.ndarray, " n"]
+    away: Float[np.ndarray, "K n"]
+
+
+def find_late_seam(island: Island) -> Seam | None:
+    """Find the seam with the most evidence, at least LATE_EVIDENCE, among unnamed landmarks."""
+    sights = _sights_of(island)
+    streams = sorted({each.contribution.stream for each in sights.submaps})
+    if not len(sights.nodes):
+        return None
+    nothing = np.zeros((len(sights.nodes),) * 2, np.bool_)
+    roughly = _misses(sights, np.zeros_like(sights.away))
+    found = [(stream, _best_place(sights, stream, roughly, nothing)) for stream in streams]
+    if not any(place.evidence >= LATE_EVIDENCE for _, places in found for place in places):
+        return None
+    spread, possible = _uncertainty_of(island, sights)
+    misses = _misses(sights, spread)
+    best: tuple[float, Stream, list[_Place]] | None = None
+    for stream in streams:
+        places = _best_place(sights, stream, misses, possible)
+        evidence = max((each.evidence for each in places), default=0.0)
+        if evidence >= LATE_EVIDENCE and (best is None or evidence > best[0]):
+            best = evidence, stream, places
+    if best is None:
+        return None
+    evidence, stream, places = best
+    first = sights.submaps[min(each.before for each in places)].contribution
+    last = sights.submaps[max(each.after for each in places)]
+    start_ns = _begin_ns(sights, stream, last.contribution.sequence)
+    return Seam(
+        stream, first.sequence, last.contribution.sequence, first.end_ns, start_ns, evidence
+    )
+
+
+def _begin_ns(sights: _Sights, stream: Stream, sequence: int) -> int:
+    of_stream = (each.contribution for each in sights.submaps)
+    return next(
+        each.end_ns for each in of_stream if each.stream == stream and each.sequence == sequence - 1
+    )
+
+
+def _sights_of(island: Island) -> _Sights:
+    graph = island.graph
+    submaps = [each for each in graph.submaps if not is_map(each.contribution.stream)]
+    nodes = np.array(sorted(node for id_, node in graph.landmarks.items() if id_ >= UNNAMED))
+    place = np.full(len(graph.fixed) + 1, -1, np.int64)
+    place[nodes] = np.arange(len(nodes))
+    sees = np.zeros((len(submaps), len(nodes)), np.bool_)
+    counts = np.zeros(len(nodes), np.int64)
+    for row, each in zip(sees, submaps, strict=True):
+        local = each.contribution.local
+        own = place[each.landmarks[local.ids >= UNNAMED]]
+        row[own[own >= 0]] = True
+        np.add.at(counts, own[own >= 0], local.unnamed.counts[own >= 0].astype(np.int64))
+    at = graph.offset[nodes]
+    points = np.column_stack([island.state[at], island.state[at + 1]])
+    away = np.array([distances(path_of(island, each), points) for each in submaps])
+    return _Sights(submaps, nodes, points, sees, counts, away.reshape(sees.shape))
+
+
+def _rows_of(sights: _Sights, stream: Stream) -> list[int]:
+    streams = [each.contribution.stream for each in sights.submaps]
+    return [k for k, each in enumerate(streams) if each == stream]
+
+
+def _misses(sights: _Sights, spread: Float[np.ndarray, "K n"]) -> Misses:
+    """Compute −ln P(a submap misses a landmark); spread: standard deviation [m] of its distance."""
+    out = np.zeros(sights.away.shape)
+    robots = [each.contribution.robot for each in sights.submaps]
+    streams = sorted({each.contribution.stream for each in sights.submaps})
+    for robot in sorted({*robots}):
+        away: list[float] = []
+        seen: list[bool] = []
+        for stream in streams:
+            rows = _rows_of(sights, stream) if stream[0] == robot else []
+            for k, row in enumerate(rows):
+                beside = [*rows[max(k - 1, 0) : k], *rows[k + 1 : k + 2]]
+                known = sights.sees[beside].any(axis=0)
+                away += sights.away[row, known].tolist()
+                seen += sights.sees[row, known].tolist()
+        if not any(seen):
+            continue
+        own = np.array([each == robot for each in robots])
+        rate = learn_rate(np.array(away), np.array(seen), unseen=1.0)
+        p = sum(weight * rate.at(np.abs(sights.away[own] + z * spread[own])) for z, weight in NODES)
+        out[own] = -core.log(np.maximum(1.0 - p, LEAST_OVERLOOKED))
+    return out
+
+
+def _uncertainty_of(
+    island: Island, sights: _Sights
+) -> tuple[Float[np.ndarray, "K n"], Bool[np.ndarray, "n n"]]:
+    """Compute the standard deviation of the landmarks' distances from the submaps' nearer ends, and
+    which landmarks may be one.
+    """
+    graph, points, n = island.graph, sights.points, len(sights.nodes)
+    ends = np.array([each.nodes[:2] for each in sights.submaps])
+    union = np.union1d(sights.nodes, ends)
+    _, covariance = joint_marginal(island, union.tolist())
+    first = np.concatenate([[0], np.cumsum(np.diff(graph.offset)[union])])
+    at = np.add.outer(first[np.searchsorted(union, sights.nodes)], np.arange(2))
+    own = covariance[np.ix_(at.ravel(), at.ravel())]
+    pairs = list_pairs(np.arange(n), np.arange(n))
+    joint = Joint(points, own, np.zeros((n, n), np.bool_))
+    profile = island.settings.association
+    possible = np.eye(n, dtype=np.bool_)
+    possible[pairs] = evaluate_pairs(joint, *pairs, profile).chi2 < profile.gate
+    spread = np.zeros(sights.away.shape)
+    blocks = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    for row, pair in zip(spread, ends, strict=True):
+        places = np.add.outer(graph.offset[pair], np.arange(2))
+        offsets = points[:, None] - island.state[places][None]
+        nearer = (offsets * offsets).sum(axis=2).argmin(axis=1)
+        end = np.add.outer(first[np.searchsorted(union, pair)], np.arange(2))[nearer]
+        away = offsets[np.arange(n), nearer]
+        along = away / np.maximum(core.hypot(away[:, 0], away[:, 1]), 1e-9)[:, None]
+        cross = covariance[at[:, :, None], end[:, None, :]]
+        of_end = covariance[end[:, :, None], end[:, None, :]]
+        difference = blocks + of_end - cross - cross.transpose(0, 2, 1)
+        variance = np.einsum("ni,nij,nj->n", along, difference, along)
+        row[:] = np.sqrt(np.maximum(variance, 0.0))
+    return spread, possible
+
+
+def _best_place(
+    sights: _Sights, stream: Stream, misses: Misses, possible: Bool[np.ndarray, "n n"]
+) -> list[_Place]:
+    """Find the candidate of a stream with the most evidence, and its neighbours that are not told
+    apart from it.
+    """
+    rows = _rows_of(sights, stream)
+    places = list(_list_places(sights, rows, misses, possible))
+    if not places:
+        return []
+    best = max(range(len(places)), key=lambda k: places[k].evidence)
+    least = places[best].evidence - AMBIGUOUS
+    low = high = best
+    while low > 0 and places[low - 1].evidence >= least:
+        low -= 1
+    while high + 1 < len(places) and places[high + 1].evidence >= least:
+        high += 1
+    return places[low : high + 1]
+
+
+def _list_places(
+    sights: _Sights, rows: list[int], misses: Misses, possible: Bool[np.ndarray, "n n"]
+) -> Iterator[_Place]:
+    """List the candidates of a stream in the order of time: between two submaps, or inside one."""
+    stable = sights.counts >= LEAST_COUNT
+    for k in range(LEAST_BEFORE, len(rows)):
+        before, row = rows[k - 1], rows[k]
+        for after in (k, k + 1):
+            tracked = (
+                int((sights.sees[before] & sights.sees[row]).sum())
+                if after == k
+                else _least_tracked(sights.submaps[row])
+            )
+            if after == len(rows) or tracked > MOST_TRACKED:
+                continue
+            behind = np.zeros(len(sights.submaps), np.bool_)
+            behind[rows[after:]] = True
+            ahead = ~behind
+            ahead[rows[k:after]] = False
+            one, two = sights.sees[ahead].any(axis=0), sights.sees[behind].any(axis=0)
+            evidence = -PRESENT * float((one & two).sum())
+            for own, other, by in ((one, two, behind), (two, one, ahead)):
+                alone = own & ~other & stable & ~possible[:, other].any(axis=1)
+                evidence += float(
+                    np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT).sum()
+                )
+            yield _Place(before, rows[after], evidence)
+
+
+def _least_tracked(submap: Joined) -> int:
+    """Return the least number of landmarks that are observed on both sides of a scan."""
+    seen = submap.contribution.local.unnamed.seen
+    before = np.logical_or.accumulate(seen, axis=1)[:, :-1]
+    after = np.logical_or.accumulate(seen[:, ::-1], axis=1)[:, ::-1][:, 1:]
+    return int((before & after).sum(axis=0).min(initial=len(seen)))

@@ -1,0 +1,128 @@
+"""Robots that are carried off among few landmarks, which only later submaps show."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.scenarios.source import streams_of
+from teamslam.team.association import AssociationProfile
+from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
+from teamslam.team.estimation.map_joining.late_seams import find_late_seam
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats
+from tests.estimation.association.unnamed_worlds import circle, drive
+from tests.final_maps import final_only, scenario_in
+from tests.trials.stress_world import CarriedOff, StressWorld, write
+
+SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
+ROUND = 14
+SPARSE = np.array(
+    [[9.0, 3.0], [2.0, 12.0], [-8.0, 5.0], [-11.0, -4.0], [-1.0, -10.0], [8.0, -7.0], [1.0, 1.0]]
+)
+"""Fewer landmarks in view than a seam needs at once (`continuity`)."""
+
+
+def folded(*parts: list[Contribution]) -> Fold:
+    """Fold drives one after the other, as if odometry joined those of a robot."""
+    fold, sequence = EMPTY_FOLD, {"r1": 0, "r2": 0}
+    ordered = sorted((e for p in parts for e in p), key=lambda each: (each.end_ns, each.robot))
+    for each in ordered:
+        own = replace(each, sequence=sequence[each.robot])
+        sequence[each.robot] += 1
+        fold = fold_tick(fold, Tick([own]), SETTINGS)
+    return fold
+
+
+def later(part: list[Contribution], by: int) -> list[Contribution]:
+    return [replace(each, end_ns=each.end_ns + by * 10**10) for each in part]
+
+
+def carried(seed: int, reach: float = 6.0) -> Island:
+    rng = np.random.default_rng(seed)
+    before, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), SPARSE, rng, reach=reach)
+    after, _ = drive("r1", circle((1.0, -1.0), 8.0, ROUND, 1.1, 2.5), SPARSE, rng, reach=reach)
+    return folded(before, later(after, ROUND)).main
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_landmarks_that_a_robot_should_observe_again_and_does_not_show_where_it_was_carried_off(
+    seed,
+):
+    seam = find_late_seam(carried(seed))
+    assert seam is not None
+    assert seam.before == ROUND - 1
+    assert seam.after in (ROUND, ROUND + 1)
+    assert seam.begin_ns == ROUND * 10**10
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_robot_that_comes_back_to_its_landmarks_has_no_seam(seed):
+    rng = np.random.default_rng(seed)
+    path, _ = drive("r1", circle((0.0, 0.0), 8.0, 2 * ROUND, 2.2), SPARSE, rng, reach=6.0)
+    assert find_late_seam(folded(path).main) is None
+
+
+def test_a_robot_that_never_comes_near_its_former_landmarks_has_no_seam():
+    rng = np.random.default_rng(1)
+    far = np.concatenate((SPARSE, SPARSE + np.array([60.0, 0.0])))
+    before, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), far, rng, reach=6.0)
+    way = np.column_stack([np.linspace(8.0, 68.0, 8), np.zeros(8), np.zeros(8)])
+    between, _ = drive("r1", way, far, rng, reach=6.0)
+    after, _ = drive("r1", circle((60.0, 0.0), 8.0, ROUND, 1.1), far, rng, reach=6.0)
+    drives = folded(before, later(between, ROUND), later(after, ROUND + 8))
+    assert find_late_seam(drives.main) is None
+
+
+def test_a_wall_that_hides_the_landmarks_of_each_side_is_no_seam():
+    """The robot passes its end, where it tracks landmarks without a gap."""
+    rng = np.random.default_rng(1)
+    x = np.linspace(-12.0, 12.0, 9)
+    sides = [np.column_stack([x, np.full(9, y)]) for y in (-2.0, 2.0)]
+    end = np.array([[14.0, 0.0], [15.0, 2.0], [15.0, -2.0]])
+    there = np.column_stack([np.linspace(-12.0, 14.0, 14), np.full(14, -1.0), np.zeros(14)])
+    back = np.column_stack([there[::-1, 0], np.full(14, 1.0), np.full(14, math.pi)])
+    turn = np.array([there[-1], [16.0, -1.0, math.pi / 2], [16.0, 1.0, math.pi], back[0]])
+    one, _ = drive("r1", there, np.concatenate((sides[0], end)), rng, reach=5.0)
+    round_it, _ = drive("r1", turn, end, rng, reach=5.0)
+    two, _ = drive("r1", back, np.concatenate((sides[1], end)), rng, reach=5.0)
+    assert find_late_seam(folded(one, later(round_it, 13), later(two, 16)).main) is None
+
+
+def run(*off: CarriedOff, seed: int = 3) -> tuple[m.FusedMap, np.ndarray]:
+    """Run one robot among eleven landmarks; return the final map and the true landmarks."""
+    world = StressWorld(
+        seed=seed, robots=1, hidden=True, landmarks=11, seconds=240.0, carried_off=off
+    )
+    with TemporaryDirectory() as folder:
+        place = write(world, Path(folder))
+        scenario = final_only(scenario_in(place))
+        final = final_map(list(run_team(scenario, streams_of(scenario))))
+        rows = np.loadtxt(place / "landmarks.csv", delimiter=",", skiprows=1)
+    return final, rows[:, 1:]
+
+
+@pytest.mark.parametrize("metres", [5.0, 15.0])
+def test_the_final_map_of_few_landmarks_has_no_second_copy_and_names_the_time(metres):
+    final, landmarks = run(CarriedOff("r1", metres, 1.2, 120.0))
+    means = floats(final.means, "means").reshape(-1, 2)
+    away = np.hypot(*(means[:, None] - landmarks).transpose(2, 0, 1))
+    assert len(means) >= 5
+    assert away.min(axis=1).max() < 1.5
+    assert len({*away.argmin(axis=1).tolist()}) == len(means)
+    found = [each for each in final.diagnosis if each.cause == "carried_off"]
+    assert [each.robot for each in found] == ["r1"]
+    assert abs(found[0].at_ns * 1e-9 - 120.0) <= 10.0
+
+
+def test_the_same_robot_left_alone_is_not_cut():
+    final, _ = run()
+    assert not any(each.cause == "carried_off" for each in final.diagnosis)
+    assert not any("refused" in each for each in final.reasons)
