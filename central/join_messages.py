@@ -23,9 +23,11 @@ from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.estimation.map_joining import landmark_view, marginals
 from teamslam.team.estimation.map_joining.alignment import NEEDED, SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
+    OdometryTie,
     Repetition,
     find_lost_streams,
     find_missed,
+    find_odometry_ties,
     find_repetitions,
     find_weakly_placed,
 )
@@ -142,7 +144,7 @@ class Shown(NamedTuple):
 
     Left out: undecided, possible duplicates of a shown one; weak, only of a poorly known heading;
     missed, by nearly all submaps that look there; `repeated` parts of the map. headings: largest
-    heading standard deviation [rad] of each lost stream.
+    heading standard deviation [rad] of each lost stream. tied: by odometry alone.
     """
 
     ids: Sequence[int] = ()
@@ -151,6 +153,7 @@ class Shown(NamedTuple):
     missed: Sequence[int] = ()
     headings: Mapping[Stream, float] = MappingProxyType({})
     repeated: Sequence[Repetition] = ()
+    tied: Sequence[OdometryTie] = ()
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
@@ -175,7 +178,8 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     repeated = find_repetitions(fold.main, left)
     copies = {id_ for each in repeated for id_ in each.ids}
     left = [id_ for id_ in left if id_ not in copies]
-    return Shown(left, undecided, weak, seldom, find_lost_streams(fold.main), repeated)
+    tied = find_odometry_ties(fold.main, left) if not fold.condensed_count else []
+    return Shown(left, undecided, weak, seldom, find_lost_streams(fold.main), repeated, tied)
 
 
 def reasons(
@@ -200,6 +204,7 @@ def reasons(
         *(sensor_warnings(fold) if fold.has_maps else ()),
         *_lost(shown),
         *_repeated(shown),
+        *_tied(shown),
         *_left_out(fold, shown, landmark_submaps),
         *miscalibrations(biases),
     )
@@ -224,6 +229,18 @@ def _repeated(shown: Shown) -> Iterator[str]:
             f"of {len(each.pairs)} others; either the building repeats itself, or the robot was "
             f"carried off or slipped at ({x:.1f}, {y:.1f}) m by ({dx:+.1f}, {dy:+.1f}) m and "
             f"{np.degrees(turn):+.0f}°; these landmarks are left out"
+        )
+
+
+def _tied(shown: Shown) -> Iterator[str]:
+    for each in shown.tied:
+        metres, radians = each.sigmas
+        yield (
+            f"the map may be wrong from submap {each.first} of {named(each.stream)} on (t = "
+            f"{each.begin_ns * 1e-9:.0f} to {each.end_ns * 1e-9:.0f} s): odometry alone, to "
+            f"{metres:.1f} m and {np.degrees(radians):.0f}°, places its {each.later} landmarks "
+            f"beside the {each.earlier} others; if the robot was carried off or slipped there, "
+            "no landmark shows it"
         )
 
 

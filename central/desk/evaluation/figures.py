@@ -28,6 +28,7 @@ _WARNINGS = (
     ("farther off than its covariance", "nonlinear"),
     ("was lost", "weak_heading"),
     ("two places look alike", "places_alike"),
+    ("odometry alone", "odometry_alone"),
     ("not settled", "not_settled"),
     ("no full solution", "no_solution"),
     ("another map fits", "wrong_minimum"),

@@ -1,5 +1,5 @@
 """Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps
-that look there, or in a repeated part of the map; and lost streams.
+that look there, or in a repeated part of the map; lost streams, and those that odometry alone ties.
 
 A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time without
 a contradiction: only odometry connects its later submaps with the rest. For each boundary between
@@ -31,7 +31,7 @@ from teamslam.team.estimation.association.voting import (
     propose_alignments,
 )
 from teamslam.team.estimation.contribution import Stream
-from teamslam.team.estimation.map_joining.gauss_newton import Island
+from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.memory import MOST
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
@@ -95,6 +95,77 @@ def find_lost_streams(island: Island) -> dict[Stream, float]:
     return {stream: sigma for stream, sigma in worst.items() if sigma > limit}
 
 
+LEAST_TIED = 3
+"""Least number of landmarks on either side of a place that odometry alone ties."""
+
+
+class OdometryTie(NamedTuple):
+    """A place in a stream: no landmark is both before it, or in other streams, and behind it.
+
+    first: submap behind it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the part
+    behind it. sigmas: standard deviation of its start's position [m] and heading [rad].
+    """
+
+    stream: Stream
+    first: int
+    earlier: int
+    later: int
+    begin_ns: int
+    end_ns: int
+    sigmas: tuple[float, float]
+
+
+def find_odometry_ties(island: Island, ids: Collection[int]) -> list[OdometryTie]:
+    """Find the place of each stream with the most landmarks `ids` on both sides.
+
+    An error of the odometry there beyond its covariance contradicts nothing.
+    """
+    unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)
+    sees = _tabulate(island, unnamed)
+    node_of = island.graph.landmarks
+    counted = np.isin(unnamed, [node_of[id_] for id_ in ids if id_ in node_of])
+    submaps, found = island.graph.submaps, []
+    for stream in sorted(island.graph.streams):
+        rows = [k for k, each in enumerate(submaps) if each.contribution.stream == stream]
+        elsewhere = np.delete(sees, rows, axis=0).any(axis=0)
+        best: tuple[int, int, int, int] | None = None
+        for k in range(1, len(rows)):
+            rest = elsewhere | sees[rows[:k]].any(axis=0)
+            beyond = sees[rows[k:]].any(axis=0)
+            counts = int((rest & counted).sum()), int((beyond & counted).sum())
+            least = min(counts)
+            if least >= LEAST_TIED and not (rest & beyond).any() and (not best or least > best[0]):
+                best = least, k, *counts
+        if best is None:
+            continue
+        _, k, earlier, later = best
+        before, submap = (submaps[rows[at]].contribution for at in (k - 1, k))
+        _, P = joint_marginal(island, [int(submaps[rows[k]].nodes[0])])
+        found.append(
+            OdometryTie(
+                stream=stream,
+                first=submap.sequence,
+                earlier=earlier,
+                later=later,
+                begin_ns=before.end_ns,
+                end_ns=submaps[rows[-1]].contribution.end_ns,
+                sigmas=(math.sqrt(P[0, 0] + P[1, 1]), math.sqrt(P[2, 2])),
+            )
+        )
+    return found
+
+
+def _tabulate(island: Island, nodes: Collection[int]) -> Bool[np.ndarray, "K n"]:
+    """Tabulate which submaps observe which of these landmarks."""
+    at = np.full(len(island.graph.fixed), -1, np.int64)
+    at[[*nodes]] = np.arange(len(nodes))
+    sees = np.zeros((len(island.graph.submaps), len(nodes)), np.bool_)
+    for row, submap in zip(sees, island.graph.submaps, strict=True):
+        known = at[submap.landmarks[submap.landmarks >= 0]]
+        row[known[known >= 0]] = True
+    return sees
+
+
 LEAST_PAIRS = 6
 """Least number of landmarks that repeat others."""
 LEAST_SHARE = 0.5
@@ -136,13 +207,8 @@ def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
         return []
     node_of, offset = island.graph.landmarks, island.graph.offset
     points = np.array([island.state[offset[node_of[i]] :][:2] for i in unnamed])
-    at = np.full(len(island.graph.fixed), -1, np.int64)
-    at[[node_of[i] for i in unnamed]] = np.arange(len(unnamed))
+    sees = _tabulate(island, [node_of[i] for i in unnamed])
     streams = [each.contribution.stream for each in island.graph.submaps]
-    sees = np.zeros((len(streams), len(unnamed)), np.bool_)
-    for row, submap in zip(sees, island.graph.submaps, strict=True):
-        known = at[submap.landmarks[submap.landmarks >= 0]]
-        row[known[known >= 0]] = True
     found = []
     for stream in sorted(island.graph.streams):
         own = np.array([each == stream for each in streams], np.bool_)

@@ -8,11 +8,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+from teamslam.central.config import CentralConfig
+from teamslam.central.join_messages import reasons, shown_landmarks
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.auditing import fold_tick
+from teamslam.team.estimation.map_joining.distinctness import find_odometry_ties
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
@@ -70,15 +73,38 @@ def test_a_robot_that_comes_back_to_its_landmarks_has_no_seam(seed):
     assert find_late_seam(folded(path).main) is None
 
 
-def test_a_robot_that_never_comes_near_its_former_landmarks_has_no_seam():
+def far_apart() -> Fold:
+    """Fold a drive through two places of seven landmarks each, 60 m apart, without return."""
     rng = np.random.default_rng(1)
     far = np.concatenate((SPARSE, SPARSE + np.array([60.0, 0.0])))
-    before, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), far, rng, reach=6.0)
+    before, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.0), far, rng, reach=6.0)
     way = np.column_stack([np.linspace(8.0, 68.0, 8), np.zeros(8), np.zeros(8)])
     between, _ = drive("r1", way, far, rng, reach=6.0)
     after, _ = drive("r1", circle((60.0, 0.0), 8.0, ROUND, 1.1), far, rng, reach=6.0)
-    drives = folded(before, later(between, ROUND), later(after, ROUND + 8))
-    assert find_late_seam(drives.main) is None
+    return folded(before, later(between, ROUND), later(after, ROUND + 7))
+
+
+def test_a_robot_that_never_comes_near_its_former_landmarks_has_no_seam():
+    assert find_late_seam(far_apart().main) is None
+
+
+def test_a_part_of_the_map_that_odometry_alone_places_is_named():
+    fold = far_apart()
+    (found,) = find_odometry_ties(fold.main, fold.main.graph.landmarks)
+    assert found.stream == ("r1", 1)
+    assert min(found.earlier, found.later) >= len(SPARSE)
+    assert ROUND <= found.first <= ROUND + 7
+    shown = shown_landmarks(fold, CentralConfig(), "final")
+    (text,) = (each for each in reasons(fold, shown, (), 1) if "odometry alone" in each)
+    (tie,) = shown.tied
+    assert f"its {tie.later} landmarks beside the {tie.earlier} others" in text
+
+
+def test_landmarks_on_both_sides_tie_a_map():
+    fold = folded(
+        drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), SPARSE, np.random.default_rng(1))[0]
+    )
+    assert find_odometry_ties(fold.main, fold.main.graph.landmarks) == []
 
 
 def test_a_wall_that_hides_the_landmarks_of_each_side_is_no_seam():
