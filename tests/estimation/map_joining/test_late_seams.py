@@ -101,9 +101,10 @@ def test_a_part_of_the_map_that_odometry_alone_places_is_named():
 
 
 def test_landmarks_on_both_sides_tie_a_map():
-    fold = folded(
-        drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), SPARSE, np.random.default_rng(1))[0]
-    )
+    rng = np.random.default_rng(1)
+    many = rng.uniform(-15.0, 15.0, (40, 2))
+    path, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), many, rng, reach=6.0)
+    fold = folded(path)
     assert find_odometry_ties(fold.main, fold.main.graph.landmarks) == []
 
 
