@@ -5,7 +5,6 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import (
@@ -250,36 +249,6 @@ def own_biases_of(saved: m.SavedMap) -> OwnBiases:
         floats(saved.own_sensitivity, "own_sensitivity").astype(np.float64).reshape(-1, K),
         floats(saved.likeliest, "likeliest").astype(np.float64),
         unpacked(floats(saved.evidence, "evidence"), K + len(saved.biases)),
-    )
-
-
-def pose_message(
-    stamp_ns: int,
-    robot: str,
-    incarnation: int,
-    sequence: int,
-    digest: bytes,
-    pose: Float[np.ndarray, "3"],
-    covariance: Float[np.ndarray, "3 3"],
-    *,
-    frame: str,
-    in_team_frame: bool,
-) -> m.PoseEstimate:
-    """Make the message of a pose; its covariance is made exactly symmetric.
-
-    frame: as in `FusedMap.frame`; in_team_frame: whether it is the team's.
-    """
-    mean, symmetric = core.pose_bytes(pose, covariance)
-    return m.PoseEstimate(
-        stamp_ns=stamp_ns,
-        robot=robot,
-        incarnation=incarnation,
-        sequence=sequence,
-        map_digest=digest,
-        pose=mean,
-        covariance=symmetric,
-        frame=frame,
-        in_team_frame=in_team_frame,
     )
 
 

@@ -7,13 +7,14 @@ from hypothesis import strategies as st
 
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.estimation.gaussian import PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import NO_MAP, announce_configuration, digest_of
+from teamslam.team.wire.digest import announce_configuration, digest_of
 from tests import build
 from tests.estimation.submap_world import correlated
 
@@ -136,9 +137,8 @@ def test_a_map_carries_its_joint_covariance_or_the_blocks_of_it():
 def test_a_pose_passes_the_door_although_rounding_made_it_skew():
     covariance = np.diag([1.0, 2.0, 3.0])
     covariance[0, 1] = 1e-17
-    message = translate.pose_message(
-        1, "r1", 1, 2, NO_MAP, np.zeros(3), covariance, frame="r1/1", in_team_frame=False
-    )
+    writer = MessageWriter("r1", 1, b"settings", started=False)
+    message = writer.pose(1, 2, PoseGaussian(np.zeros(3), covariance)).message
     assert over_the_wire(message) == message
 
 

@@ -153,7 +153,7 @@ class RunningPoses:
     ) -> list[Outgoing]:
         """Make the messages of the own pose and, given a prior, the team's."""
         sequence, writer, window = estimator.sequence, estimator.writer, estimator.open_window()
-        out = [writer.own_pose(stamp_ns, sequence, estimator.own_pose(window))]
+        out = [writer.pose(stamp_ns, sequence, estimator.own_pose(window))]
         if prior is None:
             return out
         try:
@@ -170,7 +170,7 @@ class RunningPoses:
             self._warnings.append(f"no team pose from the fused map: {error}")
             return out
         self.sigma_m = math.sqrt(max(float(posed[1][0, 0] + posed[1][1, 1]), 0.0))
-        return [*out, writer.team_pose(stamp_ns, sequence, prior, posed)]
+        return [*out, writer.pose(stamp_ns, sequence, posed, prior)]
 
 
 def outside_team_frame(own: Outgoing) -> Outgoing:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import packed
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
@@ -124,32 +124,22 @@ class MessageWriter:
     def _frame(self) -> str:
         return translate.frame_name(self.robot, self.incarnation)
 
-    def own_pose(self, stamp_ns: int, sequence: int, pose: PoseGaussian) -> Outgoing:
-        """A running pose by own measurements, in the stream's start frame."""
-        message = translate.pose_message(
-            stamp_ns,
-            self.robot,
-            self.incarnation,
-            sequence,
-            NO_MAP,
-            *pose,
-            frame=self._frame,
-            in_team_frame=self.started,
-        )
-        return Outgoing(ch.OWN_POSE, self.robot, message)
-
-    def team_pose(
-        self, stamp_ns: int, sequence: int, prior: m.Prior, pose: PoseGaussian
+    def pose(
+        self, stamp_ns: int, sequence: int, pose: PoseGaussian, prior: m.Prior | None = None
     ) -> Outgoing:
-        """A running pose given the team's map, in the prior's frame."""
-        message = translate.pose_message(
-            stamp_ns,
-            self.robot,
-            self.incarnation,
-            sequence,
-            prior.digest,
-            *pose,
-            frame=prior.frame,
-            in_team_frame=True,
+        """A running pose by own measurements, in the stream's start frame; given the team's map, in
+        the prior's frame.
+        """
+        mean, covariance = core.pose_bytes(*pose)
+        message = m.PoseEstimate(
+            stamp_ns=stamp_ns,
+            robot=self.robot,
+            incarnation=self.incarnation,
+            sequence=sequence,
+            map_digest=NO_MAP if prior is None else prior.digest,
+            pose=mean,
+            covariance=covariance,
+            frame=self._frame if prior is None else prior.frame,
+            in_team_frame=self.started or prior is not None,
         )
-        return Outgoing(ch.TEAM_POSE, self.robot, message)
+        return Outgoing(ch.OWN_POSE if prior is None else ch.TEAM_POSE, self.robot, message)

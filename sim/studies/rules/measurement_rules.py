@@ -13,7 +13,7 @@ from teamslam.central.fused_map import START_POSES, fused_message
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.rules.map_rules import ComparisonCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
@@ -203,15 +203,16 @@ class MeasurementCentre(ComparisonCentre):
         if sensor.is_mounted:
             pose = moved_by(pose, inverse(np.array(sensor.mount)))
         incarnation = self.members[each.robot].incarnation
-        message = translate.pose_message(
-            each.stamp_ns,
-            each.robot,
-            incarnation,
-            each.number,
-            NO_MAP,
-            *pose,
+        mean, covariance = core.pose_bytes(*pose)
+        message = m.PoseEstimate(
+            stamp_ns=each.stamp_ns,
+            robot=each.robot,
+            incarnation=incarnation,
+            sequence=each.number,
+            map_digest=NO_MAP,
+            pose=mean,
+            covariance=covariance,
             frame=self._frame,
-            in_team_frame=True,
         )
         return Outgoing(ch.CENTRAL_POSE, each.robot, message)
 
