@@ -299,20 +299,21 @@ def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
 
 
 def _remedy_of_scale(robot: str, value: float) -> str:
-    """Describe the remedy: other sigmas within MOST_SCALE; none for a saved map."""
+    """Describe the remedy: other sigmas up to MOST_SCALE; none for a saved map."""
     if robot.startswith(MAP):
         if value < 1.0:
             return "leave out days that the saved map contains already: each counts once"
         return "the place has changed since the map was saved, or the map is of another place"
-    if not 1.0 / MOST_SCALE < value < MOST_SCALE:
+    if value >= MOST_SCALE:
         return (
             "noise is not stated that far off: check the columns (range and bearing, ids), units, "
             "clocks and robots' names of the data (docs/faq.md)"
         )
-    return (
+    remedy = (
         f"multiply the sigmas of sensor and odometry by {math.sqrt(value):.2g}, or with ground "
         "truth learn them by `teamslam calibrate`"
     )
+    return remedy if value > 1.0 / MOST_SCALE else f"{remedy}; check the units of the data, too"
 
 
 def widening(found: Sequence[m.Diagnosis]) -> float:

@@ -102,12 +102,19 @@ def test_noise_that_is_stated_wrong_is_named_with_its_factor(noise, cause):
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
 
 
-@pytest.mark.parametrize("noise", [5.0, 0.2])
-def test_noise_that_no_robot_has_is_answered_by_the_data_and_not_by_other_sigmas(noise):
-    (found,) = final_map(noisy(noise)).diagnosis
-    assert found.cause.startswith("noise_")
+def test_noise_that_no_robot_has_is_answered_by_the_data_and_not_by_other_sigmas():
+    (found,) = final_map(noisy(5.0)).diagnosis
+    assert found.cause == "noise_underestimated"
     assert "check the columns" in found.remedy
     assert "multiply" not in found.remedy
+
+
+def test_noise_that_is_stated_far_too_large_is_answered_by_sigmas_and_units():
+    """As by the scenario `recorded` for good wheels: nothing is wrong with the data."""
+    (found,) = final_map(noisy(0.2)).diagnosis
+    assert found.cause == "noise_overestimated"
+    assert f"by {math.sqrt(found.value[0]):.2g}, or" in found.remedy
+    assert "units" in found.remedy
 
 
 def test_noise_that_is_stated_too_small_widens_the_covariance_of_the_final_map():
