@@ -4,6 +4,7 @@ import re
 import runpy
 import sys
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -167,6 +168,8 @@ def test_the_notebook_runs_from_top_to_bottom(capsys):
     out = capsys.readouterr().out
     found = re.search(r"mean of 50 windows: (\d\.\d+)", out)
     assert 0.8 < float(found[1]) < 1.3
+    assert len(plt.get_fignums()) == 3
+    plt.close("all")
     assert all(cell.get("outputs", []) == [] for cell in cells), "committed without its outputs"
 
 
