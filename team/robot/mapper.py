@@ -23,7 +23,7 @@ from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindo
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.scans import Scan, sensible
-from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.estimation.submap import LocalMap, Slipped
 from teamslam.team.rejection import UNMEASURED, Rejection
 from teamslam.team.robot.landmark_classes import classify_landmarks
 from teamslam.team.robot.ledger import Ledger, OnDisposition
@@ -32,7 +32,6 @@ from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.stream import StreamJudge
 from teamslam.team.robot.submaps import Submaps
-from teamslam.team.robot.warnings import slipped
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
@@ -269,7 +268,7 @@ class Mapper:
         if measurement is not None:
             self.account(measurement, rejected)
         self.ledger.close(closed)
-        self.warnings += [slipped(slip) for slip in closed.slips]
+        self.warnings += [_describe_slip(slip) for slip in closed.slips]
         self.out += self.submaps.close(factors, submap)
         self.forget_window()
         self._judge = StreamJudge(self.config.bounds, closed.end_ns)
@@ -387,3 +386,10 @@ class Mapper:
     def open_window(self) -> RunningWindow | None:
         """Gaussian of the open window at its last keyframe."""
         return self._slam.running()
+
+
+def _describe_slip(slip: Slipped) -> str:
+    metres, turn = core.hypot(*slip.by[:2]), float(np.degrees(slip.by[2]))
+    return (
+        f"the odometry slipped by {metres:.2f} m, {turn:.0f}° before {slip.stamp_ns * 1e-9:.2f} s"
+    )

@@ -1,11 +1,32 @@
-"""A robot's status, for people."""
+"""A robot's status, for people, with its warnings."""
 
 from typing import Literal
 
+from teamslam.team.config import Estimator
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.robot.mapper import Mapper
-from teamslam.team.robot.warnings import driver_away, unexpected
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+
+UNEXPECTED = 3.0
+"""NIS per degree of freedom above which measurements contradict the models: 1 is right, and
+5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
+UNEXPECTED_DOF = 60
+"""… computed from this many degrees of freedom at least."""
+
+
+def unexpected(nis: Innovation, estimator: Estimator) -> tuple[str, ...]:
+    """Warn of measurements far from their predictions, and name the settings."""
+    ratio = nis.per_dof
+    if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
+        return ()
+    remedy = "is the sensor's or the odometry's noise larger than its sigmas?"
+    if estimator != "hybrid":
+        remedy = f"outliers, or {remedy.removeprefix('is ')} {estimator} uses every measurement"
+    return (
+        f"measurements lie far from their predictions, NIS {ratio:.0f} per degree of freedom "
+        f"(1 is right): {remedy}",
+    )
 
 
 def status_of(
@@ -41,7 +62,10 @@ def status_of(
         figures["gated"] = float(mapper.gated)
     warnings = ["no measurements of this team yet"] if state == "waiting" else []
     if waits_for_driver and state != "done":
-        warnings = [driver_away(measurements - 1)]
+        warnings = [
+            f"its driver is away after measurement {measurements - 1}: start it again, or end the "
+            "team by `teamslam end`"
+        ]
     if poses.team_map.doubt:
         warnings.append(poses.team_map.doubt)
     return m.Status(
