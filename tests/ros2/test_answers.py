@@ -1,4 +1,5 @@
 import math
+from collections.abc import Iterator
 from dataclasses import fields
 
 import msgspec
@@ -12,9 +13,9 @@ from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import index_log
 from teamslam.team.ros2.definitions import types
 from teamslam.team.ros2.encoding import compose, ellipse, inverse, names_of
-from teamslam.team.ros2.keys import of_rmw, of_token
+from teamslam.team.ros2.keys import of_rmw, of_token, publication
 from teamslam.team.ros2.topics import RobotTopics
-from teamslam.team.ros2_answers import Answers, LiveAnswers, RosPublisher
+from teamslam.team.ros2_answers import Answer, Answers, LiveAnswers, RosPublisher
 from teamslam.team.translate import landmark_blocks_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -144,6 +145,49 @@ def test_a_robot_s_topics_are_beside_its_odometry(topic, frame, namespace, tf):
     assert (names.namespace, names.tf) == (namespace, tf)
 
 
+@pytest.mark.parametrize(
+    ("latched", "of_rmw_zenoh", "of_bridge"),
+    [(False, "::,10:,:,:,,", ":1:0:0,10:"), (True, ":1:,1:,:,:,,", ":1:1:0,1:")],
+)
+def test_the_graph_has_the_quality_of_service(latched, of_rmw_zenoh, of_bridge):
+    about = {"domain": 3, "node": "n", "session": "abc", "entity": 4, "latched": latched}
+    keys = publication("/r1/team_path", "nav_msgs/msg/Path", "RIHS01_0", **about)
+    assert keys.tokens[1].endswith(f"/nav_msgs::msg::dds_::Path_/RIHS01_0/{of_rmw_zenoh}")
+    assert f"/nav_msgs§msg§Path/{of_bridge}typehash=RIHS01_0;" in keys.tokens[3]
+
+
+def test_every_answer_is_on_the_clock_of_the_robot_s_messages():
+    """With use_sim_time that clock is a simulator's."""
+    live = LiveAnswers("r1", RobotTopics(odometry="/r1/odom"))
+    live.add_odometry(7 * S, (1.0, 0.0, 0.0), "odom", "base_link")
+    for message in (
+        posed(7 * S, (2.0, 0.0, 0.0)),
+        example(m.FusedMap, stamp_ns=7 * S),
+        example(m.Status, node="r1", stamp_ns=7 * S),
+    ):
+        live.add_message(message)
+    published = list[Answer]()
+
+    class Publisher(RosPublisher):
+        def __init__(self):
+            pass
+
+        def publish(self, answer):
+            published.append(answer)
+
+    live.publish(Publisher())
+    assert len({each.topic for each in published}) == 6
+
+    def stamps(value) -> Iterator[int]:
+        if getattr(value, "__msgtype__", "") == "std_msgs/msg/Header" and value.frame_id:
+            yield value.stamp.sec * S + value.stamp.nanosec
+        for each in value if isinstance(value, list) else getattr(value, "__dict__", {}).values():
+            yield from stamps(each)
+
+    assert {stamp for each in published for stamp in stamps(decoded(each))} == {7 * S}
+    assert {each.stamp_ns for each in published} == {7 * S}
+
+
 def test_answers_reach_subscribers_of_rmw_zenoh_and_of_a_bridge_with_their_types(network):
     router, endpoint = network
     live = LiveAnswers("r1", RobotTopics(odometry="/r1/odom"))
@@ -229,6 +273,15 @@ def test_two_readers_decode_the_same_bag_whose_truth_lies_at_the_paths(tmp_path,
     export_rosbag2(written(tmp_path / "log.mcap", samples), bag)
     with AnyReader([bag]) as reader:
         assert {each.msgtype for each in reader.connections} == PUBLISHED.keys()
+        assert {
+            each.topic.rpartition("/")[2]: (q.reliability.name, q.durability.name, q.depth)
+            for each in reader.connections
+            for q in each.ext.offered_qos_profiles
+            if q.durability.name != "VOLATILE"
+        } == dict.fromkeys(
+            ("team_path", "smoothed_path", "team_landmarks", "team_map", "tf_static"),
+            ("RELIABLE", "TRANSIENT_LOCAL", 1),
+        )
         first = [
             (each.topic, stamp, plain(reader.deserialize(data, each.msgtype)))
             for each, stamp, data in reader.messages()
