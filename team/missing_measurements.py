@@ -7,13 +7,13 @@ from contextlib import suppress
 
 from teamslam.team.containment import reply_of
 from teamslam.team.shell import Shell
+from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import BusError
 from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.request_times import RequestTimes
 
-PATIENCE_S = 0.5
-"""Time [s] for which a gap may stay open before it is requested."""
 ASK_TIMEOUT_S = 10.0
 """Longest time [s] for an answer; the request is repeated later."""
 _LOG = logging.getLogger("teamslam")
@@ -30,26 +30,22 @@ class MissingMeasurements:
     ) -> None:
         self._shell = shell
         self._confirm = confirm
-        self._since_s: float | None = None
+        self._times: RequestTimes[Stream] = RequestTimes()
 
     def look(self, requested: Sequence[m.MeasurementsRequest]) -> None:
-        """Send the requests once one has been open for PATIENCE_S."""
-        now_s = time.monotonic()
-        if not requested:
-            self._since_s = None
-        elif self._since_s is None:
-            self._since_s = now_s
-        elif now_s - self._since_s > PATIENCE_S:
-            self._since_s = now_s
-            for each in requested:
-                _LOG.warning(
-                    "measurements %d to %d of %s, incarnation %d, are missing: asked for",
-                    each.first,
-                    each.last,
-                    each.robot,
-                    each.incarnation,
-                )
-                self.ask(each)
+        """Send the requests that are due."""
+        by_stream = {(each.robot, each.incarnation): each for each in requested}
+        firsts = {stream: each.first for stream, each in by_stream.items()}
+        for stream in self._times.due(firsts, time.monotonic()):
+            each = by_stream[stream]
+            _LOG.warning(
+                "measurements %d to %d of %s, incarnation %d, are missing: asked for",
+                each.first,
+                each.last,
+                each.robot,
+                each.incarnation,
+            )
+            self.ask(each)
 
     def ask(self, requested: m.MeasurementsRequest) -> int:
         """Send one request; return the number of measurements received."""
