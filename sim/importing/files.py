@@ -18,14 +18,17 @@ from teamslam.sim.datasets.folder_tables import (
 )
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.columns import MEASURED, REQUIRED, TABLES, Map, Table, map_columns
-from teamslam.sim.importing.proposal import propose_map, proposed_kinds
+from teamslam.sim.importing.proposal import (
+    MOST_ROBOTS,
+    drop_line,
+    propose_map,
+    proposed_kinds,
+)
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.importing.words import names_robot
 from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
 
-MOST_ROBOTS = 100
-"""Most values of a column that names robots."""
 QUATERNION = 8
 """Columns of a TUM trajectory: t x y z qx qy qz qw."""
 
@@ -173,14 +176,12 @@ def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) 
     for column, cells in rows.columns.items():
         names = list(dict.fromkeys(cells))
         if column not in used and names_robot(column) and 1 < len(names) <= MOST_ROBOTS:
-            others = ", ".join(f'"{name}"' for name in names[1:])
-            key = column if re.fullmatch(r"[A-Za-z0-9_-]+", column) else f'"{column}"'
             raise rows.fault(
                 f"column {column} has {len(names)} values, {', '.join(names)}, and the rows of one "
-                f"robot are imported. To import {names[0]}, write drop = {{ {key} = [{others}] }} "
-                f"below `files` of {place or 'its table in the map of columns'}; to import all, "
-                "give each robot such tables, [robots.NAME.odometry] and so on. If it names no "
-                "robots, rename it"
+                f"robot are imported. To import {names[0]}, write "
+                f"{drop_line(column, names[1:])} below `files` of "
+                f"{place or 'its table in the map of columns'}; to import all, give each robot "
+                "such tables, [robots.NAME.odometry] and so on. If it names no robots, rename it"
             )
 
 

@@ -1,17 +1,19 @@
 """Propose a column map from the names of files and columns."""
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ROBOT_NAME
 from teamslam.sim.datasets.folder_tables import DEGREE, POINTS, POLAR, POSES
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.columns import MEASURED, REQUIRED, TABLES
-from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
+from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word, names_robot
 
 SYNONYMS: Mapping[str, str] = {
     "t_s": "t time times timestamp stamp sec secs seconds ts epoch unix unix_time header_stamp",
@@ -50,6 +52,9 @@ UNITS = {
 """Factor to our unit, by the unit at the end of a column name."""
 LARGEST_S = 1e11
 """Times from here on are no seconds."""
+MOST_ROBOTS = 100
+"""More values of a column are no names of robots."""
+_NONE: Mapping[str, Any] = MappingProxyType({})
 KIND = "<kind>"
 """Placeholder of a table's name."""
 PROPOSED = (*MEASURED, "truth", "landmarks", "start")
@@ -91,7 +96,11 @@ Files = Mapping[str, CsvTable]
 """Tables of one robot by file name."""
 
 
-def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
+Drops = Mapping[str, Mapping[str, str]]
+"""By robot and file, the line that drops the rows of the others."""
+
+
+def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops = _NONE) -> str:
     """Propose a TOML map for the files of each robot.
 
     A table that not all robots have alike, with `own` every table, is the robot's own,
@@ -99,13 +108,17 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
     of the file that it should have. Missing columns and files without a table are comments.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
-    _drop_shared_truth(robots, found)
+    _drop_shared_truth(robots, found, drops)
     comments = _add_odometry(found)
     kinds = dict.fromkeys(kind for tables, _ in found.values() for kind in tables)
     shared: list[str] = []
     by_robot: dict[str, list[str]] = {robot: [] for robot in robots}
     for kind in kinds:
-        of = {robot: tables[kind].text for robot, (tables, _) in found.items() if kind in tables}
+        of = {
+            robot: _text_of(tables[kind], drops.get(robot, _NONE))
+            for robot, (tables, _) in found.items()
+            if kind in tables
+        }
         if len(of) == len(found) and len(set(of.values())) == 1 and not own:
             shared.append(next(iter(of.values())).replace(KIND, kind))
             continue
@@ -119,12 +132,61 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False) -> str:
     return comments + "\n".join([*shared, *chain(*by_robot.values())]) + "".join(lacking)
 
 
+def _text_of(table: _Proposed, drops: Mapping[str, str]) -> str:
+    line = f'files = ["{table.file}"]\n'
+    return table.text.replace(line, line + drops.get(table.file, ""))
+
+
+def drops_by_robot(files: Files) -> Drops:
+    """Lines for tables whose rows are of several robots, by a column that names them; empty if the
+    odometry has none.
+    """
+    tables = _tables(files)[0]
+    columns = {
+        table.file: column
+        for table in tables.values()
+        for column, cells in files[table.file].columns.items()
+        if names_robot(column)
+        and f'"{column}"' not in table.text
+        and 1 < len(set(cells)) <= MOST_ROBOTS
+    }
+    if "odometry" not in tables or tables["odometry"].file not in columns:
+        return {}
+    values = {
+        name: list(dict.fromkeys(files[name].columns[column])) for name, column in columns.items()
+    }
+    robots = {
+        (f"r{value}" if value.isdigit() else value.lower()): value
+        for value in chain(*values.values())
+    }
+    whole = len(robots) == len(set(chain(*values.values())))
+    if not whole or not all(re.fullmatch(ROBOT_NAME, robot) for robot in robots):
+        return {}
+    return {
+        robot: {
+            name: drop_line(column, [other for other in values[name] if other != own]) + "\n"
+            for name, column in columns.items()
+        }
+        for robot, own in robots.items()
+    }
+
+
+def drop_line(column: str, texts: Sequence[str]) -> str:
+    """Line of a column map that drops the rows with these texts in a column."""
+    key = column if re.fullmatch(r"[A-Za-z0-9_-]+", column) else json.dumps(column)
+    return f"drop = {{ {key} = {json.dumps(texts, ensure_ascii=False)} }}"
+
+
 def _drop_shared_truth(
-    robots: Mapping[str, Files], found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]
+    robots: Mapping[str, Files],
+    found: Mapping[str, tuple[dict[str, _Proposed], list[str]]],
+    drops: Drops,
 ) -> None:
-    """Replace the truth that several robots would have of one file by a comment."""
+    """Replace the truth that several robots would have of one file's rows by a comment."""
     files = {
-        robot: tables["truth"].file for robot, (tables, _) in found.items() if "truth" in tables
+        robot: tables["truth"].file
+        for robot, (tables, _) in found.items()
+        if "truth" in tables and tables["truth"].file not in drops.get(robot, _NONE)
     }
     for robot, file in files.items():
         table = robots[robot][file]

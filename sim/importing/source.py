@@ -31,7 +31,12 @@ from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.bag import import_bag, propose_assignment, propose_topics
 from teamslam.sim.importing.columns import MEASURED, ColumnMap, load_map
 from teamslam.sim.importing.files import import_files, map_by_names, read_files, trajectory
-from teamslam.sim.importing.proposal import propose_map, split_by_robot, write_proposal
+from teamslam.sim.importing.proposal import (
+    drops_by_robot,
+    propose_map,
+    split_by_robot,
+    write_proposal,
+)
 from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.recorded.streams import measurements_in
 from teamslam.sim.scenarios.scenario import Scenario
@@ -191,7 +196,7 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
         found = {robot: map_by_names(files) for robot, files in robots.items()}
         maps = {robot: own for robot, own in found.items() if own is not None}
         if len(maps) < len(robots) or request.columns is not None:
-            raise _question(split_by_robot(read.get("", {})) or robots, request, folder)
+            raise _question(read.get("", {}), robots, request, folder)
     everyones = {name for files in read.values() for name in files}
     tables, notes = [], list[str]()
     for robot, files in robots.items():
@@ -229,9 +234,15 @@ def _files_by_map(
 
 
 def _question(
-    robots: Mapping[str, Mapping[str, CsvTable]], request: Request, folder: Path
+    of_all: Mapping[str, CsvTable],
+    robots: Mapping[str, Mapping[str, CsvTable]],
+    request: Request,
+    folder: Path,
 ) -> DatasetError:
-    proposed = propose_map(robots)
+    """Error that proposes a map; names of files `of_all`, or a column, tell their robots."""
+    split, drops = split_by_robot(of_all), drops_by_robot(of_all)
+    by_column = dict.fromkeys(drops, of_all)
+    proposed = propose_map(split or by_column or robots, drops={} if split else drops)
     if request.columns is not None:
         return write_proposal(proposed, request.columns)
     name, table = next(

@@ -217,6 +217,24 @@ def test_one_truth_of_two_robots_is_not_proposed_and_refused_unless_its_rows_are
     assert all(each.truth is not None for each in imported(logs, columns, tmp_path / "set"))
 
 
+def test_tables_with_a_column_of_robots_have_a_map_that_parts_them(tmp_path):
+    def both(text: str) -> str:
+        head, *rows = text.splitlines()
+        rows = [f"{row},{robot}" for row in rows for robot in ("ann", "bob")]
+        return "\n".join([f"{head},robot", *rows])
+
+    logs = team_of(tmp_path / "logs", odom=both(TRACK), tags=both(TAGS))
+    columns = tmp_path / "columns.toml"
+    assert run(logs, "-o", tmp_path / "set", "--columns", columns).exit_code == 2
+    assert 'drop = { robot = ["bob"] }' in columns.read_text()
+    assert [each.robot for each in imported(logs, columns, tmp_path / "set")] == ["ann", "bob"]
+    seen = "t,robot,range,bearing\n1,bob,2.0,0.1\n2,cat,2.0,0.1\n"
+    alone = team_of(tmp_path / "alone", odom=TRACK, tags=TAGS, sightings=seen)
+    columns = tmp_path / "alone.toml"
+    assert run(alone, "-o", tmp_path / "one", "--columns", columns).exit_code == 2
+    assert "robots." not in columns.read_text(), "teammates, seen by one robot"
+
+
 def test_a_file_of_two_robots_is_refused_by_its_column_or_its_times_with_the_cure(tmp_path):
     head = TRACK.splitlines()[0]
     steps = [f"{t},{0.1 * t + 5 * k},0,0,{robot}" for t in range(1, 9)
