@@ -202,7 +202,7 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     Of several maps the one with the largest change counts. A landmark that one submap places
     elsewhere, while none sees it at its former place, is gone: a single wrong number does not move
     it. An unnamed one has moved if its former place is empty; else the other place is a new
-    landmark's. One that chance does not explain, but one wrong association, is not listed.
+    landmark's.
     """
     if fold.main_key is None:
         return ()
@@ -226,8 +226,6 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
         for each in displacements(island, saved):
             is_beyond, is_unnamed = each.is_apart or each.chi2 > limit, each.landmark >= UNNAMED
             is_sure = not is_beyond or is_confirmed(graph, saved, each.landmark)
-            if is_unnamed and not is_sure:
-                continue
             if each.is_apart and (is_unnamed or not is_sure):
                 former[each.landmark] = graph.former[saved.contribution.stream, each.landmark]
             before = found.get(each.landmark)

@@ -429,6 +429,29 @@ def test_a_map_without_identities_is_saved_with_classes_which_tell_it_from_anoth
         assert any("the saved map site not joined" in each for each in reasons) != joins
 
 
+def hidden(seed, moved=()):
+    """A day without identities; moved: landmarks by number."""
+    day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
+    places = np.array(day_of.world.landmarks)
+    for number, by in moved:
+        places[number - 1] += by
+    world = msgspec.structs.replace(day_of.world, landmarks=tuple(map(tuple, places.tolist())))
+    day_of = final_only(msgspec.structs.replace(day_of, world=world))
+    return day_of, streams_of(day_of)
+
+
+@pytest.mark.parametrize(("number", "by"), [(15, (1.0, -0.5)), (8, (0.6, 0.3))])
+def test_a_landmark_without_identity_that_has_moved_is_found_and_nothing_else(number, by):
+    scenario, streams = hidden(1)
+    _, centre, _ = day(1, scenario=scenario, streams=streams)
+    saved = centre.maps.fold.save_map("site")
+    scenario, streams = hidden(1001, [(number, by)])
+    samples, _, _ = day(1, [saved], scenario=scenario, streams=streams)
+    (found,) = changed(final_map(samples)).values()
+    assert found.state == "moved"
+    assert (np.abs([found.dx - by[0], found.dy - by[1]]) < 4.0 * found.sigma).all()
+
+
 def test_the_submap_of_a_map_has_landmarks_and_no_motion():
     submap = decoded(encoded(msgspec.structs.replace(submap_of(first_day()[1]), robot="r1")))
     assert isinstance(submap, m.Submap)

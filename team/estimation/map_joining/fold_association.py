@@ -33,9 +33,15 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     joint_marginal,
     solve_island,
 )
-from teamslam.team.estimation.map_joining.joining import Fold, merge_islands, precedence
+from teamslam.team.estimation.map_joining.joining import (
+    Fold,
+    merge_islands,
+    precedence,
+    separate_moved,
+)
 from teamslam.team.estimation.map_joining.merging import Merge, place_island
 from teamslam.team.estimation.map_joining.minima import solve_minimum
+from teamslam.team.estimation.map_joining.saved_maps import SEQUENTIAL
 from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
@@ -63,7 +69,7 @@ def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
         for key in sorted(fold.islands):
             if key in fold.islands and key != fold.home[stream]:
                 fold = _join_island(fold, stream, last[stream], key, views)
-    return fold
+    return separate_moved(fold, SEQUENTIAL, contributions) if fold.has_maps else fold
 
 
 def view_island(island: Island, landmarks: Landmarks) -> IslandView:

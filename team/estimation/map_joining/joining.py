@@ -62,6 +62,8 @@ from teamslam.team.estimation.map_joining.resting import wake_landmarks
 from teamslam.team.estimation.map_joining.saved_maps import (
     FALSE_ALARM,
     SEQUENTIAL,
+    dissociate,
+    is_confirmed,
     maps_of,
     next_change,
     returned,
@@ -87,6 +89,7 @@ __all__ = [
     "fold_submaps",
     "merge_islands",
     "precedence",
+    "separate_moved",
     "solve_fold",
 ]
 
@@ -325,7 +328,7 @@ def fold_submaps(
         landmarks=landmarks,
     )
     merged = _merge_all(_search_suspicious(grown))
-    return _separate_moved(merged, SEQUENTIAL, contributions) if merged.has_maps else merged
+    return separate_moved(merged, SEQUENTIAL, contributions) if merged.has_maps else merged
 
 
 def compact_fold(fold: Fold) -> Fold:
@@ -384,9 +387,7 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
     )
 
 
-def _separate_moved(
-    fold: Fold, chance: float, newest: Sequence[Contribution] | None = None
-) -> Fold:
+def separate_moved(fold: Fold, chance: float, newest: Sequence[Contribution] | None = None) -> Fold:
     """Separate the landmarks that have moved since a saved map from their former places.
 
     The worst first, with a solution before the next test. newest: the submaps whose landmarks are
@@ -403,7 +404,11 @@ def _separate_moved(
             nodes = {node for each in submaps for node in each.landmarks.tolist()}
         with suppress(*UNSOLVABLE):
             while (found := next_change(islands[key], chance, nodes)) is not None:
-                apart = separate(islands[key], found[0], [found[1].landmark])
+                saved, id_ = found[0], found[1].landmark
+                if id_ < UNNAMED or is_confirmed(islands[key].graph, saved, id_):
+                    apart = separate(islands[key], saved, [id_])
+                else:
+                    apart = dissociate(islands[key], saved, id_)
                 islands[key] = iterate_tick(apart)
     return replace(fold, islands=islands)
 
@@ -414,7 +419,7 @@ def _test_saved_places(fold: Fold) -> Fold:
         with suppress(*UNSOLVABLE):
             for stream, id_ in returned(island, FALSE_ALARM):
                 islands[key] = iterate_tick(reunite(islands[key], stream, id_))
-    return _separate_moved(replace(fold, islands=islands), FALSE_ALARM)
+    return separate_moved(replace(fold, islands=islands), FALSE_ALARM)
 
 
 def _search_island(island: Island) -> Search:

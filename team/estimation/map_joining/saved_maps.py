@@ -9,12 +9,13 @@ with the map's residual r, information W and Jacobian J, and the island's covari
 g_i with covariance M_ii⁻¹ (Baarda 1968). Without a displacement χ²_i has two degrees of freedom. A
 landmark beyond the limit gets a second node, its former place, which the map alone has; the others
 are tested again, the worst first. An unnamed landmark is known by its place alone, and a submap may
-have associated its neighbour: two submaps are needed to move it.
+have associated its neighbour: two submaps are needed to move it, and the association of one is
+undone.
 """
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, count
 from typing import NamedTuple
 
 import numpy as np
@@ -208,6 +209,17 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
     return replace(island, graph=graph, state=state)
 
 
+def dissociate(island: Island, saved: Joined, id_: int) -> Island:
+    """Give the other submaps' place of a saved map's landmark to a new unnamed landmark."""
+    apart = separate(island, saved, [id_])
+    former = dict(apart.graph.former)
+    place = former.pop((saved.contribution.stream, id_))
+    landmarks = dict(apart.graph.landmarks)
+    other = next(number for number in count(UNNAMED) if number not in landmarks)
+    landmarks |= {id_: place, other: landmarks[id_]}
+    return replace(apart, graph=replace(apart.graph, landmarks=landmarks, former=former))
+
+
 def reunite(island: Island, stream: Stream, id_: int) -> Island:
     """Make a landmark's former place and its present one the same again."""
     graph = island.graph
@@ -223,8 +235,9 @@ def reunite(island: Island, stream: Stream, id_: int) -> Island:
 def next_change(
     island: Island, chance: float, nodes: Collection[int] | None = None
 ) -> tuple[Joined, Displacement] | None:
-    """Find the landmark that disagrees most with its place in a saved map, beyond chance and wrong
-    associations.
+    """Find the landmark that disagrees most with its place in a saved map, beyond chance.
+
+    nodes: those to test in a running map, where an unnamed landmark awaits its second submap.
     """
     limit, graph = chi2_limit(2, chance), island.graph
     found = [
@@ -232,7 +245,7 @@ def next_change(
         for saved in maps_of(graph)
         for each in displacements(island, saved, nodes)
         if not each.is_apart and each.chi2 > limit
-        if each.landmark < UNNAMED or is_confirmed(graph, saved, each.landmark)
+        if nodes is None or each.landmark < UNNAMED or is_confirmed(graph, saved, each.landmark)
     ]
     if not found:
         return None

@@ -6,21 +6,17 @@ import pytest
 from teamslam.central.saved_maps import landmark_changes
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Contribution
+from teamslam.team.estimation.map_joining.fold_association import associate_tick
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     ages,
     solve_island,
 )
-from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
-from teamslam.team.estimation.map_joining.saved_maps import (
-    FALSE_ALARM,
-    maps_of,
-    next_change,
-    separate,
-)
+from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, solve_fold
+from teamslam.team.estimation.map_joining.landmark_view import points_of
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
-from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 SITE, ROBOT = ("map-site", 0), ("r1", 1)
 ANGLES = 2.0 * np.pi * np.arange(8) / 8
@@ -48,40 +44,56 @@ def _local(first: int, places: np.ndarray, keep: np.ndarray | None = None) -> Lo
     chosen = np.arange(len(places)) if keep is None else np.flatnonzero(keep)
     mean = np.concatenate([np.zeros(3), places[chosen].ravel()])
     variances = np.concatenate([[1e-4, 1e-4, 1e-6], np.full(2 * len(chosen), 0.05**2)])
-    return LocalMap((first + chosen).astype(np.uint32), mean, np.diag(variances))
+    once = np.ones((len(chosen), 1), np.bool_) if first >= UNNAMED else np.ones((0, 1), np.bool_)
+    unnamed = Unnamed(np.ones(len(once), np.uint32), once)
+    ids = (first + chosen).astype(np.uint32)
+    return LocalMap(ids, mean, np.diag(variances), unnamed=unnamed)
+
+
+def final(of: Island) -> Fold:
+    """The full solution, with landmarks that have moved apart."""
+    fold = Fold((), {}, {SITE: of}, {SITE: SITE, ROBOT: SITE}, EMPTY_FOLD.reasons)
+    return solve_fold(fold, of.settings)
 
 
 def states(of: Island) -> dict[int, str]:
-    """Separate the landmark that next_change finds; return the states by index."""
-    found = next_change(of, FALSE_ALARM)
-    first = min(of.graph.landmarks)
-    if found is not None:
-        of = solve_island(separate(of, found[0], [found[1].landmark]))[0]
-    fold = Fold((), {}, {SITE: of}, {SITE: SITE, ROBOT: SITE}, EMPTY_FOLD.reasons)
-    changes = landmark_changes(fold, sorted(of.graph.landmarks))
-    return {each.landmark - first: each.state for each in changes}
+    """States of the landmarks in the final map, by index."""
+    changes = landmark_changes(final(of), sorted(of.graph.landmarks))
+    return {each.landmark - min(of.graph.landmarks): each.state for each in changes}
 
 
 @pytest.mark.parametrize("submaps", [1, 6])
-def test_a_single_submap_moves_no_landmark_that_is_known_by_its_place_alone(submaps):
-    """It may have associated a neighbour; a number identifies it."""
-    found = states(island(UNNAMED, having=1, submaps=submaps))
+def test_a_single_submap_moves_no_landmark_that_is_known_by_its_place_alone(submaps: int) -> None:
+    """It may have associated a neighbour, which becomes a landmark of its own."""
+    of = island(UNNAMED, having=1, submaps=submaps)
+    found = states(of)
     assert MOVED not in found
     assert {*found.values()} == {"unchanged"}
     assert len(found) == len(PLACES) - 1
-    of = island(1, having=1, submaps=1)
-    found_named = next_change(of, FALSE_ALARM)
-    assert found_named is not None
-    assert found_named[1].landmark == 1 + MOVED
-    assert found_named[0] is maps_of(of.graph)[0]
+    solved = final(of).main
+    saved, other = points_of(solved, [UNNAMED + MOVED, UNNAMED + len(PLACES)])
+    assert np.allclose(saved, PLACES[MOVED], atol=0.01)
+    assert np.allclose(other, PLACES[MOVED] + BY, atol=0.01)
 
 
-def test_an_unnamed_landmark_has_moved_if_its_former_place_is_empty():
+def test_a_single_submap_moves_a_landmark_that_its_number_identifies() -> None:
+    assert states(island(1, having=1, submaps=1))[MOVED] == "moved"
+
+
+def test_an_unnamed_landmark_has_moved_if_its_former_place_is_empty() -> None:
     found = states(island(UNNAMED, having=8, submaps=8))
     assert {k for k, state in found.items() if state != "unchanged"} == {MOVED}
     assert found[MOVED] == "moved"
 
 
-def test_beside_a_former_place_that_may_have_been_overlooked_it_is_a_new_landmark():
+def test_beside_a_former_place_that_may_have_been_overlooked_it_is_a_new_landmark() -> None:
     assert states(island(UNNAMED, having=2, submaps=2))[MOVED] == "new"
     assert states(island(1, having=2, submaps=2))[MOVED] == "moved"
+
+
+def test_an_unnamed_landmark_is_tested_in_the_tick_that_associates_it() -> None:
+    """Later its submaps are discounted against the saved map, which is not."""
+    of = island(UNNAMED, having=8, submaps=8)
+    fold = Fold((), {}, {SITE: of}, {SITE: SITE, ROBOT: SITE}, EMPTY_FOLD.reasons)
+    newest = of.graph.submaps[-1].contribution
+    assert {*associate_tick(fold, [newest]).main.graph.former} == {(SITE, UNNAMED + MOVED)}
