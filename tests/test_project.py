@@ -150,6 +150,16 @@ def test_a_process_loads_nothing_that_it_does_not_use_until_it_connects(words, u
     assert loaded.isdisjoint(unused)
 
 
+def test_a_launch_starts_its_processes_before_it_loads_what_it_needs_later():
+    code = (
+        "import sys, teamslam.sim.cli.launch, teamslam.sim.launch.launch\n"
+        "import teamslam.sim.launch.live; print(*sys.modules)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    unused = {"numpy", "cryptography.x509", "pydantic", "mcap", "teamslam.sim.cli.main"}
+    assert set(ran.stdout.split()).isdisjoint(unused)
+
+
 def test_a_launch_and_its_report_need_no_scipy():
     parts = (
         "sim.launch.launch", "sim.cli.main", "sim.in_memory.team", "central.main",

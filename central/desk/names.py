@@ -1,4 +1,4 @@
-"""Robot names for display."""
+"""Names and texts for display."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -7,6 +7,7 @@ from pathlib import PurePath
 OUTSIDE = "not in the team's frame"
 """Replaces the error of poses outside the team map's frame."""
 _DIGITS = re.compile("([0-9]+)")
+_DECIMAL = re.compile(r"\d+\.\d+")
 _NOT_JOINED = " not joined: "
 _FIRST_LIFE = " (incarnation 1)"
 _ROBOT = re.compile(r"(\S+) \(incarnation \d+\)")
@@ -40,3 +41,8 @@ def not_joined(reasons: Iterable[str]) -> Iterator[tuple[str, str]]:
 def short(words: str) -> str:
     """Omit the incarnation of robots that have only one."""
     return words.replace(_FIRST_LIFE, "")
+
+
+def without_decimals(text: str) -> str:
+    """Mask decimals: other figures make no new event."""
+    return _DECIMAL.sub("#", text)

@@ -3,16 +3,19 @@
 import re
 import time
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from teamslam.central.desk.evaluation.verdicts import pair_of
 from teamslam.central.desk.names import in_order
 from teamslam.team.keys.roster import ROBOT
 from teamslam.team.peers.members import Member, about
-from teamslam.team.peers.proofs import Signs, sign_order
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, open_valid
 from teamslam.team.wire.codec import encoded
+
+if TYPE_CHECKING:
+    from teamslam.team.peers.proofs import Signs
 
 CENTRE_S = 10.0
 """Time [s] within which a running centre or robot is detected."""
@@ -84,10 +87,12 @@ class RunningTeam:
         raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
 
 
-def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
+def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
     """Publish an order, with its signature for peers if there are keys."""
     bus.publish(order)
     if signer is not None:
+        from teamslam.team.peers.proofs import sign_order
+
         member = Member(order.key, encoded(order.message), order.message)
         robot = about(order.message)
         if robot:
@@ -95,7 +100,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: Signs | None) -> None:
 
 
 def withdraw(
-    bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> m.FusedMap:
     """Order a robot's withdrawal and return the first map without it.
 
@@ -116,7 +121,7 @@ def withdraw(
 
 
 def give_up(
-    bus: Bus, robot: str, reason: str, patience_s: float, signer: Signs | None = None
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> None:
     """Order the team to continue without a lost robot; return on confirmation.
 
@@ -175,7 +180,7 @@ def judge(
     judgement: m.Judgement,
     reason: str,
     patience_s: float,
-    signer: Signs | None = None,
+    signer: "Signs | None" = None,
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from importlib import import_module
 
 # Before NumPy: one BLAS thread per process, for equal bits everywhere and no contention.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -13,7 +14,8 @@ from teamslam.sim.cli.options import FAILED, WRONG_USE  # noqa: E402
 from teamslam.sim.cli.plain import parse_plainly  # noqa: E402
 
 PROCESSES = ("router", "record", "central", "robot", "world")
-"""Commands that run beside many others: the rest of the command line is not imported for them."""
+PLAIN = {"launch": "launch", **dict.fromkeys(PROCESSES, "nodes")}
+"""Commands that start a team, with their modules: no other command is imported for them."""
 
 
 def main() -> None:
@@ -32,11 +34,11 @@ def main() -> None:
 
 
 def _run(words: list[str]) -> None:
-    if words and words[0] in PROCESSES:
-        sys.modules["_hashlib"] = None  # type: ignore[assignment] # OpenSSL in hashlib: 3.5 MB
-        from teamslam.sim.cli import nodes
-
-        function = getattr(nodes, words[0])
+    if words and words[0] in PLAIN:
+        if words[0] in PROCESSES:
+            sys.modules["_hashlib"] = None  # type: ignore[assignment] # OpenSSL in hashlib: 3.5 MB
+        commands = import_module(f"teamslam.sim.cli.{PLAIN[words[0]]}")
+        function = getattr(commands, words[0])
         arguments = parse_plainly(function, words[1:])
         if arguments is not None:
             try:

@@ -22,6 +22,9 @@ def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict
         annotated, info = get_args(parameter.annotation)
         kinds = get_args(annotated) if isinstance(annotated, UnionType) else (annotated,)
         kind = next(each for each in kinds if each is not NoneType)
+        if parameter.default is not inspect.Parameter.empty:
+            is_list = get_origin(kind) is list and parameter.default is None
+            found[name] = () if is_list else parameter.default
         if isinstance(info, ArgumentInfo):
             places.append((name, kind))
             continue
@@ -31,9 +34,6 @@ def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict
         for written in declared or [own]:
             for word, value in zip(written.split("/"), (True, False), strict=False):
                 options[word.strip()] = (name, kind, value)
-        if parameter.default is not inspect.Parameter.empty:
-            is_list = get_origin(kind) is list and parameter.default is None
-            found[name] = () if is_list else parameter.default
     rest = iter(words)
     for word in rest:
         if not word.startswith("-") and places:
@@ -49,4 +49,4 @@ def parse_plainly(function: Callable[..., object], words: Sequence[str]) -> dict
         if kind not in (str, Path) or text is None or text.startswith("-"):
             return None
         found[name] = kind(text)
-    return None if places or len(found) < len(inspect.signature(function).parameters) else found
+    return None if len(found) < len(inspect.signature(function).parameters) else found

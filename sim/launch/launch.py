@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre
 from teamslam.sim.launch.processes import Starter, Used
@@ -18,13 +19,15 @@ from teamslam.sim.launch.supervision import (
     names_only,
     supervise,
 )
-from teamslam.sim.launch.watch import Watch
+from teamslam.sim.launch.watch import COMPARED, Watch
 from teamslam.sim.scenarios.scenario import Scenario, dumps
-from teamslam.team.keys.credentials import Credentials, credentials_of
-from teamslam.team.peers.proofs import Signs
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import BusError
 from teamslam.team.wire.zenoh.bus import ZenohBus
+
+if TYPE_CHECKING:
+    from teamslam.team.keys.credentials import Credentials
+    from teamslam.team.peers.proofs import Signs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +121,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         drivers = ids if plan.scenario.is_live else None
         watch = Watch(began=began, robots=ids, drivers=drivers)
         team = plan.scenario.team
-        own = None if plan.keys is None else credentials_of(plan.keys, "operator", team)
+        own = None if plan.keys is None else _own_keys(plan.keys, team)
         door = "".join(f" {word}" for word in plan.door)
         endpoint, connected = enter_team(
             router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES)
@@ -138,7 +141,7 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
                     bus.subscribe(channel)
                 bus.watch_alive("central")
                 watch.signer = None if own is None else _signer(own)
-            for channel in watch.errors.listens:
+            for channel in COMPARED:
                 bus.subscribe(channel)
             for name, arguments in _commands(plan, resolved, endpoint):
                 services.append(Supervised(name, arguments, plan.folder, starter))
@@ -196,7 +199,13 @@ def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> S
     return service
 
 
-def _signer(own: Credentials) -> Signs:
+def _own_keys(folder: Path, team: str) -> "Credentials":
+    from teamslam.team.keys.credentials import credentials_of
+
+    return credentials_of(folder, "operator", team)
+
+
+def _signer(own: "Credentials") -> "Signs":
     from teamslam.team.keys.signing import Signer
 
     return Signer(own)

@@ -15,13 +15,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from teamslam.central.desk.evaluation.events import without_decimals
-from teamslam.central.desk.names import in_order, not_joined, short
+from teamslam.central.desk.names import in_order, not_joined, short, without_decimals
 from teamslam.sim.launch.watch import DRIVERS, Watch, team_time
 from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:
-    from teamslam.sim.launch.watch import LiveErrors
+    from teamslam.sim.launch.live_errors import LiveErrors
 
 AHEAD_S = 10.0
 """Smallest reported lead of the world over the map [s]."""

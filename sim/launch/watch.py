@@ -4,14 +4,9 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, ClassVar
+from functools import cached_property
+from typing import TYPE_CHECKING
 
-from teamslam.central.desk.evaluation.running import (
-    NeesTally,
-    RunningErrors,
-    TrueLandmarks,
-    TruthFrames,
-)
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.team.wire import channels as ch
@@ -21,105 +16,8 @@ from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.message_order import is_newer_map
 
 if TYPE_CHECKING:
+    from teamslam.sim.launch.live_errors import LiveErrors
     from teamslam.team.peers.proofs import Signs
-
-EVERY_NS = 1_000_000_000
-"""Least team time between a robot's compared poses."""
-
-
-@dataclass
-class _Robot:
-    tally: NeesTally = field(default_factory=NeesTally)
-    errors: RunningErrors = field(default_factory=lambda: RunningErrors(EVERY_NS))
-    given_map: bool = False
-    team_ns: int = -1
-
-    def begin_again(self, *, given_map: bool) -> None:
-        """Discard poses and errors before a change of kind or frame."""
-        self.given_map, self.tally = given_map, NeesTally()
-        self.errors.forget_poses()
-
-    def judge(self) -> None:
-        """Compare every pose up to the newest truth; discards used truth."""
-        if (found := self.errors.known()) is not None:
-            self.tally.take(found.nees, 3)
-            self.errors.forget(int(found.stamps_ns[-1]))
-
-
-@dataclass
-class LiveErrors:
-    """Errors of a team so far.
-
-    landmarks: of the newest fused map, unaligned; NEES as the report's map NEES per dof.
-    """
-
-    landmarks: NeesTally = field(default_factory=NeesTally)
-    _robots: dict[str, _Robot] = field(default_factory=dict)
-    _truth: TrueLandmarks = field(default_factory=TrueLandmarks)
-    _frames: TruthFrames = field(default_factory=TruthFrames)
-
-    listens: ClassVar[tuple[ch.Channel, ...]] = (
-        ch.START,
-        ch.TRUTH,
-        ch.TRUTH_LANDMARKS,
-        ch.OWN_POSE,
-        ch.TEAM_POSE,
-    )
-
-    def of(self, robot: str) -> NeesTally:
-        """Errors of a robot's online poses, given the team's map if there are any."""
-        return self._robots[robot].tally if robot in self._robots else NeesTally()
-
-    def wants(self, channel: ch.Channel, robot: str, sample: Sample) -> bool:
-        """Whether the sample needs decoding."""
-        if channel not in (ch.OWN_POSE, ch.TEAM_POSE):
-            return True
-        known = self._robot(robot)
-        if channel is ch.TEAM_POSE:
-            is_again = sample.stamp_ns <= known.team_ns  # may withdraw the pose of this time
-            known.team_ns = sample.stamp_ns
-            if is_again:
-                return True
-        if known.given_map != (channel is ch.TEAM_POSE):
-            return channel is ch.TEAM_POSE  # the first one given the map replaces the others
-        return known.errors.is_due(sample.stamp_ns)
-
-    def take(self, channel: ch.Channel, message: m.Message) -> None:
-        """Process a message of any channel."""
-        match message:
-            case m.InitialPose():
-                self._frames.take(message)
-            case m.PoseEstimate():
-                self._take_pose(message, by_team=channel is ch.TEAM_POSE)
-            case m.Truth():
-                robot = self._robot(message.robot)
-                robot.errors.take_truth(message)
-                robot.judge()
-            case m.TruthLandmarks():
-                self._truth = TrueLandmarks.of(message)
-            case m.FusedMap():
-                self._take_map(message)
-            case _:
-                pass
-
-    def _robot(self, name: str) -> _Robot:
-        return self._robots.setdefault(name, _Robot())
-
-    def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
-        robot = self._robot(message.robot)
-        given_map = by_team and message.in_team_frame
-        if by_team and given_map != robot.given_map:
-            robot.begin_again(given_map=given_map)
-        if by_team == given_map and self._frames.has(message.frame):
-            robot.errors.take_pose(message)
-        robot.judge()
-
-    def _take_map(self, fused: m.FusedMap) -> None:
-        self.landmarks = NeesTally()
-        if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
-            self.landmarks.take(fit.nees, 2)
-            self.landmarks.nees_per_dof = fit.nees_per_dof * fit.landmarks
-
 
 TURN_S = 0.1
 DRIVERS = "drivers"
@@ -128,13 +26,10 @@ UNIX_S = 1e9
 """Team times from here on are Unix times: 1e9 s is in 2001."""
 SILENT_S = 10.0
 """Driver silence [s] that is reported; a status is due each second."""
+COMPARED = (ch.START, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.OWN_POSE, ch.TEAM_POSE)
+"""Channels of `LiveErrors`, besides the fused map's."""
 _PROGRESS = ("measurements", "submaps", "messages")
 """Status figures that grow with progress."""
-
-
-def _no_errors() -> "LiveErrors":
-    """Make an empty `LiveErrors`, whose import outlasts the start of the processes."""
-    return LiveErrors()
 
 
 @dataclass
@@ -152,7 +47,6 @@ class Watch:
     failures: list[str] = field(default_factory=list)
     began: float = field(default_factory=time.monotonic)
     robots: tuple[str, ...] = ()
-    errors: "LiveErrors" = field(default_factory=_no_errors)
     place: str = ""
     call: str = ""
     notes: list[str] = field(default_factory=list)
@@ -207,6 +101,13 @@ class Watch:
             elif status.state == "waiting":
                 yield f"the driver of {robot} is running and has sent no odometry yet"
 
+    @cached_property
+    def errors(self) -> "LiveErrors":
+        """Errors so far; loaded with NumPy at the first truth or map, when all processes run."""
+        from teamslam.sim.launch.live_errors import LiveErrors
+
+        return LiveErrors()
+
     @property
     def missing_robots(self) -> list[str]:
         """Robots without a status."""
@@ -241,7 +142,7 @@ class Watch:
 
     def _take(self, sample: Sample) -> None:
         found = ch.channel_of(sample.key)
-        if found is None or not self.errors.wants(*found, sample):
+        if found is None or (found[0] in COMPARED and not self.errors.wants(*found, sample)):
             return
         try:
             channel, _, message = open_printable(sample)
@@ -257,7 +158,7 @@ class Watch:
         elif isinstance(message, m.Concluded):
             self.concluded[message.robot] = message
             self.concluded_s.setdefault(message.robot, time.monotonic() - self.began)
-        if channel not in (ch.TEAM_MAP, ch.TEAM_FINAL):
+        if channel in (*COMPARED, ch.FUSED_MAP, ch.FINAL_MAP):
             self.errors.take(channel, message)
 
     def _take_fault(self, fault: m.Fault) -> None:

@@ -1,10 +1,9 @@
 """Detect a team's events: robots that join, are lost or refused, and warnings."""
 
-import re
 from dataclasses import dataclass, field
 from typing import Literal
 
-from teamslam.central.desk.names import in_order, not_joined, short
+from teamslam.central.desk.names import in_order, not_joined, short, without_decimals
 from teamslam.central.diagnosis import describe
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.channels import robot_node
@@ -25,7 +24,6 @@ Kind = Literal[
 MOST = 2000
 """Most events of a run."""
 FIRST = 1
-_NUMBER = re.compile(r"\d+\.\d+")
 _AWAITED = (
     "waiting for ",
     "has not appeared yet",
@@ -219,8 +217,3 @@ def is_awaited(warning: str) -> bool:
 
 def _is_apart(reason: str) -> bool:
     return any(not_joined([reason]))
-
-
-def without_decimals(text: str) -> str:
-    """Mask decimals: other figures make no new event."""
-    return _NUMBER.sub("#", text)

@@ -1,10 +1,13 @@
 """Operator verdicts on pairs of unnamed landmarks."""
 
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 
-from teamslam.central.desk.evaluation.log import Collected
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+
+if TYPE_CHECKING:
+    from teamslam.central.desk.evaluation.log import Collected
 
 Pair = frozenset[m.LocalLandmark]
 
@@ -63,7 +66,7 @@ def _chain(
     return chains.get(last)
 
 
-def verdicts_given(log: Collected) -> tuple[str, ...]:
+def verdicts_given(log: "Collected") -> tuple[str, ...]:
     """Describe the verdicts of a log, in order."""
     keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)

@@ -1,4 +1,5 @@
-from teamslam.central.desk.evaluation.events import EventDetector, without_decimals
+from teamslam.central.desk.evaluation.events import EventDetector
+from teamslam.central.desk.names import without_decimals
 from teamslam.team.wire import messages as m
 from tests import build
 from tests.support import fused_map

@@ -1,12 +1,13 @@
 import json
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from teamslam.sim.cli import nodes, results
-from teamslam.sim.cli.entry import PROCESSES
+from teamslam.sim.cli import results
+from teamslam.sim.cli.entry import PLAIN
 from teamslam.sim.cli.help import SECTIONS
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.plain import parse_plainly
@@ -48,6 +49,10 @@ def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():
     assert "did you mean `waypoints`?" in str(RUN.invoke(app, ["launch", "waypoint"]).exception)
 
 
+def function_of(name):
+    return getattr(import_module(f"teamslam.sim.cli.{PLAIN[name]}"), name)
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -61,13 +66,16 @@ def test_a_misspelt_command_option_or_scenario_is_answered_by_the_closest_one():
         "central s.json --peers --keys keys",
         "record s.json -o a.mcap --no-join",
         "record s.json --output a.mcap --resume",
+        "launch",
+        "launch thesis --view -o runs/first --speed 20 --no-report",
+        "launch --dataset my_set --json a.json --peers --without-centre",
     ],
 )
 def test_what_is_parsed_is_as_by_typer(words):
     name, *rest = words.split()
     command = WHOLE.commands[name]
     parsed = command.make_context(name, list(rest)).params
-    assert parse_plainly(getattr(nodes, name), rest) == parsed
+    assert parse_plainly(function_of(name), rest) == parsed
 
 
 @pytest.mark.parametrize(
@@ -76,13 +84,12 @@ def test_what_is_parsed_is_as_by_typer(words):
         "robot", "robot s.json", "robot s.json r1 r2", "robot s.json r1 --help",
         "robot s.json r1 --conect a", "robot s.json r1 --connect", "world s --seed 3",
         "central s --patience 3", "central s --map a.toml", "record s", "record s -ofile",
-        "router --listen --insecure",
+        "router --listen --insecure", "launch a b", "launch --seed 3", "launch --map a --help",
     ],
 )  # fmt: skip
 def test_help_mistakes_and_numbers_are_left_to_typer(words):
     name, *rest = words.split()
-    assert name in PROCESSES
-    assert parse_plainly(getattr(nodes, name), rest) is None
+    assert parse_plainly(function_of(name), rest) is None
 
 
 def test_short_work_says_nothing_and_long_work_what_it_does_and_how_far_it_is(monkeypatch, capsys):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from teamslam.sim.launch.watch import LiveErrors
+from teamslam.sim.launch.live_errors import LiveErrors
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_stamps
