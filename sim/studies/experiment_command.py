@@ -1,7 +1,6 @@
 """Commands `teamslam experiment NAME`: one per catalogue entry, `all`, and `merge`."""
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,62 +10,11 @@ import typer
 
 from teamslam.sim.cli.help import Command, Group
 from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
-from teamslam.sim.studies.experiments.runner import ENTRIES, Entry
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
-    from teamslam.sim.studies.experiments.cases import Done
     from teamslam.sim.studies.experiments.runner import Plan
-
-LINE_S = 10.0
-
-
-@contextmanager
-def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[["Done"], None]]:
-    """Yield a function to call with every finished task."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
-    # The bar advances by expected cost, which differs widely between runs.
-    cost = sum(task.cost for task in tasks)
-    bar = Progress(
-        BarColumn(bar_width=30),
-        TextColumn("{task.fields[runs]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not (tasks and console.is_terminal),
-    )
-    finished, due = 0, time.monotonic()
-
-    def hear(done: "Done") -> None:
-        nonlocal finished, due
-        finished += 1
-        bar.update(whole, advance=done.task.cost, runs=f"{finished} of {of}")
-        if done.error:
-            text = f"failed: {done.task.label}: {done.error}"
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
-        if bar.disable and (time.monotonic() >= due or finished == len(tasks)):
-            due = time.monotonic() + LINE_S
-            console.print(f"{finished} of {of}", highlight=False, soft_wrap=True)
-
-    if not tasks:
-        console.print(of, highlight=False)
-    with bar:
-        whole = bar.add_task("", total=cost, runs=of)
-        yield hear
-
 
 app = typer.Typer(
     name="experiment",
@@ -246,6 +194,7 @@ def _run_shard(asked: Asked, text: str) -> None:
         write_shard,
     )
     from teamslam.sim.studies.experiments.experiment import without_datasets
+    from teamslam.sim.studies.experiments.output import show_progress
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
 
     with failing(WRONG_USE, ShardError):
@@ -280,7 +229,12 @@ def _run(asked: Asked) -> None:
     _require_joblib()
 
     from teamslam.sim.studies.experiments.experiment import without_datasets
-    from teamslam.sim.studies.experiments.output import render_outcome, to_json, write
+    from teamslam.sim.studies.experiments.output import (
+        render_outcome,
+        show_progress,
+        to_json,
+        write,
+    )
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_outcomes, cores
     from teamslam.team.recording.provenance import provenance
 

@@ -11,8 +11,9 @@ from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
+from teamslam.sim.studies.experiments.catalogue import Entry
 from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table, runs_of
-from teamslam.sim.studies.experiments.runner import FAILURES, Entry, Plan, compute_outcomes
+from teamslam.sim.studies.experiments.runner import FAILURES, Plan, compute_outcomes
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 

@@ -7,7 +7,7 @@ To add an experiment:
 before all have been made. A `Task` names a function of this package with JSON parameters and a JSON
 result; a team's run is `team_runs.team_task(scenario)`. `Outcome.missing` lists figures that need a
 data set.
-3. Add an entry to `runner.py`.
+3. Add an entry to `catalogue.py`.
 
 Results are stored in the output folder by task and digest of the imported sources.
 """

@@ -1,20 +1,25 @@
-"""Write an experiment's outcome: tables, JSON, pictures, and a page."""
+"""Show the progress of runs; write an outcome: tables, JSON, pictures, and a page."""
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from html import escape
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import RenderableType
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 from rich.text import Text
 
+from teamslam.sim.studies.experiments.cases import Done
 from teamslam.sim.studies.experiments.experiment import Goal, Table
 from teamslam.sim.studies.experiments.runner import Concluded
+from teamslam.sim.studies.experiments.task import Task
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 64rem; margin: 2rem auto; padding: 0 1rem; }
@@ -230,3 +235,43 @@ def _figure(path: Path, caption: str) -> str:
         f'src="data:image/png;base64,{data}"></div>'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
+
+
+LINE_S = 10.0
+
+
+@contextmanager
+def show_progress(tasks: Sequence[Task], found: int) -> Iterator[Callable[[Done], None]]:
+    """Yield a function to call with every finished task."""
+    console = Console(stderr=True)
+    of = f"{len(tasks)} runs" + (f", {found} more are stored" if found else "")
+    # The bar advances by expected cost, which differs widely between runs.
+    cost = sum(task.cost for task in tasks)
+    bar = Progress(
+        BarColumn(bar_width=30),
+        TextColumn("{task.fields[runs]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not (tasks and console.is_terminal),
+    )
+    finished, due = 0, time.monotonic()
+
+    def hear(done: Done) -> None:
+        nonlocal finished, due
+        finished += 1
+        bar.update(whole, advance=done.task.cost, runs=f"{finished} of {of}")
+        if done.error:
+            text = f"failed: {done.task.label}: {done.error}"
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+        if bar.disable and (time.monotonic() >= due or finished == len(tasks)):
+            due = time.monotonic() + LINE_S
+            console.print(f"{finished} of {of}", highlight=False, soft_wrap=True)
+
+    if not tasks:
+        console.print(of, highlight=False)
+    with bar:
+        whole = bar.add_task("", total=cost, runs=of)
+        yield hear
