@@ -1,8 +1,8 @@
 """Commands `teamslam experiment NAME`: one per catalogue entry, `all`, and `merge`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +10,7 @@ import typer
 
 from teamslam.sim.cli.help import Command, Group
 from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
-from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry
+from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry, Study
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
@@ -68,21 +68,11 @@ def _command(name: str, summary: str) -> None:
         check: Check = False,
         json_file: JsonFile = None,
     ) -> None:
-        asked = Asked(
-            name=name,
-            seeds=seeds,
-            first=first,
-            quick=quick,
-            paths=dataset or [],
-            output=output,
-            jobs=jobs,
-            check=check,
-            json_file=json_file,
-        )
+        study = Study(name, seeds, first, quick, [str(path) for path in dataset or ()])
         if shard is None:
-            _run(asked)
+            _run(study, output, jobs, json_file, check=check)
         else:
-            _run_shard(asked, shard)
+            _run_shard(study, shard, output, jobs)
 
     app.command(name, cls=Command, help=summary, epilog=f"teamslam experiment {name} --quick")(run)
 
@@ -117,54 +107,33 @@ def merge(
 
     with failing(WRONG_USE, ShardError):
         study, program = study_of(shards)
-    asked = Asked(
-        name=study.name,
-        seeds=study.seeds,
-        first=study.first,
-        quick=study.quick,
-        paths=dataset or [Path(path) for path in study.datasets],
-        output=output,
-        jobs=jobs,
-        check=check,
-        json_file=json_file,
-    )
-    tasks = tasks_by_name(asked.plans())
+    if dataset:
+        study = replace(study, datasets=[str(path) for path in dataset])
+    tasks = tasks_by_name(_plans(study))
     if programs_of(list(tasks.values())) != program:
         fail("the shards were computed by another version of the program or libraries", WRONG_USE)
     collect_results(shards, output)
-    _run(asked)
+    _run(study, output, jobs, json_file, check=check)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Asked:
-    """Name of an experiment and options of its command."""
+def _plans(study: Study) -> "list[Plan]":
+    """Plans of the experiment, or of all."""
+    from teamslam.sim.studies.experiments.experiment import Options
+    from teamslam.sim.studies.experiments.runner import dataset, plan_runs
 
-    name: str
-    seeds: int | None
-    first: int
-    quick: bool
-    paths: Sequence[Path]
-    output: Path
-    jobs: int | None
-    check: bool
-    json_file: Path | None
+    datasets = tuple(dataset(Path(path)) for path in study.datasets)
+    entries = [entry for entry in ENTRIES if study.experiment in (entry.name, ALL)]
+    return [
+        plan_runs(entry, Options(_seeds_of(entry, study), study.quick, datasets))
+        for entry in entries
+    ]
 
-    def plans(self) -> "list[Plan]":
-        """Plans of the experiment, or of all."""
-        from teamslam.sim.studies.experiments.experiment import Options
-        from teamslam.sim.studies.experiments.runner import dataset, plan_runs
 
-        datasets = tuple(dataset(path) for path in self.paths)
-        entries = [entry for entry in ENTRIES if self.name in (entry.name, ALL)]
-        return [
-            plan_runs(entry, Options(self._seeds_of(entry), self.quick, datasets))
-            for entry in entries
-        ]
-
-    def _seeds_of(self, entry: Entry) -> tuple[int, ...]:
-        own = min(entry.seeds, entry.seeds_in_all) if self.name == ALL else entry.seeds
-        count = self.seeds or (entry.quick_seeds if self.quick else own)
-        return tuple(range(self.first, self.first + count))
+def _seeds_of(entry: Entry, study: Study) -> tuple[int, ...]:
+    in_all = study.experiment == ALL
+    own = min(entry.seeds, entry.seeds_in_all) if in_all else entry.seeds
+    count = study.seeds or (entry.quick_seeds if study.quick else own)
+    return tuple(range(study.first, study.first + count))
 
 
 def _require_joblib() -> None:
@@ -182,12 +151,11 @@ def _stoppable(output: Path) -> Iterator[None]:
         fail(f"interrupted; results so far are in {output}: repeat the command to continue", FAILED)
 
 
-def _run_shard(asked: Asked, text: str) -> None:
+def _run_shard(study: Study, text: str, output: Path, jobs: int | None) -> None:
     _require_joblib()
 
     from teamslam.sim.studies.experiments.cases import (
         ShardError,
-        Study,
         parsed_shard,
         programs_of,
         tasks_of,
@@ -199,29 +167,25 @@ def _run_shard(asked: Asked, text: str) -> None:
 
     with failing(WRONG_USE, ShardError):
         shard = parsed_shard(text)
-    tasks = tasks_by_name(asked.plans())
+    tasks = tasks_by_name(_plans(study))
     if not tasks:
-        fail(without_datasets(asked.name), WRONG_USE)
+        fail(without_datasets(study.experiment), WRONG_USE)
     part = tasks_of(tasks, shard)
-    with _stoppable(asked.output):
-        _, failed = compute_runs(part, asked.output, asked.jobs or cores(), show_progress)
-    study = Study(
-        name=asked.name,
-        seeds=asked.seeds,
-        first=asked.first,
-        quick=asked.quick,
-        datasets=[str(path.resolve()) for path in asked.paths],
-    )
-    write_shard(asked.output, shard, study, programs_of(list(tasks.values())))
+    with _stoppable(output):
+        _, failed = compute_runs(part, output, jobs or cores(), show_progress)
+    found = replace(study, datasets=[str(Path(path).resolve()) for path in study.datasets])
+    write_shard(output, shard, found, programs_of(list(tasks.values())))
     typer.echo(
-        f"{asked.output}: {len(part) - len(failed)} of {len(tasks)} runs; with the other shards: "
+        f"{output}: {len(part) - len(failed)} of {len(tasks)} runs; with the other shards: "
         "teamslam experiment merge FOLDER… -o DIR"
     )
     if failed:
-        fail(f"{len(failed)} runs failed; {asked.output / FAILURES} has their tracebacks", FAILED)
+        fail(f"{len(failed)} runs failed; {output / FAILURES} has their tracebacks", FAILED)
 
 
-def _run(asked: Asked) -> None:
+def _run(
+    study: Study, output: Path, jobs: int | None, json_file: Path | None, *, check: bool
+) -> None:
     import json
 
     from rich.console import Console
@@ -238,31 +202,31 @@ def _run(asked: Asked) -> None:
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_outcomes, cores
     from teamslam.team.recording.provenance import provenance
 
-    name = asked.name
-    if asked.json_file is not None and not asked.json_file.absolute().parent.is_dir():
-        fail(f"--json {asked.json_file}: no such folder; make it first", WRONG_USE)
-    plans = asked.plans()
+    name = study.experiment
+    if json_file is not None and not json_file.absolute().parent.is_dir():
+        fail(f"--json {json_file}: no such folder; make it first", WRONG_USE)
+    plans = _plans(study)
     if not any(plan.tasks for plan in plans):
         fail(without_datasets(name), WRONG_USE)
-    with _stoppable(asked.output):
-        concluded = compute_outcomes(plans, asked.output, asked.jobs or cores(), show_progress)
+    with _stoppable(output):
+        concluded = compute_outcomes(plans, output, jobs or cores(), show_progress)
     origin = provenance()
     console = Console()
     if not console.is_terminal:
         console.width = FILE_WIDTH
     for each in concluded:
         console.print(*render_outcome(each), sep="\n")
-    page = write(concluded, asked.output, "index" if name == ALL else name, origin)
-    if asked.json_file is not None:
+    page = write(concluded, output, "index" if name == ALL else name, origin)
+    if json_file is not None:
         contents = {each.entry.name: to_json(each, origin) for each in concluded}
         content = contents if name == ALL else contents[name]
-        asked.json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
+        json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
     typer.echo(f"{page}: results with pictures; JSON and PNG files beside it")
     failed = sum(len(each.failed) for each in concluded)
     if failed:
-        fail(f"{failed} runs failed; {asked.output / FAILURES} has their tracebacks", FAILED)
+        fail(f"{failed} runs failed; {output / FAILURES} has their tracebacks", FAILED)
     missed = sum(goal.passed is False for each in concluded for goal in each.outcome.goals)
-    if asked.check and missed:
+    if check and missed:
         fail(f"{missed} goals were missed", FAILED)
 
 

@@ -8,13 +8,14 @@ import traceback
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from joblib import Memory, Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+from teamslam.sim.studies.experiments.catalogue import Study
 from teamslam.sim.studies.experiments.task import Task
 
 FOLDER = "cases"
@@ -150,17 +151,6 @@ class Shard:
     of: int
 
 
-@dataclass(frozen=True, kw_only=True)
-class Study:
-    """An experiment's name and the options that determine its runs."""
-
-    name: str
-    seeds: int | None
-    first: int
-    quick: bool
-    datasets: Sequence[str]
-
-
 def parsed_shard(text: str) -> Shard:
     """Parse `I/N`; raises ShardError."""
     found = re.fullmatch(r"(\d+)/(\d+)", text)
@@ -182,12 +172,7 @@ def programs_of(tasks: Sequence[Task]) -> dict[str, str]:
 
 def write_shard(folder: Path, shard: Shard, study: Study, programs: Mapping[str, str]) -> None:
     """Describe the shard in its folder."""
-    content = {
-        "experiment": study.name,
-        "seeds": study.seeds,
-        "first": study.first,
-        "quick": study.quick,
-        "datasets": list(study.datasets),
+    content = asdict(study) | {
         "program": dict(sorted(programs.items())),
         "of": shard.of,
         "shard": shard.number,
@@ -206,17 +191,11 @@ def study_of(folders: Sequence[Path]) -> tuple[Study, dict[str, str]]:
             raise ShardError(
                 f"{folder} and {first} are not of one study: they differ in {', '.join(differing)}"
             )
-    lacking = [str(k) for k in range(1, common["of"] + 1) if k not in numbers.values()]
+    program, of = common.pop("program"), common.pop("of")
+    lacking = [str(k) for k in range(1, of + 1) if k not in numbers.values()]
     if lacking:
-        raise ShardError(f"shard {', '.join(lacking)} of {common['of']} is not among the folders")
-    study = Study(
-        name=common["experiment"],
-        seeds=common["seeds"],
-        first=common["first"],
-        quick=common["quick"],
-        datasets=common["datasets"],
-    )
-    return study, common["program"]
+        raise ShardError(f"shard {', '.join(lacking)} of {of} is not among the folders")
+    return Study(**common), program
 
 
 def collect_results(folders: Sequence[Path], output: Path) -> None:

@@ -1,5 +1,7 @@
 """The experiments by name: what every start of `teamslam` reads of them."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 
@@ -16,6 +18,17 @@ class Entry(NamedTuple):
     seeds: int = 30
     quick_seeds: int = 5
     seeds_in_all: int = 30
+
+
+@dataclass(frozen=True)
+class Study:
+    """An experiment's name, and the options that determine its runs."""
+
+    experiment: str
+    seeds: int | None
+    first: int
+    quick: bool
+    datasets: Sequence[str]
 
 
 ENTRIES = (
