@@ -7,8 +7,11 @@ from hypothesis import strategies as st
 
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
+from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.models import increment_of, predicted
+from teamslam.team.estimation.models import Increment, increment_of, predicted
 from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import polar_scan
 from teamslam.team.estimation.se2 import compose
@@ -175,3 +178,19 @@ def test_the_derivative_by_a_bias_is_that_of_the_bases_submap(mount):
     up, down = (closed(mount, mount, shift=s)[0].mean for s in (1e-3, -1e-3))
     told, found = local.sensitivity[0], (up - down) / 2e-3
     assert np.abs(told + found).max() < 0.05 * np.abs(found).max(), "it takes the error out"
+
+
+@pytest.mark.parametrize(
+    ("variance", "range_m"), [(-1.0, 2.0), (np.nan, 2.0), (1e-4, np.nan)], ids=str
+)
+def test_a_keyframe_that_is_no_gaussian_leaves_a_window_without_solution(variance, range_m):
+    window = OpenWindow(config(), 1, 0)
+    ids, bearings = np.array([3], np.uint32), np.zeros(1)
+    still = Increment(np.zeros(3), 1e-4 * np.eye(3))
+    window.advance(Keyframe(1, still, ids, np.array([2.0]), bearings))
+    assert window.solve(windows.running) is not None
+    moved = Increment(np.zeros(3), variance * np.eye(3))
+    window.advance(Keyframe(2, moved, ids, np.array([range_m]), bearings))
+    assert window.solve(windows.running) is None
+    window.confirm()
+    assert window.solve(windows.gaussian) is None
