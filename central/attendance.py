@@ -349,11 +349,6 @@ class TeamAttendance:
         same = (d for d in robot.dones if (d.incarnation, d.measurements) == counts)
         return next(filter(self.has_received, same), None)
 
-    def takes_part(self, name: str) -> bool:
-        """Whether the robot, even a lost one, may still send a map."""
-        robot = self.robots[name]
-        return robot.done is None and not robot.given_up
-
     @property
     def watermark_ns(self) -> float:
         """The least progress of the live robots: every submap that ends before it has arrived.

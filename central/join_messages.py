@@ -4,7 +4,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-import msgspec
 import numpy as np
 
 from teamslam.central.config import CentralConfig
@@ -324,20 +323,19 @@ def trajectories(
         if fold.home[part] != fold.main_key:
             continue
         found = marginals.trajectory(fold, *part)
-        poses, covariances = found.poses, found.covariances
-        robot, incarnation = whole_of(part)
-        own = submaps[robot, incarnation][first_of(part) :]
-        ends = [s.stamp_ns for s in own][: len(poses)]
+        stream = whole_of(part)
+        own = submaps[stream][first_of(part) :]
         message = translate.trajectory_message(
-            ends[-1], robot, incarnation, digest, ends, poses, covariances
-        )
-        with_start = msgspec.structs.replace(
-            message,
+            stream,
+            digest,
+            [each.stamp_ns for each in own[: len(found.poses)]],
+            found.poses,
+            found.covariances,
             start=from_floats(found.start),
             start_covariance=from_floats(found.start_covariance),
             crosses=from_floats(found.crosses),
         )
-        paths.append(Outgoing(ch.TRAJECTORY, robot, with_start))
+        paths.append(Outgoing(ch.TRAJECTORY, part[0], message))
     return paths
 
 

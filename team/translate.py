@@ -1,5 +1,6 @@
 """Convert estimation values to messages and back: the only module that imports both."""
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import msgspec
@@ -416,24 +417,28 @@ def landmark_prior_message(
 
 
 def trajectory_message(
-    stamp_ns: int,
-    robot: str,
-    incarnation: int,
+    stream: Stream,
     digest: bytes,
-    pose_stamps: list[int],
+    pose_stamps: Sequence[int],
     poses: Float[np.ndarray, "K 3"],
     covariances: Float[np.ndarray, "K 3 3"],
+    **start: bytes,
 ) -> m.Trajectory:
-    """Make the message of the smoothed end poses of a robot's submaps."""
+    """Make the message of the smoothed end poses of a robot's submaps.
+
+    start: `start`, `start_covariance` and `crosses` of the message.
+    """
+    robot, incarnation = stream
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return m.Trajectory(
-        stamp_ns=stamp_ns,
+        stamp_ns=pose_stamps[-1],
         robot=robot,
         incarnation=incarnation,
         digest=digest,
         stamps=from_stamps(pose_stamps),
         poses=from_floats(poses),
         covariances=from_floats(symmetric),
+        **start,
     )
 
 

@@ -146,7 +146,7 @@ def test_a_trajectory_comes_back_with_its_stamps():
     poses = np.arange(6.0).reshape(2, 3)
     covariances = np.stack([np.eye(3), 2.0 * np.eye(3)])
     message = over_the_wire(
-        translate.trajectory_message(20, "r1", 1, bytes(8), [10, 20], poses, covariances)
+        translate.trajectory_message(("r1", 1), bytes(8), [10, 20], poses, covariances)
     )
     stamps_ns, found = translate.trajectory_of(message)
     assert stamps_ns.tolist() == [10, 20]

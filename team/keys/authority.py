@@ -38,7 +38,6 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 class Made:
     """Nodes with new, unchanged and revoked certificates."""
 
-    roster: Roster
     made: tuple[str, ...]
     unchanged: tuple[str, ...]
     revoked: tuple[str, ...]
@@ -89,7 +88,7 @@ def make_keys(
     _write(folder / ROSTER, roster_bytes(roster))
     new = (*missing, *renewed)
     unchanged = tuple(sorted(node for node in generations if node not in new))
-    return Made(roster, tuple(sorted(new)), unchanged, tuple(sorted(gone)), ends)
+    return Made(tuple(sorted(new)), unchanged, tuple(sorted(gone)), ends)
 
 
 _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]

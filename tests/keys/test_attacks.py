@@ -166,7 +166,7 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
 
         def ends(bus: ZenohBus, *channels: ch.Channel) -> list[Sample]:
             end = EndQuery(bus, "robot/r1", channels or (ch.FINAL_MAP,))
-            end._began -= 3600.0
+            end._before_s = 3600.0
             return end.find_missed()
 
         operator.publish(order)

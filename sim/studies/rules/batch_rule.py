@@ -135,7 +135,7 @@ class BatchCentre(MeasurementCentre):
                 poses = np.array([each.mean for each in moved])
                 covariances = np.array([each.covariance for each in moved])
             message = translate.trajectory_message(
-                stamps[-1], robot, incarnation, self.set_digest, stamps, poses[1:], covariances[1:]
+                (robot, incarnation), self.set_digest, stamps, poses[1:], covariances[1:]
             )
             outgoing.append(Outgoing(ch.TRAJECTORY, robot, message))
         return outgoing

@@ -304,8 +304,10 @@ class RoundsCentre(ComparisonCentre):
 
     def _is_complete(self, number: int) -> bool:
         maps = self._rounds.get(number, {})
+        # A robot, even a lost one, may still send its map until it is done or given up.
         return bool(maps) and all(
-            r in maps or not self.attendance.takes_part(r) for r in self.robots
+            name in maps or robot.done is not None or robot.given_up
+            for name, robot in self.attendance.robots.items()
         )
 
     def _final(self, now_ns: int) -> m.FusedMap:
