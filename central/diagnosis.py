@@ -230,18 +230,19 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
     places = dict(zip(named, points, strict=True))
     for robot, chain in sorted({**own, **withdrawn}.items()):
-        gains: list[float] = []
+        gains: list[tuple[float, Contribution]] = []
         wrong = 0
         sole = {id_ for id_ in seen_by.get(robot, ()) if observers[id_] == 1}
         for each in chain:
             gain = _gain_of_reflection(places, each, sole)
             if gain is not None:
-                gains.append(gain)
+                gains.append((gain, each))
                 wrong += not gain > 0.0
             if len(chain) - wrong < MIRRORED * len(chain):  # whatever the others' gains are
                 break
         if len(gains) >= LEAST_MIRRORED and len(gains) - wrong >= MIRRORED * len(gains):
-            evidence = math.fsum(gains) / len(gains)
+            chi2 = (gain / _variance_of(places, each, sole) for gain, each in gains)
+            evidence = math.fsum(chi2) / len(gains)
             yield m.Diagnosis(
                 cause="mirrored",
                 robot=robot,
@@ -255,12 +256,12 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
 def _gain_of_reflection(
     places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
 ) -> float | None:
-    """χ² of a submap's landmarks by the best rotation less that by the best reflection.
+    """Squared distance [m²] of a submap's landmarks from the map's by the best rotation, less that
+    by the best reflection.
 
     places: landmarks x + iy [m] by id. sole: those that the robot alone observes.
     """
-    ids = submap.local.ids.tolist()
-    own = [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
+    ids, own = submap.local.ids.tolist(), _shared(places, submap, sole)
     if len(own) < LEAST_SHARED:
         return None
     z = _centred([places[ids[k]] for k in own])
@@ -269,8 +270,21 @@ def _gain_of_reflection(
         sum(a * b for a, b in zip(z, each, strict=True)) for each in ([b.conjugate() for b in w], w)
     )
     gain = core.hypot(reflected.real, reflected.imag) - core.hypot(rotated.real, rotated.imag)
-    variance = median(submap.factor.landmarks[own][:, [0, 2]].ravel().tolist())
-    return float(2.0 * gain) / variance
+    return float(2.0 * gain)
+
+
+def _shared(
+    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
+) -> list[int]:
+    ids = submap.local.ids.tolist()
+    return [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
+
+
+def _variance_of(
+    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
+) -> float:
+    own = _shared(places, submap, sole)
+    return float(median(submap.factor.landmarks[own][:, [0, 2]].ravel().tolist()))
 
 
 def _centred(points: Sequence[complex]) -> list[complex]:

@@ -300,9 +300,10 @@ def gets_landmarks_alone(
     """Whether a stream outside the team's map, neither withdrawn nor cut, gets a running map's
     landmarks.
     """
-    is_out = fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream)
+    if fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream):
+        return False
     named_ones = sum(id_ < UNNAMED for id_ in shown)
-    return named_ones >= NEEDED and not is_out and fold.latest_part(stream) == stream
+    return named_ones >= NEEDED and fold.latest_part(stream) == stream
 
 
 def _landmarks_alone(fold: Fold, shown: Sequence[int]) -> LandmarkGaussian:

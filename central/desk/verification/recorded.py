@@ -117,12 +117,10 @@ class Recorded:
 
     def take(self, sample: Sample) -> None:
         """Index one sample; a viewer's samples are ignored."""
-        if _is_a_view(sample.key):
-            return
         try:
             channel, _, message = opened(sample)
         except WireError:
-            self.unsound += 1
+            self.unsound += ch.VIEW.owner(sample.key) is None
             return
         if m.is_measurement(message):  # most messages are measurements
             self.measurements[message.robot, message.incarnation].put(message)
@@ -242,11 +240,6 @@ def index_log(log: Log) -> Recorded:
             raise chunk
         found.take_all(chunk)
     return found
-
-
-@lru_cache(maxsize=4096)
-def _is_a_view(key: str) -> bool:
-    return ch.VIEW.owner(key) is not None
 
 
 @lru_cache(maxsize=4096)

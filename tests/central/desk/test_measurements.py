@@ -84,3 +84,10 @@ def test_unsound_odometry_is_counted_and_another_robots_is_not_taken():
     assert found.unsound == 2
     assert [*found.measurements] == [("r1", 0)]
     assert np.array_equal([*found.measurements["r1", 0]], [1])
+
+
+def test_samples_of_a_view_are_ignored_and_those_of_no_channel_are_unsound():
+    found = Recorded()
+    found.take_all([Sample(key, b"x", 0, 0, 0) for key in ("view/errors", "nothing/r1/at_all")])
+    assert found.unsound == 1
+    assert not found.outputs
