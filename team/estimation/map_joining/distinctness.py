@@ -95,7 +95,7 @@ def find_lost_streams(island: Island) -> dict[Stream, float]:
     return {stream: sigma for stream, sigma in worst.items() if sigma > limit}
 
 
-LEAST_TIED = 3
+LEAST_TIED = 2
 """Least number of landmarks on either side of a place that odometry alone ties."""
 
 
