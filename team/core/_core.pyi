@@ -331,12 +331,6 @@ class SubmapFactor:
 
 LARGEST_RATIO: float
 
-def linearise_sighting(observer: NDArray[numpy.float64], teammate: NDArray[numpy.float64], measurement: NDArray[numpy.float64], point: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Compute the residual of an inter-robot measurement (range, bearing) of a teammate's point, and its Jacobian
-    over both poses.
-    """
-
 class Quadratic:
     """
     Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,
@@ -463,11 +457,6 @@ class Estimate:
     @property
     def cost(self) -> float:
         """The minimised cost, at these robust scales."""
-
-    def cost_of(self, other: Estimate) -> float:
-        """
-        Evaluate Σ w χ² of another state with the weights and noise of this one, which a step lowers.
-        """
 
     @property
     def normal_equations(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
@@ -638,7 +627,9 @@ class ChainSolution:
         """The map without covariance; 0 is the prior."""
 
 class Calibration:
-    """What corrects a raw measurement of range and bearing, or refuses it."""
+    """
+    Correction of a raw measurement of range and bearing, and the limits beyond which it is refused.
+    """
 
     def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
         """
@@ -723,12 +714,6 @@ class MotionModel:
         the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.
         """
 
-    def forward_column(self, duration_s: float, forward: float, yaw_rate: float) -> NDArray[numpy.float64]:
-        """
-        Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)
-        times the measured one; zero where |forward| lies in `calibrated_speed`.
-        """
-
 def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], then: NDArray[numpy.float64], added: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
     Compose two motions: mean o then, with Ad C Ad' + added, Ad = Ad(then^-1), to first order in the noise.
@@ -737,11 +722,6 @@ def compose_motions(mean: NDArray[numpy.float64], covariance: NDArray[numpy.floa
 def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64], mount: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
     Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
-    """
-
-def shift_after(shift: NDArray[numpy.float64], motion: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.
     """
 
 class Odometry:
@@ -759,14 +739,14 @@ class Odometry:
 
     def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
         """
-        Go on by a part of an interval whose speeds were measured.
+        Integrate a part of an interval whose speeds were measured.
 
         added: variances per second, in addition to the noise.
         """
 
     def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
         """
-        Go on by a part of an interval whose motion was measured, as `MotionModel.part`.
+        Integrate a part of an interval whose motion was measured, as `MotionModel.part`.
         """
 
     def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
@@ -779,11 +759,11 @@ class Odometry:
 
     def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
-        Return the motion since the last scan without identities or keyframe; this is such a scan.
+        Return the motion since the last scan without identities or keyframe, and begin anew here.
         """
 
     def mark_scan(self) -> None:
-        """A scan of a keyframe of several scans is here."""
+        """Mark a scan here, of a keyframe of several scans."""
 
     def end_scans(self) -> NDArray[numpy.float64]:
         """
@@ -795,11 +775,11 @@ class Odometry:
 
     def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
         """
-        This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.
+        Begin the motion since the last pose node here; return the motions since the marked sightings, and forget these.
         """
 
     def mark_sighting(self) -> None:
-        """An inter-robot measurement that waits for the next pose node is here."""
+        """Mark an inter-robot measurement here, for the next pose node."""
 
     def forget_sightings(self) -> None:
         """Forget the marked sightings."""
@@ -936,14 +916,6 @@ class Cholesky:
         Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.
         """
 
-def minimum_degree(sizes: NDArray[numpy.int64], column_start: NDArray[numpy.int64], rows: NDArray[numpy.int64]) -> tuple[NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64], NDArray[numpy.int64]]:
-    """
-    Find the elimination order of a pattern's variables by minimum degree, in postorder.
-
-    Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row
-    of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].
-    """
-
 class Random:
     """
     Random numbers with defined bits: Philox 4x64-10 (Salmon et al. 2011), a function of its key and
@@ -1011,17 +983,8 @@ def normalised_square(error: NDArray[numpy.float64], S: NDArray[numpy.float64]) 
     Compute e' inv(S) e by the Cholesky factor of S; NaN where a pivot is not above rounding.
     """
 
-def semidefinite_factor(covariance: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute lower L with L L' = covariance, of any rank; NaN where the matrix is indefinite.
-    """
-
 class Step:
     """Statistics of one keyframe."""
-
-    @property
-    def effective(self) -> float:
-        """Number of effective particles, 1/sum(w^2)."""
 
     @property
     def log_evidence(self) -> float:
@@ -1180,10 +1143,6 @@ class Window:
     def keyframes(self) -> int:
         """Number of keyframes."""
 
-    @property
-    def effective(self) -> float:
-        """Number of effective particles after the last keyframe."""
-
 class OpenWindow:
     """
     A window while it is open: its particles behind a gate against outliers, and their random numbers.
@@ -1199,8 +1158,8 @@ class OpenWindow:
         Take a keyframe with those of its measurements that agree with others of the window so far.
 
         node_ns: the team time, where the keyframe is a pose node. Other arguments are as of `Window.advance`.
-        Returns False, and leaves the particles as they are, where a measurement that was accepted before does not
-        agree any more: they are to begin anew with the accepted measurements of all keyframes. Raises MotionError.
+        Returns False, and leaves the particles as they are, if a measurement that was accepted before no longer
+        agrees: restart with `begin` and the accepted measurements of all keyframes. Raises MotionError.
         """
 
     def take(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], node_ns: int | None = None) -> None:
@@ -1223,7 +1182,7 @@ class OpenWindow:
 
     def begin(self, particles: int) -> None:
         """
-        Begin anew with so many particles and the first random number; the gate stays.
+        Restart with so many particles and the first random number; the gate stays.
         """
 
     @property

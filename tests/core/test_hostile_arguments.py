@@ -140,7 +140,7 @@ EXAMPLES = {
     # sparse
     "sizes": lambda: np.array([3, 2]),
     "column_start": lambda: np.array([0, 2, 3]),
-    **dict.fromkeys(("Pattern.rows", "minimum_degree.rows"), lambda: np.array([0, 1, 1])),
+    "Pattern.rows": lambda: np.array([0, 1, 1]),
     "values": lambda: np.concatenate([np.eye(3).ravel(), np.zeros(6), np.eye(2).ravel()]),
     **dict.fromkeys(("Pattern.block.row", "Pattern.block.column"), lambda: 1),
     **dict.fromkeys(("Pattern.quadratic.x", "right"), lambda: np.ones(5)),
@@ -177,11 +177,7 @@ EXAMPLES = {
     "Window.sensitivity.mean": MEAN.copy,
     # odometry
     **dict.fromkeys(("duration_s", "interval_s", "yaw_rate"), lambda: 0.1),
-    **{
-        f"{each}.forward": lambda: 1.0
-        for each in ("MotionModel.increment", "MotionModel.forward_column")
-    },
-    "Odometry.drive.forward": lambda: 1.0,
+    **{f"{each}.forward": lambda: 1.0 for each in ("MotionModel.increment", "Odometry.drive")},
     **dict.fromkeys(("forward", "turn", "final_turn", "lateral"), lambda: (0.01, 0.1, 0.1)),
     **dict.fromkeys(("forward_scale", "yaw_scale", "yaw_rate_limit", "slow_scale"), lambda: 1.0),
     **dict.fromkeys(("turn_drag", "veer", "slow_below"), lambda: 0.0),
@@ -197,7 +193,6 @@ EXAMPLES = {
     **dict.fromkeys(("range_scale", "half_field"), lambda: 1.0),
     "lens": lambda: (0.1, 0.0, 0.0),
     "Calibration.ranges": lambda: (0.1, 10.0),
-    "other": lambda: made("Estimate"),
 }
 
 

@@ -1,6 +1,6 @@
 // Checks of the arrays in messages, given as their bytes: little-endian float64 or uint32.
 //
-// What is refused raises ValueError("reason: detail"). Symmetry and rank of a covariance are judged in
+// A refused array raises ValueError("reason: detail"). Symmetry and rank of a covariance are judged in
 // units of its standard deviations, so that units and scale do not matter.
 #include <algorithm>
 #include <bit>

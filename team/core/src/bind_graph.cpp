@@ -147,16 +147,6 @@ void bind_graph(nb::module_& m) {
                    "Each landmark's own covariance (xx, xy, yy).");
   m.attr("LARGEST_RATIO") = graph::LARGEST_RATIO;
 
-  m.def("linearise_sighting",
-        [](const Triple& observer, const Triple& teammate, const se2::Point<double>& measurement, const se2::Point<double>& point) {
-          const graph::Sighting sighting{0, 0, {measurement.x, measurement.y}, {}, {point.x, point.y}};
-          const auto at = sighting.linear(observer.data(), teammate.data());
-          return std::tuple(std::vector{at.residual[0], at.residual[1]}, Matrix(dense::Const{at.jacobian[0], 2, 6, 6}));
-        },
-        "observer"_a, "teammate"_a, "measurement"_a, "point"_a,
-        "Compute the residual of an inter-robot measurement (range, bearing) of a teammate's point, and its Jacobian\n"
-        "over both poses.");
-
   nb::class_<Quadratic>(m, "Quadratic",
                         "Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,\n"
                         "over some nodes of a graph, ascending, none of them fixed.")
@@ -290,12 +280,6 @@ void bind_graph(nb::module_& m) {
       .def_prop_ro("prior_chi2", &Estimate::prior_chi2, "χ² of each prior.")
       .def_prop_ro("prior_weights", &Estimate::prior_weights, "Robust weight of each prior: below 1 only for a robot's own bias.")
       .def_prop_ro("cost", &Estimate::cost, "The minimised cost, at these robust scales.")
-      .def("cost_of",
-           [](const Estimate& self, const Estimate& other) {
-             check(&self.graph() == &other.graph(), "both states must be of one graph");
-             return self.cost_of(other);
-           },
-           "other"_a, "Evaluate Σ w χ² of another state with the weights and noise of this one, which a step lowers.")
       .def_prop_ro("normal_equations", &Estimate::normal_equations,
                    "A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.")
       .def_prop_ro("gradient", [](const Estimate& self) { return self.normal_equations().second; },
@@ -315,7 +299,7 @@ void bind_graph(nb::module_& m) {
       .def("take_step",
            [](const Estimate& self, double damping, int halvings, double most_damping) {
              check(damping >= 0.0, "the damping must not be negative");
-             graph::Step step = self.take_step(damping, halvings, most_damping);
+             gauss_newton::Step step = self.take_step(damping, halvings, most_damping);
              std::optional<graph::Numbers> state;
              if (!step.state.empty()) state = std::move(step.state);
              return std::tuple(std::move(state), step.damping, step.change);

@@ -27,7 +27,7 @@ MadeTable made_claims(std::span<const models::Claim> claims, std::size_t n) {
 }
 
 void bind_calibration(nb::module_& m) {
-  nb::class_<Calibration>(m, "Calibration", "What corrects a raw measurement of range and bearing, or refuses it.")
+  nb::class_<Calibration>(m, "Calibration", "Correction of a raw measurement of range and bearing, and the limits beyond which it is refused.")
       .def(
           "__init__",
           [](Calibration* self, double range_offset, double range_scale, double bearing_offset,

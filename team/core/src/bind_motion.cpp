@@ -60,16 +60,7 @@ void bind_model(nb::module_& m) {
           "twist"_a, "covariance"_a.none(), "duration_s"_a, "share"_a, "rest"_a,
           "Compute a share of a measured motion Exp(twist) at constant twist, followed by the share `rest`.\n\n"
           "covariance: the source's own of the whole interval, in the tangent space of its end; without it the noise is\n"
-          "the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.")
-      .def(
-          "forward_column",
-          [](const Model& self, double duration_s, double forward, double yaw_rate) {
-            const auto [ahead, left] = motion::forward_column(self, duration_s, forward, yaw_rate);
-            return se2::Motion{ahead, left, 0.0};
-          },
-          "duration_s"_a, "forward"_a, "yaw_rate"_a,
-          "Compute d/db at 0 of an interval's motion, in the tangent space of its end, if the true path length is (1 + b)\n"
-          "times the measured one; zero where |forward| lies in `calibrated_speed`.");
+          "the model's. A share f of it is f Ad C Ad', with Ad of the motion that follows, so that parts compose to C.");
 }
 
 }  // namespace
@@ -89,8 +80,6 @@ void bind_motion(nb::module_& m) {
         return made_increment(motion::of_sensor({mean, covariance}, mount));
       },
       "mean"_a, "covariance"_a, "mount"_a, "Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).");
-  m.def("shift_after", motion::shift_after, "shift"_a, "motion"_a,
-        "Compute a shift of an earlier motion, seen at the end of a further motion: Ad(motion^-1) shift.");
 
   nb::class_<Odometry>(m, "Odometry",
                        "Odometry integrated since the places that matter to a window.\n\n"
@@ -106,7 +95,7 @@ void bind_motion(nb::module_& m) {
           "model"_a, "mount"_a.none(), "mount: the sensor's pose on the base; None where it is at the base's origin.")
       .def("drive", nb::overload_cast<double, double, double, const std::optional<Odometry::Unmeasured>&>(&Odometry::drive),
            "duration_s"_a, "forward"_a, "yaw_rate"_a, "added"_a.none(),
-           "Go on by a part of an interval whose speeds were measured.\n\nadded: variances per second, in addition to the noise.")
+           "Integrate a part of an interval whose speeds were measured.\n\nadded: variances per second, in addition to the noise.")
       .def(
           "move",
           [](Odometry& self, const se2::Motion& twist, const std::optional<linalg::Matrix3>& covariance, double interval_s,
@@ -114,7 +103,7 @@ void bind_motion(nb::module_& m) {
             self.drive({twist, interval_s, covariance}, duration_s, share, rest, added);
           },
           "twist"_a, "covariance"_a.none(), "interval_s"_a, "duration_s"_a, "share"_a, "rest"_a, "added"_a.none(),
-          "Go on by a part of an interval whose motion was measured, as `MotionModel.part`.")
+          "Integrate a part of an interval whose motion was measured, as `MotionModel.part`.")
       .def(
           "end_keyframe",
           [](Odometry& self) {
@@ -127,8 +116,8 @@ void bind_motion(nb::module_& m) {
           "Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the\n"
           "motion since the last scan without identities, if there was one.")
       .def("pass_unnamed_scan", [](Odometry& self) { return made_increment(self.pass_unnamed_scan()); },
-           "Return the motion since the last scan without identities or keyframe; this is such a scan.")
-      .def("mark_scan", &Odometry::mark_scan, "A scan of a keyframe of several scans is here.")
+           "Return the motion since the last scan without identities or keyframe, and begin anew here.")
+      .def("mark_scan", &Odometry::mark_scan, "Mark a scan here, of a keyframe of several scans.")
       .def(
           "end_scans",
           [](Odometry& self) {
@@ -149,8 +138,8 @@ void bind_motion(nb::module_& m) {
             for (const motion::Increment& each : self.reach_node()) since.push_back(made_increment(each));
             return since;
           },
-          "This is a pose node: returns the motions since the marked sightings, in their order, and forgets these.")
-      .def("mark_sighting", &Odometry::mark_sighting, "An inter-robot measurement that waits for the next pose node is here.")
+          "Begin the motion since the last pose node here; return the motions since the marked sightings, and forget these.")
+      .def("mark_sighting", &Odometry::mark_sighting, "Mark an inter-robot measurement here, for the next pose node.")
       .def("forget_sightings", &Odometry::forget_sightings, "Forget the marked sightings.");
 }
 

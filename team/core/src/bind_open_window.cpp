@@ -33,8 +33,8 @@ void bind_open_window(nb::module_& m) {
            "bearings"_a, "own"_a, "node_ns"_a = nb::none(),
            "Take a keyframe with those of its measurements that agree with others of the window so far.\n\n"
            "node_ns: the team time, where the keyframe is a pose node. Other arguments are as of `Window.advance`.\n"
-           "Returns False, and leaves the particles as they are, where a measurement that was accepted before does not\n"
-           "agree any more: they are to begin anew with the accepted measurements of all keyframes. Raises MotionError.")
+           "Returns False, and leaves the particles as they are, if a measurement that was accepted before no longer\n"
+           "agrees: restart with `begin` and the accepted measurements of all keyframes. Raises MotionError.")
       .def("take", &take_keyframe<&OpenWindow::take>, "motion"_a, "covariance"_a, "shift"_a, "ids"_a.noconvert(), "ranges"_a,
            "bearings"_a, "own"_a, "node_ns"_a = nb::none(), "Take a keyframe past the gate; arguments as of `admit`. Raises MotionError.")
       .def(
@@ -52,7 +52,7 @@ void bind_open_window(nb::module_& m) {
             check(particles > 0 && particles <= MOST_PARTICLES, "particles must be in 1 ... 10,000,000");
             self.begin(particles);
           },
-          "particles"_a, "Begin anew with so many particles and the first random number; the gate stays.")
+          "particles"_a, "Restart with so many particles and the first random number; the gate stays.")
       .def_prop_ro("window", &OpenWindow::window, nb::rv_policy::reference_internal, "The particles.")
       .def_prop_ro("random", &OpenWindow::random, nb::rv_policy::reference_internal, "The random numbers.")
       .def_prop_ro("rejected", &OpenWindow::rejected, "Number of measurements that are not accepted.")

@@ -108,17 +108,6 @@ void bind_sparse(nb::module_& m) {
            "Compute A⁻¹ between some unknowns, (k, k): their joint covariance, exactly symmetric.")
       .def("selected_inverse", &Cholesky::selected_inverse,
            "Compute the entries of A⁻¹ on the pattern of A, in the layout of A's numbers, by Takahashi's recursion.");
-
-  m.def("minimum_degree",
-        [](const IndexVector& sizes, const IndexVector& column_start, const IndexVector& rows) {
-          const Pattern checked(sizes, column_start, rows);
-          sparse::Elimination e = sparse::minimum_degree(checked.sizes(), checked.column_start(), checked.rows());
-          return std::tuple(std::move(e.order), std::move(e.parent), std::move(e.start), std::move(e.structure));
-        },
-        "sizes"_a, "column_start"_a, "rows"_a,
-        "Find the elimination order of a pattern's variables by minimum degree, in postorder.\n\n"
-        "Returns (order, parent, start, structure), by step of elimination: the variable; the step of the first row\n"
-        "of its column, −1 at a root; its column's rows are structure[start[k] : start[k + 1]].");
 }
 
 }  // namespace teamslam::binding

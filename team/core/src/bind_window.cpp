@@ -218,13 +218,6 @@ void bind_particles(nb::module_& m) {
         return linalg::normalised_square({error.data(), error.size()}, {S.data(), S.size()});
       },
       "error"_a, "S"_a, "Compute e' inv(S) e by the Cholesky factor of S; NaN where a pivot is not above rounding.");
-  m.def(
-      "semidefinite_factor",
-      [](const Matrix3& covariance) {
-        const linalg::Lower3 L = linalg::semidefinite_factor(std::span<const double, 9>(covariance.data(), 9));
-        return made<double, nb::ndim<2>>({L.l00, 0.0, 0.0, L.l10, L.l11, 0.0, L.l20, L.l21, L.l22}, {3, 3});
-      },
-      "covariance"_a, "Compute lower L with L L' = covariance, of any rank; NaN where the matrix is indefinite.");
 }
 
 }  // namespace
@@ -232,7 +225,6 @@ void bind_particles(nb::module_& m) {
 void bind_window(nb::module_& m) {
   bind_particles(m);
   nb::class_<window::Step>(m, "Step", "Statistics of one keyframe.")
-      .def_ro("effective", &window::Step::effective, "Number of effective particles, 1/sum(w^2).")
       .def_ro("log_evidence", &window::Step::log_evidence, "log p(z | earlier z) by the particles.")
       .def_ro("squared", &window::Step::squared,
               "NIS of the measurements that were predicted; NaN where a pivot of S is not above rounding.")
@@ -438,8 +430,7 @@ void bind_window(nb::module_& m) {
           "innovated", [](const Window& self) { return std::tuple(self.innovated().squared, self.innovated().dof); },
           "Sum of the innovations of all keyframes: NIS, and its degrees of freedom.")
       .def_prop_ro("landmarks", [](const Window& self) { return self.particles().landmarks(); }, "Number of landmarks.")
-      .def_prop_ro("keyframes", &Window::keyframes, "Number of keyframes.")
-      .def_prop_ro("effective", &Window::effective, "Number of effective particles after the last keyframe.");
+      .def_prop_ro("keyframes", &Window::keyframes, "Number of keyframes.");
 }
 
 }  // namespace teamslam::binding

@@ -1,4 +1,4 @@
-// What the bindings share: arrays from Python, checked once, and arrays to Python.
+// Shared by all bindings: arrays from Python, checked once, and arrays to Python.
 //
 // nanobind checks type, dimensions and layout; it converts numbers, and copies where only the layout
 // differs, but never converts ids and indices, which would wrap. The functions here check lengths and

@@ -1,4 +1,4 @@
-// What corrects a raw measurement of range and bearing, or refuses it.
+// Correction of a raw measurement of range and bearing, and the limits beyond which it is refused.
 #pragma once
 
 #include <array>

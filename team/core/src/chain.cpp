@@ -12,28 +12,13 @@ namespace {
 using dense::Matrix;
 using Numbers = std::vector<double>;
 
-constexpr double SHARES[] = {1.0, 0.5, 0.25, 0.125, 0.0625};  // of an undamped step, tried before damping
+constexpr int HALVINGS = 4;  // of an undamped step, tried before damping
 constexpr double MOST_DAMPING = 1e8;
-
-// The largest size of a number; NaN where there is one.
-double largest(const Numbers& x) {
-  double most = 0.0;
-  for (const double each : x) {
-    if (std::isnan(each)) return each;
-    most = pack::max(most, pack::abs(each));
-  }
-  return most;
-}
 
 }  // namespace
 
 // The unknowns: the origin (which stays zero), the end pose of each map, the landmarks by ascending id.
 struct Chain::Problem {
-  // damping: for the next step. change: the largest of the full step; NaN where an unknown is undetermined.
-  struct Step {
-    double damping, change;
-  };
-
   const std::vector<Link>& links;
   std::vector<std::uint32_t> ids;
   std::vector<std::vector<graph::Index>> at;       // of each map's members
@@ -122,37 +107,26 @@ struct Chain::Problem {
     return after;
   }
 
-  // Takes one step.
-  Step take(double damping) {
+  gauss_newton::Step take_step(double damping) const {
     Numbers gradient;
     Matrix H = normal_equations(gradient);
     Numbers diagonal(H.rows());
     for (std::size_t i = 0; i < H.rows(); i++) diagonal[i] = H[i][i];
-    double refused = elementary::INF;
-    while (damping < MOST_DAMPING) {
+    const auto step_at = [&](double damping) -> std::optional<Numbers> {
       for (std::size_t i = 0; i < H.rows(); i++) H[i][i] = diagonal[i] * (1.0 + damping);
       const gaussian::Factor factor = gaussian::factor_or_fault(H);
-      if (factor.fault != gaussian::Fault::NONE) return {damping, elementary::NOT_A_NUMBER};
+      if (factor.fault != gaussian::Fault::NONE) return std::nullopt;
       Numbers step = gradient;
       for (double& each : step) each = -each;
       const dense::View column = dense::column(std::span<double>(step));
       dense::solve_lower(factor.L, column);
       dense::solve_upper(factor.L, column);
-      const double change = largest(step);
-      for (const double share : SHARES) {
-        if (damping > 0.0 && share < 1.0) break;
-        Numbers after = moved(step, share);
-        const double now = cost(after);
-        if (gauss_newton::is_accepted(now, chi2)) {
-          state = std::move(after);
-          chi2 = now;
-          return {gauss_newton::lower_damping(damping), change};
-        }
-      }
-      if (refused == elementary::INF) refused = change;
-      damping = gauss_newton::raise_damping(damping);
-    }
-    return {elementary::INF, refused};
+      return step;
+    };
+    return gauss_newton::take_step(
+        damping, HALVINGS, MOST_DAMPING, chi2, step_at,
+        [&](const Numbers& step, double share) { return moved(step, share); },
+        [&](const Numbers& after) { return cost(after); });
   }
 };
 
@@ -179,12 +153,14 @@ ChainSolution Chain::solve(int iterations, double tolerance) const {
   Problem problem(links_);
   double damping = 0.0;
   for (int iteration = 0; iteration < iterations && damping != elementary::INF; iteration++) {
-    const Problem::Step step = problem.take(damping);
+    gauss_newton::Step step = problem.take_step(damping);
     damping = step.damping;
     if (std::isnan(step.change)) {
       found.fault = ChainFault::UNDETERMINED;
       return found;
     }
+    if (!step.state.empty()) problem.state = std::move(step.state);
+    problem.chi2 = step.cost;
     if (damping == 0.0 && step.change < tolerance) break;
   }
   Numbers gradient;

@@ -32,9 +32,8 @@ class Chain {
   explicit Chain(const LocalMap& prior) { append(prior); }
   void append(const LocalMap& submap);
 
-  // Minimises over all poses and landmarks, by the steps of `gauss_newton.settled` without robust
-  // losses: undamped steps are shortened to a sixteenth before they are damped. Stops where no number
-  // of an undamped step reaches the tolerance.
+  // Minimises over all poses and landmarks without robust losses, by `gauss_newton::take_step`; stops where
+  // no number of an undamped step reaches the tolerance.
   ChainSolution solve(int iterations, double tolerance) const;
 
  private:

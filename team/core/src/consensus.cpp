@@ -15,7 +15,7 @@ constexpr double EVIDENCE = 4.605170185988092;
 constexpr double JITTER[3] = {1e-6, 1e-6, 1e-8};  // added to each motion's variances [m², m², rad²]
 constexpr std::size_t MOST_COMPARED = 32, MOST_SMOOTHED = 100;
 constexpr double MOST_REJECTED = 0.05;
-constexpr int ROUNDS = 5;                         // of classifying and smoothing; it comes to rest in two or three
+constexpr int ROUNDS = 5;                         // of classifying and smoothing; two or three suffice
 constexpr int LEAST_STEPS = 2, MOST_STEPS = 10;   // of Gauss-Newton in a round
 constexpr double CONVERGED = 0.1;                 // largest last step, in standard deviations
 
@@ -83,7 +83,7 @@ double log_likelihood(const Reading& z, const models::Landmark<double>& at, cons
   return log_density(e0, e1, {S.rr + rr, S.rb + rb, S.bb + bb});
 }
 
-// That a measurement is good if this share of them are outliers.
+// Log odds that a measurement is good, for this share of outliers.
 double log_odds(double share) { return elementary::log((1.0 - share) / share); }
 
 }  // namespace
@@ -94,7 +94,7 @@ Consensus::Consensus(const Noise& sensor, double max_range, double field_of_view
       field_of_view_(field_of_view),
       prior_(log_odds(share)) {}
 
-// Added to log p(z): gives the log odds that the measurement is good.
+// The log odds that a measurement is good, less its log p(z).
 double Consensus::odds() const {
   const double uniform = 1.0 / (std::min(max_range_, farthest_) * field_of_view_);
   return prior_ - elementary::log(uniform);
@@ -185,7 +185,7 @@ struct Consensus::Smoothed {
     return spread_by(J, P);
   }
 
-  // Of each landmark the number of the measurements that are taken.
+  // The number of taken measurements of each landmark.
   std::vector<double> counts(const std::vector<bool>& taken) const {
     std::vector<double> found(landmarks.size());
     for (std::size_t n = 0; n < slots.size(); n++)
@@ -193,7 +193,7 @@ struct Consensus::Smoothed {
     return found;
   }
 
-  // The sum of their values.
+  // The sum of their values, by landmark.
   std::vector<double> sums(std::span<const double> values, const std::vector<bool>& taken) const {
     std::vector<double> found(landmarks.size());
     for (std::size_t n = 0; n < slots.size(); n++)
@@ -327,7 +327,7 @@ bool Consensus::smooth(Smoothed& window, const std::vector<bool>& taken) const {
 //
 // With M = J P Jᵀ a measurement that was not taken has S = R + M; of one that was, D = R − M is the
 // covariance of its residual e, and without it the residual is R D⁻¹ e with S = R D⁻¹ R. It is −∞ where
-// nothing else says where the landmark is.
+// nothing else determines the landmark.
 std::vector<double> Consensus::logs_of_others(const Smoothed& window, const std::vector<bool>& taken) const {
   std::vector<double> logs;
   for (std::size_t n = 0; n < taken.size(); n++) {

@@ -4,8 +4,8 @@
 // brings, or it is an outlier, uniform over the sensor's range and field of view with density u. It is
 // accepted if (1 − ε) p(z | the other accepted ones, odometry) > ε u. A landmark is accepted if its
 // measurements together reach odds of EVIDENCE against being outliers and against being another
-// landmark of the window under a wrong identity. The only measurement of a landmark is accepted: it
-// does not act on the path, and is compared with other windows at the centre. Only measurements of the window itself are used: a gate
+// landmark of the window under a wrong identity. The only measurement of a landmark is accepted: it does
+// not affect the path, and is compared with other windows at the centre. Only measurements of the window itself are used: a gate
 // by a map or an earlier window would keep rejecting correct measurements once that map is wrong, and
 // would use measurements twice. All variances of a measurement are its whole ones, since the persistent
 // part of its error is nearly constant within a window.
@@ -29,16 +29,16 @@ class Consensus {
 
   std::size_t size() const { return measurements_.size(); }
 
-  // Takes what `agreeing` says of the measurements since the last call, or of all where one that was
-  // accepted before does not agree any more; returns whether those accepted before stay so.
+  // Accepts the measurements since the last call that are in `agreeing`. If one that was accepted before no
+  // longer agrees, all are classified anew. Returns whether all that were accepted before still are.
   bool accept();
 
-  // Takes what `confirmed` says of all measurements; returns whether that is another choice.
+  // Accepts the measurements in `confirmed`; returns whether the classification changed.
   bool confirm();
 
   const std::vector<bool>& accepted() const { return accepted_; }
 
-  // Of each measurement whether it agrees with others of its landmark under the odometry alone.
+  // Marks each measurement that agrees with others of its landmark under the odometry alone.
   //
   // The measurement of a landmark that the others support best places it; it is accepted together with
   // those that support it. Measurement j supports i with max(0, log p(j | i, odometry) + odds of j).

@@ -1,7 +1,5 @@
 #include "estimate.hpp"
 
-#include "gauss_newton.hpp"
-
 namespace teamslam::graph {
 
 namespace {
@@ -15,6 +13,11 @@ const T& once(std::optional<T>& kept, F&& make) {
 }
 
 double squared(double x) { return x * x; }
+
+Numbers negated(Numbers x) {
+  for (double& each : x) each = -each;
+  return x;
+}
 
 // Σ value(k) over k < count, of those that are chosen, in the order of NumPy.
 template <class Chosen, class F>
@@ -290,11 +293,7 @@ const std::shared_ptr<const sparse::Cholesky>& Estimate::posterior() const {
 }
 
 const Numbers& Estimate::step() const {
-  return once(step_, [&] {
-    Numbers found = posterior()->solve(normal_equations().second);
-    for (double& x : found) x = -x;
-    return found;
-  });
+  return once(step_, [&] { return negated(posterior()->solve(normal_equations().second)); });
 }
 
 const Numbers& Estimate::selected_covariance() const {
@@ -313,32 +312,17 @@ Numbers Estimate::moved(const Numbers& step, double share) const {
   return moved;
 }
 
-Step Estimate::take_step(double damping, int halvings, double most_damping) const {
-  const double before = cost_of(*this);
-  std::optional<double> refused;
-  while (damping < most_damping) {
-    Numbers step;
-    if (damping != 0.0) {
-      auto [damped, gradient] = normal_equations();
-      for (const Index i : graph_->pattern()->diagonal()) damped[i] *= 1.0 + damping;
-      step = sparse::Cholesky(graph_->pattern(), damped).solve(Values(gradient));
-      for (double& x : step) x = -x;
-    } else {
-      step = this->step();
-    }
-    double largest = 0.0;
-    for (const double x : step)
-      if (largest == largest && !(std::fabs(x) <= largest)) largest = std::fabs(x);  // NaN stays
-    double share = 1.0;
-    for (int k = 0; k <= (damping != 0.0 ? 0 : halvings); k++, share *= 0.5) {
-      const Estimate after(graph_, moved(step, share), scale_, sighting_scale_, loss_);
-      if (gauss_newton::is_accepted(cost_of(after), before))
-        return {after.state_, gauss_newton::lower_damping(damping), largest};
-    }
-    if (!refused) refused = largest;
-    damping = gauss_newton::raise_damping(damping);
-  }
-  return {{}, elementary::INF, refused.value_or(elementary::INF)};
+gauss_newton::Step Estimate::take_step(double damping, int halvings, double most_damping) const {
+  const auto step_at = [&](double damping) -> std::optional<Numbers> {
+    if (damping == 0.0) return step();
+    auto [damped, gradient] = normal_equations();
+    for (const Index i : graph_->pattern()->diagonal()) damped[i] *= 1.0 + damping;
+    return negated(sparse::Cholesky(graph_->pattern(), damped).solve(Values(gradient)));
+  };
+  return gauss_newton::take_step(
+      damping, halvings, most_damping, cost_of(*this), step_at,
+      [&](const Numbers& step, double share) { return moved(step, share); },
+      [&](const Numbers& state) { return cost_of(Estimate(graph_, state, scale_, sighting_scale_, loss_)); });
 }
 
 Numbers Estimate::explained() const {

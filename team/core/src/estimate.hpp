@@ -6,6 +6,7 @@
 // Cauchy's. Each landmark of a submap has a gate and a weight of its own as well.
 #pragma once
 
+#include "gauss_newton.hpp"
 #include "graph.hpp"
 
 namespace teamslam::graph {
@@ -32,17 +33,10 @@ struct Summed {
   double cost;
 };
 
-// Of each landmark of each submap: its point in the frame by the submap's start pose, and its covariance
-// (xx, xy, yy) from that of the start pose and its own.
+// A row for each landmark of each submap: its point in the frame by the submap's start pose, and its
+// covariance (xx, xy, yy) from that of the start pose and its own.
 struct Observations {
   dense::Matrix points, spread;
-};
-
-// state: empty where no step lowers the cost; then the damping is infinite. change: the largest change
-// of a number by the full step.
-struct Step {
-  Numbers state;
-  double damping, change;
 };
 
 class Estimate {
@@ -81,9 +75,8 @@ class Estimate {
   const Numbers& step() const;  // −A⁻¹g
   const Numbers& selected_covariance() const;
 
-  // The step −(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on;
-  // else a more damped one, up to most_damping.
-  Step take_step(double damping, int halvings, double most_damping) const;
+  // `gauss_newton::take_step` by −(A + damping · diag A)⁻¹g.
+  gauss_newton::Step take_step(double damping, int halvings, double most_damping) const;
 
   // tr(JᵀP⁻¹J Σ) of each factor: the part of its numbers that the solution absorbs. For a solution with
   // these weights the sum over all factors is the number of unknowns.

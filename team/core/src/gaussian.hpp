@@ -1,4 +1,4 @@
-// Covariance matrices: which matrix is one, and its factor.
+// Covariance matrices: their faults, and their factors.
 #pragma once
 
 #include "dense.hpp"
@@ -9,7 +9,7 @@ namespace teamslam::gaussian {
 // Why a matrix is no covariance; the index in teamslam.team.estimation.gaussian.FAULTS.
 enum class Fault : int { NONE = 0, NOT_FINITE = 1, NOT_POSITIVE = 2, NOT_SYMMETRIC = 3 };
 
-// What is seen of a matrix without factoring it; sigmas: the roots of its diagonal, where it is positive.
+// The fault of a matrix that shows without a factor; sigmas: the roots of its diagonal, where it is positive.
 Fault fault_of(dense::Const P, std::span<double> sigmas);
 
 struct Factor {

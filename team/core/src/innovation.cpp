@@ -122,7 +122,7 @@ Innovation innovation_of(const Particles& particles, const Motion& motion, const
     S[b * m + r] = sums[k].rb.value();
     S[b * m + b] = sums[k].bb.value();
     error[r] = sums[k].ranges.value();
-    // What was read less what a particle predicts lies near zero, where angles have a mean.
+    // The mean of the innovations is on the circle; they lie near zero, where it is well defined.
     error[b] = is_point ? sums[k].bearings.value() : elementary::atan2(sums[k].sines.value(), sums[k].cosines.value());
     for (std::size_t at = 0; at < stride; at += WIDTH) {
       double *range = rows.row(r, DEVIATION, at), *bearing = rows.row(b, DEVIATION, at);

@@ -98,11 +98,11 @@ struct Innovation {
   T of_range, of_bearing, rr, rb, bb;
 };
 
-// Of a point, whose bearing's innovation δ is given by its sine and cosine.
+// The innovation of a point, with that of its bearing, δ, given by sine and cosine.
 //
 // Both innovations are the point's: with its error (r cos δ − d, r sin δ) along and across the
 // predicted direction and S its covariance turned there, (e₀, e₁/d) and diag(1, 1/d) S diag(1, 1/d).
-// That is a linear map of both, so whatever follows is what it were for the point itself.
+// A linear map of both leaves all that follows as it is for the point itself.
 template <class T>
 inline Innovation<T> innovation_of_point(const Reading& z, const T& distance, const T& sine_off, const T& cosine_off) {
   const double reach = max(z.range, NEAREST_M);

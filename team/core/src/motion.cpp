@@ -144,7 +144,7 @@ Increment increment_of(const Model& model, double duration_s, double forward, do
 }
 
 Point<double> forward_column(const Model& model, double duration_s, double forward, double yaw_rate) {
-  if (model.knows_scale(pack::abs(forward))) return {0.0, 0.0};
+  if (model.has_known_scale(pack::abs(forward))) return {0.0, 0.0};
   const double way = model.forward_scale * forward * duration_s;
   if (model.turns_first) return {way, 0.0};
   const auto [s, c] = elementary::sin_cos(0.5 * (model.clipped(model.yaw_scale * yaw_rate) * duration_s));
@@ -165,7 +165,7 @@ Increment part_of(const Model& model, const Moved& moved, double share, double r
 
 Point<double> forward_column(const Model& model, const Moved& moved, double share) {
   const double speed = elementary::hypot(moved.twist.forward, moved.twist.left) / moved.duration_s;
-  if (model.knows_scale(speed)) return {0.0, 0.0};
+  if (model.has_known_scale(speed)) return {0.0, 0.0};
   const auto [x, y, turn] = times(share, calibrated(model, moved));
   const auto [s, c] = elementary::sin_cos(0.5 * turn);
   return {c * x + s * y, c * y - s * x};

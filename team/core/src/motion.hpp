@@ -39,7 +39,7 @@ struct Model {
 
   double clipped(double rate) const { return rate < -yaw_rate_limit ? -yaw_rate_limit : rate > yaw_rate_limit ? yaw_rate_limit : rate; }
   // Whether the scale of this speed is known, so that it has no error of its own.
-  bool knows_scale(double speed) const {
+  bool has_known_scale(double speed) const {
     return calibrated_speed && (*calibrated_speed)[0] <= speed && speed <= (*calibrated_speed)[1];
   }
 };

@@ -5,15 +5,15 @@
 namespace teamslam::motion {
 
 void Odometry::drive(double duration_s, double forward, double yaw_rate, const std::optional<Unmeasured>& added) {
-  go_on(increment_of(model_, duration_s, forward, yaw_rate), forward_column(model_, duration_s, forward, yaw_rate), duration_s,
+  integrate(increment_of(model_, duration_s, forward, yaw_rate), forward_column(model_, duration_s, forward, yaw_rate), duration_s,
         added);
 }
 
 void Odometry::drive(const Moved& moved, double duration_s, double share, double rest, const std::optional<Unmeasured>& added) {
-  go_on(part_of(model_, moved, share, rest), forward_column(model_, moved, share), duration_s, added);
+  integrate(part_of(model_, moved, share, rest), forward_column(model_, moved, share), duration_s, added);
 }
 
-void Odometry::go_on(Increment step, Point<double> column, double duration_s, const std::optional<Unmeasured>& added) {
+void Odometry::integrate(Increment step, Point<double> column, double duration_s, const std::optional<Unmeasured>& added) {
   if (added)
     for (int i = 0; i < 3; i++) step.covariance[i][i] += duration_s * (*added)[i];
   Motion shift{column.x, column.y, 0.0};

@@ -17,7 +17,7 @@ class Odometry {
   // keyframe and a scan are the sensor's, those since a pose node the base's.
   Odometry(const Model& model, const std::optional<Pose<double>>& mount) : model_(model), mount_(mount) {}
 
-  // Goes on by a part of an interval whose speeds were measured, or its motion, as in `part_of`.
+  // Integrates a part of an interval whose speeds were measured, or whose motion was, as in `part_of`.
   void drive(double duration_s, double forward, double yaw_rate, const std::optional<Unmeasured>& added);
   void drive(const Moved& moved, double duration_s, double share, double rest, const std::optional<Unmeasured>& added);
 
@@ -30,24 +30,25 @@ class Odometry {
   // Ends the motion since the last keyframe here.
   Keyframe end_keyframe();
 
-  // The motion since the last scan without identities or the last keyframe; this is such a scan.
+  // Returns the motion since the last scan without identities or the last keyframe, and begins anew here.
   Increment pass_unnamed_scan();
 
-  // A scan of a keyframe of several is here.
+  // Marks a scan here, of a keyframe of several scans.
   void mark_scan() { scans_.push_back(in_keyframe_); }
   // The poses at these scans, seen from here; further scans are those of the next keyframe.
   std::vector<Pose<double>> end_scans();
 
   // The motion since the last pose node.
   const Increment& since_node() const { return since_node_; }
-  // This is a pose node; returns the motions since the sightings that wait for one.
+  // Begins the motion since the last pose node here; returns the motions since the marked sightings, and
+  // forgets these.
   std::vector<Increment> reach_node();
-  // An inter-robot measurement that waits for the next pose node is here.
+  // Marks an inter-robot measurement here, for the next pose node.
   void mark_sighting() { since_sightings_.emplace_back(); }
   void forget_sightings() { since_sightings_.clear(); }
 
  private:
-  void go_on(Increment step, Point<double> column, double duration_s, const std::optional<Unmeasured>& added);
+  void integrate(Increment step, Point<double> column, double duration_s, const std::optional<Unmeasured>& added);
 
   Model model_;
   std::optional<Pose<double>> mount_;

@@ -15,19 +15,19 @@ class OpenWindow {
 
   // Takes a keyframe with those of its measurements that agree with others of the window so far.
   //
-  // False where one that was accepted before does not agree any more: the particles are left as they
-  // were, and are to begin anew with the accepted measurements of all keyframes. node_ns: the team time,
+  // False if one that was accepted before no longer agrees: the particles are then unchanged, and must be
+  // restarted (`begin`) with the accepted measurements of all keyframes. node_ns: the team time,
   // where the keyframe is a pose node. Throws MotionError.
   bool admit(const Increment& increment, const Scan& scan, std::optional<std::int64_t> node_ns);
 
   // Compares all measurements of the window; returns whether other ones are accepted now.
   bool confirm() { return gate_.confirm(); }
 
-  // Of each measurement of a keyframe whether it is accepted; none where they all are.
+  // Marks each accepted measurement of a keyframe; none where all are.
   std::optional<std::vector<bool>> accepted(std::size_t keyframe) const;
   std::size_t rejected() const;
 
-  // Begins anew, with so many particles and the first random number; the gate stays.
+  // Restarts with so many particles and the first random number; the gate stays.
   void begin(std::size_t particles);
 
   // Takes a keyframe past the gate. Throws MotionError.

@@ -11,7 +11,7 @@ using dense::Const, dense::Matrix, dense::View;
 using Numbers = std::vector<double>;
 using Places = std::vector<std::size_t>;
 
-constexpr int ITERATIONS = 3;
+constexpr int ITERATIONS = 3;  // of the EKF update
 
 // The constraints of k landmarks, linearised at the result of the iterations.
 //
@@ -43,8 +43,8 @@ void put(View to, Const from) {
   for (std::size_t i = 0; i < from.rows; i++) std::copy(from[i], from[i] + from.columns, to[i]);
 }
 
-// Rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ.
-Matrix of_map(Const P, const Numbers& lever) {
+// cov(map, innovation): rows of the map's covariance (columns: pose, then the landmarks) times Hᵀ.
+Matrix map_cross(Const P, const Numbers& lever) {
   Matrix U(P.rows, lever.size());
   for (std::size_t row = 0; row < P.rows; row++) {
     const double* from = P[row];
@@ -57,8 +57,8 @@ Matrix of_map(Const P, const Numbers& lever) {
   return U;
 }
 
-// Rows of the submap's covariance (columns: the landmarks) times Hᵀ.
-Matrix of_submap(Const P, double s, double c) {
+// cov(submap, innovation): rows of the submap's covariance (columns: the landmarks) times Hᵀ.
+Matrix submap_cross(Const P, double s, double c) {
   Matrix V(P.rows, P.columns);
   for (std::size_t row = 0; row < P.rows; row++) {
     const double* from = P[row];
@@ -78,8 +78,8 @@ Numbers moved(std::span<const double> mean, Const gain, const Numbers& z) {
   return after;
 }
 
-// S⁻¹ of a symmetric S, exactly symmetric; none where S is not positive definite. The pivots of its
-// factor are roots, where `dense::cholesky` divides by the root: they round otherwise.
+// S⁻¹ of a symmetric S, exactly symmetric; none where S is not positive definite. A pivot is √p, where
+// `dense::cholesky` has p/√p, which rounds differently.
 std::optional<Matrix> inverse(const Matrix& S) {
   const std::size_t m = S.rows();
   Matrix U = dense::transposed(S), L(m, m);
@@ -118,7 +118,7 @@ bool tie(const Numbers& mean, const Matrix& covariance, const Numbers& seen, con
       y[i] = c * seen[i] - s * seen[j] + mean[0] - mean[3 + i] + x * turn;
       y[j] = s * seen[i] + c * seen[j] + mean[1] - mean[3 + j] + u * turn;
     }
-    const Matrix U = of_map(covariance, found.lever), V = of_submap(of_seen, s, c);
+    const Matrix U = map_cross(covariance, found.lever), V = submap_cross(of_seen, s, c);
     Matrix S(m, m);
     for (std::size_t i = 0; i < m; i += 2)
       for (std::size_t k = 0; k < m; k++) {
@@ -273,8 +273,8 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined) {
   const Agreement found = agreement(map, submap, elementary::INF);
   if (found.fault != Fault::NONE) return found.fault;
   const std::size_t n = map.mean.size(), m = submap.mean.size(), old = n - 3;
-  const Matrix U = of_map(part(map.covariance, up_to(n), found.place), found.tie.lever);
-  const Matrix V = of_submap(part(submap.covariance, up_to(m), found.sights), found.tie.sine, found.tie.cosine);
+  const Matrix U = map_cross(part(map.covariance, up_to(n), found.place), found.tie.lever);
+  const Matrix V = submap_cross(part(submap.covariance, up_to(m), found.sights), found.tie.sine, found.tie.cosine);
   const Numbers state = moved(map.mean, U, found.tie.multiplier), ended = moved(submap.mean, V, found.tie.multiplier);
   // The covariance of (map, submap) after the update: P less P Hᵀ S⁻¹ H P.
   const Matrix map_gain = dense::product(U, found.tie.inverse), gain = dense::product(V, found.tie.inverse);
@@ -330,9 +330,9 @@ TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate) {
   const std::size_t m = found.sights.size();
   const Numbers& z = found.tie.multiplier;
   Matrix gain(6, m), joint(6, 6);
-  put(gain.view().part(0, 0, 3, m), of_map(found.covariance.view().part(0, 0, 3, 3 + m), found.tie.lever));
+  put(gain.view().part(0, 0, 3, m), map_cross(found.covariance.view().part(0, 0, 3, 3 + m), found.tie.lever));
   put(gain.view().part(3, 0, 3, m),
-      of_submap(part(submap.covariance, up_to(3), found.sights), found.tie.sine, found.tie.cosine));
+      submap_cross(part(submap.covariance, up_to(3), found.sights), found.tie.sine, found.tie.cosine));
   Numbers before(found.mean.begin(), found.mean.begin() + 3);
   before.insert(before.end(), submap.mean.begin(), submap.mean.begin() + 3);
   const Numbers state = moved(before, gain, z);

@@ -67,7 +67,7 @@ Fault join(const WholeMap& map, const LocalMap& submap, WholeMap& joined);
 // with two degrees of freedom.
 TiedPose end_pose(const WholeMap& map, const LocalMap& submap, double gate);
 
-// A submap corrected by what the centre found out about errors b that all submaps of a robot share:
+// A submap corrected by the centre's estimates of errors b that all submaps of a robot share:
 // N(mean + Sᵀ b + ½ Dᵀ b², f P + S'ᵀ diag(σ²) S'), S' = S + b D, with f a factor and a row of the
 // sensitivity S and of the curvature D for each error.
 struct SharedError {

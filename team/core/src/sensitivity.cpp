@@ -16,14 +16,13 @@ constexpr double TWIST_S = 0.25;
 // Added to each motion's variances [m², m², rad²].
 constexpr double JITTER[3] = {1e-7, 1e-7, 1e-9};
 
-// The clock offset [s], to each side, by which the answer to it is displaced to see how it changes: a
-// large one, as it is where it matters.
+// Step [s] of the central difference by the clock's offset: of the size of offsets that matter.
 constexpr double LATE_S = 0.2;
 
-using Shifts = std::array<double, BIASES>;  // a number's answer to each bias
+using Shifts = std::array<double, BIASES>;  // a number's derivative by each bias
 
-// Range or bearing of a measurement: ∂h by the pose's error and by the landmark, its variance, and its
-// answer to each bias where pose and landmark stay.
+// Range or bearing of a measurement: ∂h by the pose's error and by the landmark, its variance, and the
+// derivative of its residual by each bias at fixed pose and landmark.
 struct Line {
   double H[5], variance;
   Shifts shifts{};
@@ -42,14 +41,14 @@ struct Solution {
   std::vector<Point<double>> landmarks;
 };
 
-// How a solution answers each bias, a column each: errors ξ of the poses, shifts of the landmarks.
-struct Answer {
+// Derivative of a solution by each bias, a column each: errors ξ of the poses, shifts of the landmarks.
+struct Response {
   dense::Matrix path, landmarks;
   Fault fault = Fault::NONE;
 };
 
-// The twist (forward, left, turn per second) of each pose but the end: of the motion from TWIST_S before
-// to TWIST_S after. Both sides count alike, so that a pose's own error does not enter.
+// The twist (forward, left, turn per second) at each pose: that of the motion from TWIST_S before to
+// TWIST_S after. Both sides have one weight, so that the pose's own error has none.
 std::vector<se2::Motion> twists_of(const std::vector<Pose<double>>& path, std::span<const WindowMotion> motions) {
   std::vector<se2::Motion> found(path.size());
   for (std::size_t k = 0; k < path.size(); k++) {
@@ -65,7 +64,7 @@ std::vector<se2::Motion> twists_of(const std::vector<Pose<double>>& path, std::s
   return found;
 }
 
-// delay: by so much the measurement was made before its stamp, at pose ∘ Exp(−delay · twist).
+// Linearises a measurement that was made `delay` [s] before its stamp, at pose ∘ Exp(−delay · twist).
 Sight sight_of(const WindowMeasurement& z, std::size_t landmark, const Pose<double>& stamped, const Point<double>& at,
                const Noise& noise, const se2::Motion& twist, double delay) {
   Pose<double> pose = stamped, since{};
@@ -118,7 +117,7 @@ void add_sight(dense::View A, dense::View B, const Sight& z, std::size_t chain) 
     }
 }
 
-// Sums over the measurements of one landmark, given the answers of their residuals.
+// Sums over the measurements of one landmark, given the derivatives of their residuals.
 struct GivenPath {
   double A[2][2] = {}, B[2][BIASES] = {};
 
@@ -150,22 +149,22 @@ struct GivenPath {
   }
 };
 
-// How a line answers to its pose's errors ξ, of which there is one for each bias.
-void add_answer(Shifts& shifts, const Line& line, dense::Const xi, std::size_t keyframe) {
+// Adds the derivative of a residual through its pose, whose error ξ by each bias is a column.
+void add_path(Shifts& shifts, const Line& line, dense::Const xi, std::size_t keyframe) {
   const double* H = line.H;
   for (std::size_t b = 0; b < BIASES; b++)
     shifts[b] += H[0] * xi[3 * keyframe][b] + H[1] * xi[3 * keyframe + 1][b] + H[2] * xi[3 * keyframe + 2][b];
 }
 
-// How a landmark answers, given the path's answer ξ, as it is solved again at the end.
+// The derivative of a landmark that is solved along the path, given the path's derivative ξ.
 GivenPath landmark_given(dense::Const xi, std::span<const Sight> sights, std::size_t landmark, const Noise& noise) {
   std::vector<const Line*> ranges, bearings;
   std::vector<Shifts> of_ranges, of_bearings;
   for (const Sight& z : sights) {
     if (z.landmark != landmark) continue;
     Shifts range = z.range.shifts, bearing = z.bearing.shifts;
-    add_answer(range, z.range, xi, z.keyframe);
-    add_answer(bearing, z.bearing, xi, z.keyframe);
+    add_path(range, z.range, xi, z.keyframe);
+    add_path(bearing, z.bearing, xi, z.keyframe);
     ranges.push_back(&z.range);
     bearings.push_back(&z.bearing);
     of_ranges.push_back(range);
@@ -190,8 +189,8 @@ std::vector<Pose<double>> path_to(const Pose<double>& end, const Window& window)
   return path;
 }
 
-// The solution's answer where measurements were made `delay` before their stamps.
-Answer answer_of(const Window& window, const Solution& at, double delay) {
+// The derivative of the solution if measurements were made `delay` before their stamps.
+Response response_of(const Window& window, const Solution& at, double delay) {
   const Noise& noise = window.settings().noise;
   const std::vector<std::uint32_t> ids = sorted_ids(window);
   const std::size_t chain = 3 * at.path.size(), L = ids.size();
@@ -223,27 +222,27 @@ Answer answer_of(const Window& window, const Solution& at, double delay) {
   return {std::move(B), std::move(landmarks)};
 }
 
-// The solution where a bias is `by` more.
-Solution displaced(const Solution& at, const Answer& answer, Bias bias, double by) {
+// The solution with a bias larger by `by`.
+Solution displaced(const Solution& at, const Response& response, Bias bias, double by) {
   Solution moved = at;
   for (std::size_t k = 0; k < at.path.size(); k++) {
-    const auto xi = [&](std::size_t i) { return by * answer.path[3 * k + i][bias]; };
+    const auto xi = [&](std::size_t i) { return by * response.path[3 * k + i][bias]; };
     moved.path[k] = se2::compose(at.path[k], se2::exponential({xi(0), xi(1), xi(2)}));
   }
   for (std::size_t l = 0; l < at.landmarks.size(); l++) {
-    moved.landmarks[l].x += by * answer.landmarks[2 * l][bias];
-    moved.landmarks[l].y += by * answer.landmarks[2 * l + 1][bias];
+    moved.landmarks[l].x += by * response.landmarks[2 * l][bias];
+    moved.landmarks[l].y += by * response.landmarks[2 * l + 1][bias];
   }
   return moved;
 }
 
-// An answer as a row over (end pose, pose nodes, landmarks), in the base's frame.
-void set_row(double* row, const Solution& at, const Answer& answer, Bias bias, std::span<const std::size_t> nodes,
+// The derivative by one bias as a row over (end pose, pose nodes, landmarks), in the base's frame.
+void set_row(double* row, const Solution& at, const Response& response, Bias bias, std::span<const std::size_t> nodes,
              const se2::Mount& mount) {
   const auto set_pose = [&](double* to, std::size_t k) {
     const auto [s, c] = elementary::sin_cos(at.path[k].heading);
-    const double x = answer.path[3 * k][bias], y = answer.path[3 * k + 1][bias];
-    const Pose<double> shift{c * x - s * y, s * x + c * y, answer.path[3 * k + 2][bias]};
+    const double x = response.path[3 * k][bias], y = response.path[3 * k + 1][bias];
+    const Pose<double> shift{c * x - s * y, s * x + c * y, response.path[3 * k + 2][bias]};
     const auto [dx, dy, turn] = mount.is_mounted() ? mount.base_shift(shift, at.path[k]) : shift;
     to[0] = dx;
     to[1] = dy;
@@ -252,7 +251,7 @@ void set_row(double* row, const Solution& at, const Answer& answer, Bias bias, s
   if (!at.path.empty()) set_pose(row, at.path.size() - 1);
   for (std::size_t k = 0; k < nodes.size(); k++) set_pose(row + 3 + 3 * k, nodes[k]);
   for (std::size_t l = 0; l < at.landmarks.size(); l++) {
-    const Point<double> shift{answer.landmarks[2 * l][bias], answer.landmarks[2 * l + 1][bias]};
+    const Point<double> shift{response.landmarks[2 * l][bias], response.landmarks[2 * l + 1][bias]};
     const auto [x, y] = mount.is_mounted() ? mount.base_vector(shift) : shift;
     row[3 + 3 * nodes.size() + 2 * l] = x + 0.0;  // a zero is positive
     row[3 + 3 * nodes.size() + 2 * l + 1] = y + 0.0;
@@ -280,16 +279,16 @@ Sensitivity sensitivity_of(const Window& window, std::span<const double> mean, b
     const Point<double> landmark{mean[i], mean[i + 1]};
     at.landmarks.push_back(mount.is_mounted() ? away.base_point(landmark) : landmark);
   }
-  const Answer answer = answer_of(window, at, 0.0);
-  if (answer.fault != Fault::NONE) return {{}, {}, answer.fault};
+  const Response response = response_of(window, at, 0.0);
+  if (response.fault != Fault::NONE) return {{}, {}, response.fault};
   Sensitivity found{dense::Matrix(BIASES, mean.size()), dense::Matrix(BIASES, mean.size())};
-  for (std::size_t b = 0; b < BIASES; b++) set_row(found.rows[b], at, answer, Bias(b), nodes, mount);
+  for (std::size_t b = 0; b < BIASES; b++) set_row(found.rows[b], at, response, Bias(b), nodes, mount);
   if (!with_nodes) return found;
   dense::Matrix rows(2, mean.size());  // later, earlier
   for (std::size_t side = 0; side < 2; side++) {
     const double by = side ? -LATE_S : LATE_S;
-    const Solution there = displaced(at, answer, CLOCK_OFFSET, by);
-    const Answer changed = answer_of(window, there, by);
+    const Solution there = displaced(at, response, CLOCK_OFFSET, by);
+    const Response changed = response_of(window, there, by);
     if (changed.fault != Fault::NONE) return {{}, {}, changed.fault};
     set_row(rows[side], there, changed, CLOCK_OFFSET, nodes, mount);
   }

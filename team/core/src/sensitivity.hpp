@@ -13,14 +13,14 @@
 
 namespace teamslam::window {
 
-// The errors: a bearing reads b too much, a measurement is stamped b too late against the odometry (it
-// was made at the pose x ∘ Exp(−b τ), with the twist τ), the way driven is (1 + b) times the odometry's,
-// a range reads b too much, or (1 + b) times itself.
+// The errors: a bearing is b too large; a measurement is stamped b too late against the odometry (it was
+// made at the pose x ∘ Exp(−b τ), with the twist τ); the path driven is (1 + b) times the odometry's; a
+// range is b too large, or (1 + b) times the true one.
 enum Bias : std::size_t { BEARING, CLOCK_OFFSET, FORWARD_SCALE, RANGE_OFFSET, RANGE_SCALE, BIASES };
 
 // A row for each Bias over (end pose, pose nodes, landmarks by ascending id), in the base's frame: the
-// first derivative, and the second of the clock's offset alone, of a window that is closed. The others
-// are as good as linear where robots are calibrated.
+// first derivative, and for a closed window the second derivative by the clock's offset. Those by the other
+// errors are negligible for calibrated robots.
 struct Sensitivity {
   dense::Matrix rows, curvature;
   gaussian::Fault fault = gaussian::Fault::NONE;  // of the smoother; there are no rows then

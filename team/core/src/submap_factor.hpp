@@ -99,7 +99,7 @@ struct Submap {
 
  private:
   double bias(Values state, Indices at, std::size_t b) const { return state[at[1 + points() + b]]; }
-  // S + D b, with which the mean answers each bias at a state.
+  // S + D b, the derivative of the mean by each bias at a state.
   dense::Matrix sensitivity_at(Values state, Indices at) const;
   Residual residual_of(const Numbers& shifted, Values state, Indices at) const;
   Normal unbiased_normal(const Numbers& shifted, Values state, Indices at) const;

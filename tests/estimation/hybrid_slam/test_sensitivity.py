@@ -19,8 +19,9 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
     solve_fold,
 )
-from teamslam.team.estimation.models import increment_of, model_of, noise_of
+from teamslam.team.estimation.models import increment_of, noise_of
 from teamslam.team.estimation.randomness import random_numbers
+from tests.core.test_odometry import shift_of
 from tests.estimation.submap_world import local_truth, team, wrap
 
 SIGMA = {
@@ -63,7 +64,7 @@ def window_of(bearing, clock_offset, forward_scale, range_offset, range_scale, w
             ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
-            np.append(model_of(MOTION).forward_column(1.0, 1.0, 0.1), 1.0),
+            shift_of(MOTION, (1.0, 1.0, 0.1)),
         )
     return windows.gaussian(window)
 
@@ -228,7 +229,9 @@ def wrap_pose(difference):
     st.sampled_from(["velocity", "turn-then-drive"]),
     st.floats(-2.0, 2.0),
 )
-def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, rate, kind, more):
+def test_a_shift_by_the_scale_of_speed_is_what_central_differences_of_two_motions_say(
+    speed, rate, kind, more
+):
     motion = msgspec.structs.replace(MOTION, kind=kind)
 
     def driven_with(scale):
@@ -237,9 +240,7 @@ def test_a_forward_column_is_what_central_differences_of_two_motions_say(speed, 
 
     h = 1e-6
     step = se2.between(driven_with(1.0 - h), driven_with(1.0 + h))
-    first = model_of(motion).forward_column(0.5, speed, rate)
-    second = increment_of(motion, 0.5, speed, more).mean
-    column = core.shift_after(first, second) + model_of(motion).forward_column(0.5, speed, more)
+    column = shift_of(motion, (0.5, speed, rate), (0.5, speed, more))[:3]
     np.testing.assert_allclose(column, se2.logarithm(step) / (2 * h), atol=3e-2 * speed)
 
 
