@@ -42,7 +42,8 @@ def normal_equations(observer, teammate, measurement, point, information):
     offset, fixed = np.array([0, 3, 6]), np.array([False, False])
     graph = core.SubmapGraph(offset, fixed, [], one, [], None)
     state, none = np.concatenate([observer, teammate]), np.empty(0)
-    at = core.Estimate(graph, state, none, np.ones(1), False, 1.0, 1.0, 1.0, False)
+    wide = np.array([1e6])
+    at = core.Estimate(graph, state, none, wide, False, 1.0, 1.0, 1.0, False)
     values, gradient = at.normal_equations
     rows = [[graph.pattern.block(values, i, j) for j in (0, 1)] for i in (0, 1)]
     return np.block(rows), gradient, at.sighting_chi2[0]
