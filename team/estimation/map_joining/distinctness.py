@@ -30,7 +30,7 @@ from teamslam.team.estimation.association.voting import (
     apply_motion,
     propose_alignments,
 )
-from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.contribution import Stream, is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.memory import MOST
@@ -55,7 +55,7 @@ def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
 
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
     """Find the landmarks of the main island that nearly all submaps miss which look at their place,
-    ascending; none that an operator has judged.
+    ascending; none that an operator has judged. A saved map looks at no place.
 
     A landmark of n < MOST submaps is missed where each landmark of MOST or more beside it has been
     observed by MOST n, and at least half of its submaps have one beside it. The share of submaps
@@ -71,6 +71,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
     observed = np.full(len(counts), np.iinfo(np.int64).max)
     having, knowing = np.zeros_like(counts), np.zeros_like(counts)
     for each in graph.observed:
+        if is_map(each.observation.stream):
+            continue
         beside = counts[each.known]
         well_known = beside[beside >= MOST]
         having[each.known] += 1

@@ -205,7 +205,7 @@ def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
     """List the main island's landmarks in at least `submaps` believed submaps; unnamed ones in the
-    larger of `submaps` and `unnamed`.
+    larger of `submaps` and `unnamed`. Those of a saved map are confirmed.
 
     Submaps with a landmark's weight below BELIEVED do not count: contradictory observations do not
     confirm each other.
@@ -220,11 +220,14 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
     count_of = dict(zip(found.tolist(), counts.tolist(), strict=True))
     old = island.graph.condensed
     before = {} if old is None else old.departed.believed
-    node_of = island.graph.landmarks
+    graph, node_of = island.graph, island.graph.landmarks
+    maps = (graph.submaps[k].landmarks.tolist() for k in graph.saved_maps.tolist())
+    saved = {node for each in maps for node in each}
     return [
         id_
         for id_ in known(island)
-        if count_of.get(node_of.get(id_, -1), 0) + before.get(id_, 0)
+        if node_of.get(id_, -1) in saved
+        or count_of.get(node_of.get(id_, -1), 0) + before.get(id_, 0)
         >= (max(submaps, unnamed) if id_ >= UNNAMED else submaps)
     ]
 

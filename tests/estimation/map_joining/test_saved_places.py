@@ -1,8 +1,12 @@
 """Moves of a saved map's landmarks that today's submaps place, with numbers and without."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from teamslam.central.config import CentralConfig
+from teamslam.central.join_messages import shown_landmarks
 from teamslam.central.saved_maps import landmark_changes
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Contribution
@@ -97,3 +101,11 @@ def test_an_unnamed_landmark_is_tested_in_the_tick_that_associates_it() -> None:
     fold = Fold((), {}, {SITE: of}, {SITE: SITE, ROBOT: SITE}, EMPTY_FOLD.reasons)
     newest = of.graph.submaps[-1].contribution
     assert {*associate_tick(fold, [newest]).main.graph.former} == {(SITE, UNNAMED + MOVED)}
+
+
+def test_a_saved_landmark_that_nobody_looked_at_today_stays_in_the_map() -> None:
+    """Its map counts as no single submap that all others contradict."""
+    of = island(UNNAMED, having=0, submaps=8)
+    taken = tuple(each.contribution for each in of.graph.submaps)
+    fold = replace(final(of), contributions=taken)
+    assert UNNAMED + MOVED in shown_landmarks(fold, CentralConfig(), "final").ids
