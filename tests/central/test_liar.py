@@ -17,6 +17,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.simulator import simulate
 from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
 from teamslam.team.robot.node import RobotNode
@@ -239,13 +240,14 @@ def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map():
 
 
 def test_two_robots_that_contradict_each_other_are_named_and_stay():
-    quiet = Agreement(0.0, 1.0, {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}, ())
-    loud = Agreement(0.0, 1.0, {"r1": (1e4, 50.0), "r2": (60.0, 50.0), "r3": (50.0, 50.0)}, ())
+    small = {"r1": (50.0, 50.0), "r2": (50.0, 50.0), "r3": (50.0, 50.0)}
+    quiet = Agreement(0.0, 1.0, small, SubmapCosts())
+    loud = Agreement(0.0, 1.0, small | {"r1": (1e4, 50.0), "r2": (60.0, 50.0)}, SubmapCosts())
 
     def without(robots: Collection[str]) -> Agreement:
         left = quiet if {"r1", "r2"} & {*robots} else loud
         rest = {each: cost for each, cost in left.robots.items() if each not in robots}
-        return Agreement(0.0, 1.0, rest, ())
+        return Agreement(0.0, 1.0, rest, SubmapCosts())
 
     found = hold_trial(loud, 4.0, without)
     assert found.robot is None
@@ -257,7 +259,7 @@ def test_a_robot_that_the_map_follows_is_found_though_only_others_disagree():
         liar_is_there = "r1" not in robots
         costs = {"r1": (1e-9, 50.0), "r2": (1e5 if liar_is_there else 50.0, 50.0)}
         costs["r3"] = (1e6 if liar_is_there else 50.0, 50.0)
-        return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, ())
+        return Agreement(0.0, 1.0, {r: costs[r] for r in costs if r not in robots}, SubmapCosts())
 
     assert hold_trial(without(()), 4.0, without).robot == "r1"
 
