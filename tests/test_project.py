@@ -150,14 +150,20 @@ def test_a_process_loads_nothing_that_it_does_not_use_until_it_connects(words, u
     assert loaded.isdisjoint(unused)
 
 
-def test_a_launch_starts_its_processes_before_it_loads_what_it_needs_later():
-    code = (
-        "import sys, teamslam.sim.cli.launch, teamslam.sim.launch.launch\n"
-        "import teamslam.sim.launch.live; print(*sys.modules)"
-    )
+@pytest.mark.parametrize(
+    ("imported", "unused"),
+    [
+        (
+            "teamslam.sim.cli.launch, teamslam.sim.launch.launch, teamslam.sim.launch.live",
+            {"numpy", "pydantic", "teamslam.sim.cli.main"},
+        ),
+        ("teamslam.team.driver.driver", {"typer", "_ssl", "jaxtyping"}),
+    ],
+)
+def test_a_launch_and_a_driver_begin_without_what_they_need_later_or_never(imported, unused):
+    code = f"import sys, {imported}; print(*sys.modules)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    unused = {"numpy", "cryptography.x509", "pydantic", "mcap", "teamslam.sim.cli.main"}
-    assert set(ran.stdout.split()).isdisjoint(unused)
+    assert set(ran.stdout.split()).isdisjoint(unused | {"cryptography.x509", "mcap"})
 
 
 def test_a_launch_and_its_report_need_no_scipy():

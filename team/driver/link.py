@@ -12,7 +12,6 @@ from teamslam.team.door import MOST_LIVES
 from teamslam.team.driver.journal import JournalError, replace_journal
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.end_query import EndQuery
-from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import KeysError
 from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as ch
@@ -155,6 +154,8 @@ class Link:
     def _connected(self) -> None:
         own = None
         if self._keys is not None:
+            from teamslam.team.keys.credentials import credentials_of
+
             own = credentials_of(self._keys, f"source-{self._node.journal.robot}", self._team)
         connect = self._connect.replace("tcp/", "tls/", 1) if own else self._connect
         with ExitStack() as stack:
