@@ -166,6 +166,13 @@ def test_a_launch_and_a_driver_begin_without_what_they_need_later_or_never(impor
     assert set(ran.stdout.split()).isdisjoint(unused | {"cryptography.x509", "mcap"})
 
 
+def test_the_commands_alone_load_no_numpy():
+    code = "import sys, teamslam.sim.cli.main; print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", code], text=True, timeout=60).split()
+    assert "teamslam.sim.studies.experiment_command" in loaded
+    assert {"numpy", "rich.progress"}.isdisjoint(loaded)
+
+
 def test_a_launch_and_its_report_need_no_scipy():
     parts = (
         "sim.launch.launch", "sim.cli.main", "sim.in_memory.team", "central.main",
