@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmarks.baseline import conclude
 from teamslam.sim.studies.estimators.innovation import innovation
+from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
 from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
@@ -91,7 +92,7 @@ def steps() -> list[Callable[[], None]]:
 
     def judged() -> None:
         for _ in range(30):
-            innovation(particles, motion, SENSOR, *seen)
+            innovation(particles, RobotStep("r1", motion, SENSOR, *seen))
 
     return [step("fastslam1"), step("fastslam2"), judged]
 
