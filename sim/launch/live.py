@@ -4,7 +4,7 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -118,14 +118,13 @@ def consistency(watch: Watch) -> str:
     parts = [
         f"{words} {figures[name]:.2f}"
         for name, words in (
-            ("joint_cost_per_dof", "joint cost per dof"),
+            ("joint_cost_per_dof", "joint cost/dof"),
             ("covariance_scale", "covariance scale"),
         )
         if name in figures
     ]
     if landmarks.count:
-        parts.append(f"landmark NEES per dof {landmarks.mean:.2f}")
-        parts.append(f"{landmarks.coverage:.0%} within 95 %")
+        parts.append(f"map NEES/dof {landmarks.mean:.2f} ({landmarks.coverage:.0%} in 95 %)")
     return ", ".join(parts)
 
 
@@ -135,8 +134,6 @@ REPEAT_S = 60.0
 """Wall time after which an unchanged line is repeated."""
 SETTLED_S = 5.0
 """A warning withdrawn within this time [s] is not printed."""
-WIDE = 80
-"""Terminal columns for the whole table."""
 MOST_ALIKE = 3
 """Most lines of warnings that differ in their numbers only."""
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
@@ -241,7 +238,7 @@ class _Lines:
         )
 
 
-def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
+def _view(title: str, watch: Watch, width: int) -> Group:
     elapsed = time.monotonic() - watch.began
     world = watch.world
     parts: list[Text | Table] = [Text(f"{title}   {elapsed:.1f} s", style="bold")]
@@ -252,12 +249,8 @@ def _view(title: str, watch: Watch, width: int = WIDE) -> Group:
         parts.append(Text(starting(watch)))
     else:
         bar = Table.grid(padding=(0, 2))
-        bar.add_row(
-            ProgressBar(total=1.0, completed=done(watch), width=36),
-            share(watch),
-            f"{times(watch, world)}, {world.node} {world.state}",
-        )
-        parts.append(bar)
+        bar.add_row(ProgressBar(total=1.0, completed=done(watch), width=36), share(watch))
+        parts += [bar, Text(f"{times(watch, world)}, {world.node} {world.state}")]
     if robots:
         parts.append(_robots(robots, watch.errors, width))
     parts += [Text(line) for line in _map_lines(watch)]
@@ -276,15 +269,28 @@ _COLUMNS = (
     ("messages_per_s", "\nmsg/s", "{:,.0f}"),
     ("bytes_per_s", "\nB/s", "{:,.0f}"),
 )
-_NARROW = ("steps", "submaps", "pose_sigma_m", "nis_per_dof")
+_LEFT_OUT_FIRST = ("messages_per_s", "bytes_per_s", "landmarks")
+"""Columns left out, in this order, until the table fits the terminal."""
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
 _SHOWN_AT_MOST = 12
 """Most robots with a row each."""
+UNBOUNDED = 1000
+"""Terminal columns in which a table takes all that it needs."""
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:
-    columns = [each for each in _COLUMNS if width >= WIDE or each[0] in _NARROW]
+    for count in range(len(_LEFT_OUT_FIRST) + 1):
+        table = _table(statuses, errors, _LEFT_OUT_FIRST[:count])
+        if Console(width=UNBOUNDED).measure(table).maximum <= width:
+            break
+    return table
+
+
+def _table(
+    statuses: Mapping[str, m.Status], errors: "LiveErrors", left_out: Sequence[str]
+) -> Table:
+    columns = [each for each in _COLUMNS if each[0] not in left_out]
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
     table.add_column(Text("\nrobot"), no_wrap=True)

@@ -1,5 +1,8 @@
 from io import StringIO
 
+import msgspec
+import numpy as np
+import pytest
 from rich.console import Console
 
 from teamslam.sim.launch import live
@@ -91,14 +94,33 @@ def told(robots: int) -> Watch:
 def printed(watch: Watch, width: int) -> list[str]:
     out = StringIO()
     Console(file=out, width=width).print(live._view("thesis, seed 1", watch, width))
-    return out.getvalue().splitlines()
+    return [line.rstrip() for line in out.getvalue().splitlines()]
 
 
 def test_without_truth_there_are_the_monitor_and_nis_alone():
     lines = printed(told(2), 80)
     assert any("NIS" in line for line in lines)
     assert not any("NEES" in line or "95 %" in line for line in lines)
-    assert "joint cost per dof 1.07" in lines
+    assert "joint cost/dof 1.07" in lines
+
+
+@pytest.mark.parametrize("peers", [False, True])
+def test_no_line_wraps_at_80_columns(peers):
+    watch = told(3)
+    world = status("world", "publishing", measurements=10.0, of=10.0, team_time_s=12345.0)
+    watch.statuses["world"] = msgspec.structs.replace(world, stamp_ns=12_345_000_000_000)
+    watch.statuses["central"].figures["covariance_scale"] = 12.34
+    watch.errors.landmarks.take(np.full(50, 25.0), 2)
+    assert watch.fused is not None
+    watch.fused = msgspec.structs.replace(watch.fused, stamp_ns=1_000_000_000)
+    if peers:
+        for k in (1, 2, 3):
+            watch.statuses[f"robot/r{k}"].figures["set_submaps"] = 123.0
+    wide, lines = printed(watch, 200), printed(watch, 80)
+    assert any("the world is 12,344 s ahead" in line for line in lines)
+    assert len(lines) == len(wide)
+    assert not any("…" in line for line in lines)
+    assert all("msg/s" in line for line in wide if "robot " in line)
 
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
