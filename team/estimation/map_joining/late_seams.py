@@ -8,8 +8,9 @@ log-likelihood ratio of a stream elsewhere from a submap on, against one at its 
 
 over the landmarks l that one side has and the submaps s of the other side, unless another landmark
 of that side is within the gate. p(d) is the probability that a submap of the robot observes a
-landmark at distance d, learnt from the landmarks of its previous and next submap: they do not
-depend on the seam. It is averaged over the uncertainty of d.
+landmark at distance d, learnt from all its submaps and all landmarks: also a camera that looks one
+way, or walls, make it small, and so do the landmarks that it misses behind a seam. It is averaged
+over the uncertainty of d.
 """
 
 import math
@@ -135,22 +136,14 @@ def _rows_of(sights: _Sights, stream: Stream) -> list[int]:
 def _misses(sights: _Sights, spread: Float[np.ndarray, "K n"]) -> Misses:
     """Compute −ln P(a submap misses a landmark); spread: standard deviation [m] of its distance."""
     out = np.zeros(sights.away.shape)
-    robots = [each.contribution.robot for each in sights.submaps]
-    streams = sorted({each.contribution.stream for each in sights.submaps})
-    for robot in sorted({*robots}):
-        away: list[float] = []
-        seen: list[bool] = []
-        for stream in streams:
-            rows = _rows_of(sights, stream) if stream[0] == robot else []
-            for k, row in enumerate(rows):
-                beside = [*rows[max(k - 1, 0) : k], *rows[k + 1 : k + 2]]
-                known = sights.sees[beside].any(axis=0)
-                away += sights.away[row, known].tolist()
-                seen += sights.sees[row, known].tolist()
-        if not any(seen):
+    robots = np.array([each.contribution.robot for each in sights.submaps])
+    stable = sights.counts >= LEAST_COUNT
+    for robot in sorted({*robots.tolist()}):
+        own = robots == robot
+        away, seen = sights.away[np.ix_(own, stable)], sights.sees[np.ix_(own, stable)]
+        if not seen.any():
             continue
-        own = np.array([each == robot for each in robots])
-        rate = learn_rate(np.array(away), np.array(seen), unseen=1.0)
+        rate = learn_rate(away.ravel(), seen.ravel(), unseen=1.0)
         p = sum(weight * rate.at(np.abs(sights.away[own] + z * spread[own])) for z, weight in NODES)
         out[own] = -core.log(np.maximum(1.0 - p, LEAST_OVERLOOKED))
     return out
