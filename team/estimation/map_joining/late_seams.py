@@ -41,6 +41,8 @@ LEAST_COUNT = 4
 """Least measurements of a landmark: fewer may be clutter."""
 MOST_TRACKED = 1
 """Most landmarks that a robot observes on both sides of a seam, by chance."""
+MOST_COMMON = 2
+"""Most landmarks on both sides of a seam, by chance: three place a stream."""
 NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
 """Nodes and weights of the Gauss-Hermite rule of three points."""
 
@@ -224,7 +226,10 @@ def _list_places(
             ahead = ~behind
             ahead[rows[k:after]] = False
             one, two = sights.sees[ahead].any(axis=0), sights.sees[behind].any(axis=0)
-            evidence = -PRESENT * float((one & two).sum())
+            common = int((one & two).sum())
+            if common > MOST_COMMON:
+                continue
+            evidence = -PRESENT * float(common)
             for own, other, by in ((one, two, behind), (two, one, ahead)):
                 alone = own & ~other & stable & ~possible[:, other].any(axis=1)
                 evidence += float(
