@@ -42,7 +42,10 @@ LEAST_COUNT = 4
 MOST_TRACKED = 1
 """Most landmarks that a robot observes on both sides of a seam, by chance."""
 MOST_COMMON = 2
-"""Most landmarks on both sides of a seam, by chance: three place a stream."""
+"""Most landmarks on both sides of a seam, by chance: three place a stream. More of those behind it
+are new, and either side misses one of the other's beyond doubt: a camera that looks one way misses
+many, but maps none a second time.
+"""
 NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
 """Nodes and weights of the Gauss-Hermite rule of three points."""
 
@@ -227,14 +230,16 @@ def _list_places(
             ahead[rows[k:after]] = False
             one, two = sights.sees[ahead].any(axis=0), sights.sees[behind].any(axis=0)
             common = int((one & two).sum())
-            if common > MOST_COMMON:
-                continue
-            evidence = -PRESENT * float(common)
+            sides: list[float] = []
+            fresh = 0
             for own, other, by in ((one, two, behind), (two, one, ahead)):
                 alone = own & ~other & stable & ~possible[:, other].any(axis=1)
-                evidence += float(
-                    np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT).sum()
-                )
+                missed = np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT)
+                sides.append(float(missed.sum()))
+                fresh = int(alone.sum())
+            if common > MOST_COMMON or fresh <= common or min(sides) < MOST_ABSENT:
+                continue
+            evidence = sum(sides) - PRESENT * float(common)
             yield _Place(before, rows[after], evidence)
 
 
