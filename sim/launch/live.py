@@ -112,19 +112,19 @@ def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
 
 
 def consistency(watch: Watch) -> str:
-    """Describe the consistency monitor's figures; with truth, NEES and coverage."""
+    """Describe the consistency monitor's figures; with truth, the landmarks' coverage."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [
         f"{words} {figures[name]:.2f}"
         for name, words in (
-            ("joint_cost_per_dof", "joint cost/dof"),
+            ("joint_cost_per_dof", "joint cost per dof"),
             ("covariance_scale", "covariance scale"),
         )
         if name in figures
     ]
     if landmarks.count:
-        parts.append(f"map NEES/dof {landmarks.mean:.2f} ({landmarks.coverage:.0%} in 95 %)")
+        parts.append(f"{landmarks.coverage:.0%} of landmarks within 95 %")
     return ", ".join(parts)
 
 

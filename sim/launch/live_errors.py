@@ -39,7 +39,7 @@ class _Robot:
 class LiveErrors:
     """Errors of a team so far.
 
-    landmarks: of the newest fused map, unaligned; NEES as the report's map NEES per dof.
+    landmarks: of the newest fused map, unaligned, each landmark in its own covariance.
     """
 
     landmarks: NeesTally = field(default_factory=NeesTally)
@@ -99,4 +99,3 @@ class LiveErrors:
         self.landmarks = NeesTally()
         if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
             self.landmarks.take(fit.nees, 2)
-            self.landmarks.nees_per_dof = fit.nees_per_dof * fit.landmarks

@@ -19,8 +19,8 @@ MAP_FRAME = "map"
 class TeamFigures(msgspec.Struct, frozen=True):
     """Figures of the team for plots; unknown ones are left out.
 
-    map_rmse_m: without alignment to the truth. landmark_nees_per_dof: 1 is consistent; joint if the
-    map has a joint covariance, else of each landmark by itself. status: the centre's figures, with
+    map_rmse_m: without alignment to the truth. landmark_nees_per_dof: the report's map NEES; 1 is
+    consistent; not of a running map without cross-covariances. status: the centre's figures, with
     those of the consistency monitor.
     """
 

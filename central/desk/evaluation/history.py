@@ -203,7 +203,8 @@ class _Gathering:
         if fused.dof > 0:
             self.map_cost.take(fused.stamp_ns, fused.chi2 / fused.dof)
         if self.frames.has(fused.frame) and (fit := self.truth.fit(fused)) is not None:
-            self.map_nees.take(fused.stamp_ns, fit.nees_per_dof)
+            of_blocks, of_map = float(fit.nees.mean()) / 2.0, fit.nees_per_dof
+            self.map_nees.take(fused.stamp_ns, of_blocks if of_map is None else of_map)
         for member in fused.members:
             waiting = self.unused[member.robot, member.incarnation]
             for sequence in [k for k in waiting if k <= member.sequence]:

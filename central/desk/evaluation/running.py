@@ -56,18 +56,13 @@ class TruthFrames:
 class MapFit(NamedTuple):
     """Unaligned map errors of the landmarks that have truth.
 
-    nees_per_dof: eᵀ P⁻¹ e / 2K with the map's covariance P. nees: of each landmark in its own
-    covariance.
+    nees_per_dof: eᵀ P⁻¹ e / 2K with the map's covariance P, as in the report; None for a running
+    map without cross-covariances. nees: of each landmark in its own covariance.
     """
 
     rmse_m: float
-    nees_per_dof: float
+    nees_per_dof: float | None
     nees: Float[np.ndarray, " K"]
-
-    @property
-    def landmarks(self) -> int:
-        """Number of landmarks with truth."""
-        return len(self.nees)
 
 
 @dataclass(frozen=True)
@@ -100,12 +95,12 @@ class TrueLandmarks:
         blocks = translate.landmark_blocks_of(fused)[known]
         solved = np.linalg.solve(blocks, errors[:, :, np.newaxis])[:, :, 0]
         each = np.einsum("ki,ki->k", errors, solved)
-        squared = float(each.sum())
-        if fused.joint:
+        per_dof = None
+        if fused.joint or fused.final:
             of_known = np.flatnonzero(np.repeat(known, 2))
             P = translate.landmark_covariance_of(fused)[np.ix_(of_known, of_known)]
-            squared = nees(errors.ravel(), P)
-        return MapFit(distance_rmse(means[known], true[known]), squared / (2.0 * len(each)), each)
+            per_dof = nees(errors.ravel(), P) / (2.0 * len(each))
+        return MapFit(distance_rmse(means[known], true[known]), per_dof, each)
 
 
 @dataclass

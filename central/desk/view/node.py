@@ -347,7 +347,7 @@ class ViewerNode:
             0 if self._landmarks is None else len(self._landmarks.ids),
             sum(not robot.lost for robot in self._robots.values()),
             msgspec.UNSET if fit is None else fit.rmse_m,
-            msgspec.UNSET if fit is None else fit.nees_per_dof,
+            msgspec.UNSET if fit is None or fit.nees_per_dof is None else fit.nees_per_dof,
             self._status,
         )
 

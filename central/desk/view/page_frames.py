@@ -313,7 +313,7 @@ class PageFrames:
             final=message.final,
             joint=message.joint,
             rmse=None if fit is None else _short(fit.rmse_m),
-            nees=_short(fit.nees_per_dof) if fit and (message.joint or message.final) else None,
+            nees=_short(fit.nees_per_dof) if fit and fit.nees_per_dof is not None else None,
             **extra,
         )
 

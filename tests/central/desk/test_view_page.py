@@ -18,6 +18,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from teamslam.central.desk.evaluation.errors import transform_points
+from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.view.export import with_views
 from teamslam.central.desk.view.foxglove_proxy import VIEWERS, refusal
 from teamslam.central.desk.view.layout import layout
@@ -28,11 +29,12 @@ from teamslam.sim.cli import view
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.tail import Tail
+from teamslam.team.translate import joint_bytes, landmark_covariance_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.crowd import crowd
 from tests.support import ROOT, fused_map, wait_until
@@ -167,6 +169,31 @@ def test_a_running_map_without_cross_covariances_has_no_nees(frames):
     assert {each["nees"] for each in running} == {None}
     assert {each["rmse"] is None for each in running} == {False}
     assert final["nees"] is not None
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_the_page_and_the_report_of_a_log_have_one_nees(samples, tmp_path, joint):
+    *first, last = samples
+    final = decoded(last.payload, m.FusedMap)
+    if joint:
+        P = landmark_covariance_of(final) + 0.005  # an error that all landmarks share
+        final = msgspec.structs.replace(final, joint=True, covariance=joint_bytes(P))
+    unknown = decoded(first[0].payload, m.TruthLandmarks)  # the last landmark has no truth
+    known = msgspec.structs.replace(
+        unknown, ids=unknown.ids[:-4], positions=unknown.positions[:-16]
+    )
+    first[0] = msgspec.structs.replace(first[0], payload=encoded(known))
+    log = [*first, msgspec.structs.replace(last, payload=encoded(final))]
+    with Recorder(tmp_path / "log.mcap", "crowd", {}) as recorder:
+        recorder.write(log)
+    frames, report = told(tmp_path / "log.mcap"), evaluate(log)
+
+    (shown,) = (frame["nees"] for frame in frames if frame["k"] == "map" and frame["final"])
+    assert report.map.errors.count == LANDMARKS - 1
+    assert shown == pytest.approx(report.map.errors.nees_per_dof, rel=1e-6)
+    for name, robot in report.robots.items():
+        rows = np.array([v for f in frames if f["k"] == "err" and f["r"] == name for v in f["v"]])
+        np.testing.assert_allclose(rows.reshape(-1, 7)[:, 6], robot.online.nees / 3.0, rtol=1e-6)
 
 
 def test_the_page_gets_the_maps_and_how_they_fit(frames, samples):

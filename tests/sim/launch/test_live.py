@@ -101,7 +101,7 @@ def test_without_truth_there_are_the_monitor_and_nis_alone():
     lines = printed(told(2), 80)
     assert any("NIS" in line for line in lines)
     assert not any("NEES" in line or "95 %" in line for line in lines)
-    assert "joint cost/dof 1.07" in lines
+    assert "joint cost per dof 1.07" in lines
 
 
 @pytest.mark.parametrize("peers", [False, True])
@@ -110,7 +110,7 @@ def test_no_line_wraps_at_80_columns(peers):
     world = status("world", "publishing", measurements=10.0, of=10.0, team_time_s=12345.0)
     watch.statuses["world"] = msgspec.structs.replace(world, stamp_ns=12_345_000_000_000)
     watch.statuses["central"].figures["covariance_scale"] = 12.34
-    watch.errors.landmarks.take(np.full(50, 25.0), 2)
+    watch.errors.landmarks.take(np.full(50, 1.0), 2)
     assert watch.fused is not None
     watch.fused = msgspec.structs.replace(watch.fused, stamp_ns=1_000_000_000)
     if peers:
