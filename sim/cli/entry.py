@@ -13,8 +13,10 @@ import typer  # noqa: E402 - the threads of BLAS are set before anything imports
 from teamslam.sim.cli.options import FAILED, WRONG_USE  # noqa: E402
 from teamslam.sim.cli.plain import parse_plainly  # noqa: E402
 
-PROCESSES = ("router", "record", "central", "robot", "world")
-PLAIN = {"launch": "launch", **dict.fromkeys(PROCESSES, "nodes")}
+PLAIN = {
+    "launch": "launch",
+    **dict.fromkeys(("router", "record", "central", "robot", "world"), "nodes"),
+}
 """Commands that start a team, with their modules: no other command is imported for them."""
 
 
@@ -35,8 +37,6 @@ def main() -> None:
 
 def _run(words: list[str]) -> None:
     if words and words[0] in PLAIN:
-        if words[0] in PROCESSES:
-            sys.modules["_hashlib"] = None  # type: ignore[assignment] # OpenSSL in hashlib: 3.5 MB
         commands = import_module(f"teamslam.sim.cli.{PLAIN[words[0]]}")
         function = getattr(commands, words[0])
         arguments = parse_plainly(function, words[1:])
