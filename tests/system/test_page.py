@@ -284,6 +284,52 @@ def test_the_name_of_a_robot_covers_no_number_of_a_landmark(page):
     assert covered == [0, ROBOTS * 81, True]
 
 
+CONTRASTS = """
+(() => {
+  const paint = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
+  const channels = (colour) => {
+    paint.clearRect(0, 0, 1, 1);
+    paint.fillStyle = colour;
+    paint.fillRect(0, 0, 1, 1);
+    return [...paint.getImageData(0, 0, 1, 1).data];
+  };
+  const over = (under, colour, opacity) => {
+    const [r, g, b, alpha] = channels(colour), share = alpha / 255 * opacity;
+    return [r, g, b].map((value, i) => value * share + under[i] * (1 - share));
+  };
+  const linear = (value) => (value / 255 + 0.055) ** 2.4 / 1.055 ** 2.4;  // above 0.04
+  const luminance = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const found = {};
+  for (const each of document.querySelectorAll('header *, aside *, footer *')) {
+    const texts = [...each.childNodes].filter((node) => node.nodeType === Node.TEXT_NODE);
+    if (!each.offsetParent || !texts.some((node) => node.textContent.trim())) continue;
+    let opacity = 1;
+    const styles = [];
+    for (let e = each; e; e = e.parentElement) styles.unshift(getComputedStyle(e));
+    for (const style of styles) opacity *= Number(style.opacity);
+    const ground = styles.reduce((under, s) => over(under, s.backgroundColor, 1), [255, 255, 255]);
+    const text = over(ground, getComputedStyle(each).color, opacity);
+    const [low, high] = [luminance(ground), luminance(text)].sort((a, b) => a - b);
+    found[`${each.tagName} ${each.textContent.trim()}`] = (high + 0.05) / (low + 0.05);
+  }
+  return found;
+})()
+"""
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_every_text_stands_out_from_its_ground(page, scheme):
+    page.call(
+        "Emulation.setEmulatedMedia",
+        features=[{"name": "prefers-color-scheme", "value": scheme}],
+    )
+    seek(page, 30)  # later events are grey
+    ratios = page.ask(CONTRASTS)
+    page.call("Emulation.setEmulatedMedia", features=[])
+    assert len(ratios) > 40
+    assert {text: ratio for text, ratio in ratios.items() if ratio < 4.5} == {}
+
+
 def test_it_fits_a_phone(page):
     page.size(390, 844, 2.0, touch=True)
     page.wait("document.documentElement.scrollWidth <= 390")

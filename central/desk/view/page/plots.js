@@ -54,7 +54,7 @@ export class Plot {
     g.fillText(title, frame.left, 10 * ratio);
     g.textAlign = 'right';
     for (const v of ticks(low, high)) {
-      g.fillStyle = colour('faint');
+      g.fillStyle = colour('soft');
       g.fillText(tickText(v) + (v === 0 ? '' : unit), frame.left - 5 * ratio, y(v) + 3.5 * ratio);
       g.fillStyle = colour('grid-strong');
       g.fillRect(frame.left, Math.round(y(v)), frame.right - frame.left, 1);
