@@ -129,7 +129,14 @@ class CsvTable:
     def conversion(self, column: str, unit: str, scale: str) -> str:
         """Remedy for a column in another unit, in the map of columns if there is one."""
         if self.origin is None or column not in self.origin.columns:
-            return conversion(unit, scale)
+            robot, mark, file = self.name.partition("/")
+            named = robot if robot and mark and "/" not in file else "r1"
+            return (
+                f"to convert from {unit}, add a column map (scale = {scale}), columns.toml, and "
+                "import: `teamslam import SET -o NEW --columns columns.toml` converts every "
+                f"robot's folder, `teamslam import SET/{named} -o NEW --robot {named} --columns "
+                "columns.toml` one (docs/your_data.md)"
+            )
         theirs, factor = self.origin.columns[column]
         entry = f'{column} = {{ column = "{theirs}", scale = {factor * float(scale)!r} }}'
         return f"to convert from {unit}, write {entry} in {self.origin.place}"
@@ -290,15 +297,6 @@ def _unit_of(seconds: Decimal) -> tuple[str, str]:
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
             unit, scale = each, by
     return unit, scale
-
-
-def conversion(unit: str, scale: str) -> str:
-    """Remedy for a column in another unit."""
-    return (
-        f"to convert from {unit}, add a column map (scale = {scale}), columns.toml, and import: "
-        "`teamslam import SET -o NEW --columns columns.toml` converts every robot's folder, "
-        "`teamslam import SET/r1 -o NEW --robot r1 --columns columns.toml` one (docs/your_data.md)"
-    )
 
 
 def _landmark(text: str) -> int:

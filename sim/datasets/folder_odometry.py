@@ -31,8 +31,12 @@ JUMP_NS = 86_400 * 10**9
 """Longest step between rows without a clock jump."""
 PACE = "most rows of its odometry are"
 """Prefix of the note on times in other units."""
-WHIRLING_RAD_S = 2.0 * np.pi
-"""Median yaw rate [rad/s] above which radians are improbable."""
+WHIRLING_RAD_S = 10.0
+"""Yaw rate [rad/s] above which radians are improbable. Ground robots turn by 1 to 5 rad/s at most;
+in degrees even a slow turn of 10 °/s exceeds it.
+"""
+LEAST_WHIRLS, WHIRLS = 2, 0.01
+"""Number and share of the stretches of 1 s in which a robot must turn faster than that."""
 SHORTEST_S, LONGEST_S = 1e-4, 5.0
 """Plausible median odometry interval in seconds."""
 IMPOSSIBLE_S = 60.0
@@ -246,16 +250,18 @@ def _judge_speeds(
         speed, rate = np.abs(steps).T
     else:
         speed, rate = np.hypot(*steps[:, :2].T) / seconds, np.abs(steps[:, 2]) / seconds
-    turning = rate[rate > 0.0]
     turn = next(column for column in form if column.endswith(("rad", "rad_s")))
-    if len(turning) > 1 and np.median(turning) > WHIRLING_RAD_S:
-        raise rows.table.fault(
-            f"it turns by {np.median(turning):.1f} rad/s most of the time, which no robot does: "
-            f"{rows.table.conversion(turn, 'degrees', DEGREE)}"
+    first = 1 if form == POSES else 0
+    usual_most = _usual_maximum(rate, seconds)
+    if usual_most > WHIRLING_RAD_S:
+        raise rows.table.error(
+            first + int((rate > WHIRLING_RAD_S).argmax()),
+            turn,
+            f"it turns by {usual_most:.1f} rad/s and more, which no robot does: "
+            f"{rows.table.conversion(turn, 'degrees', DEGREE)}",
         )
     bounds = Bounds()
     fast = (speed > bounds.speed_m_s) | (rate > bounds.yaw_rate_rad_s)
-    first = 1 if form == POSES else 0
     too_fast = np.zeros(len(rows.table), np.bool_)
     too_fast[first : first + len(fast)] = fast
     rows.note(
@@ -263,6 +269,17 @@ def _judge_speeds(
         f"beyond {bounds.speed_m_s:g} m/s or {bounds.yaw_rate_rad_s:g} rad/s, which a robot "
         "refuses: metres, radians and seconds are meant",
     )
+
+
+def _usual_maximum(rate: Float[np.ndarray, " N"], seconds: Float[np.ndarray, " N"]) -> float:
+    """Mean yaw rate [rad/s] that LEAST_WHIRLS and a share WHIRLS of stretches of 1 s reach, which
+    single wrong rows and jittering stamps do not raise. NaN rates, of another form, count as 0.
+    """
+    ends = np.append(0.0, np.cumsum(seconds))
+    edges = np.linspace(0.0, ends[-1], 1 + max(1, min(int(ends[-1]), len(rate))))
+    turned = np.append(0.0, np.cumsum(np.nan_to_num(rate) * seconds))
+    means = np.sort(np.diff(np.interp(edges, ends, turned)) / edges[1])
+    return float(means[-min(max(LEAST_WHIRLS, int(WHIRLS * len(means))), len(means))])
 
 
 def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:

@@ -173,6 +173,29 @@ def test_what_is_hardly_meant_is_noted(tmp_path):
     assert "r3: neither odometry.csv nor observations.csv in it: left out" in said
 
 
+def test_a_turn_in_degrees_of_a_robot_that_mostly_drives_straight_is_refused(tmp_path):
+    """In 100 s it turns for 4 s at 0.5 rad/s. Wrong rows of a jittering clock are no turn."""
+
+    def odometry(scale: float, *others: str) -> str:
+        rows = [
+            f"{k / 10},1,{0.5 * scale if 300 <= k < 340 else 0.001 * scale}" for k in range(1000)
+        ]
+        return "\n".join([SPEEDS.splitlines()[0], *rows, *others]) + "\n"
+
+    with pytest.raises(DatasetError) as refused:
+        only(data_set(tmp_path / "w", odometry=odometry(180 / np.pi)))
+    words = "r1/odometry.csv, line 302, column yaw_rate_rad_s: it turns by 28.6 rad/s and more"
+    assert words in str(refused.value)
+    assert "to convert from degrees, add a column map" in str(refused.value)
+    (tmp_path / "w" / "r1").rename(tmp_path / "w" / "bert")
+    with pytest.raises(DatasetError, match="import SET/bert -o NEW --robot bert --columns"):
+        read(tmp_path / "w", "bert")
+    wrong = "100.001,1,90", "100.002,1,90", "100.003,0,0"
+    assert (
+        len(only(data_set(tmp_path / "r", odometry=odometry(1, *wrong))).intervals.end_ns) == 1002
+    )
+
+
 def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
     seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
     stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
