@@ -24,6 +24,7 @@ SEAM_DOF = 3.0
 
 Pose = Float[np.ndarray, "3"]
 REMEDY = "leave the robot on the ground, or restart its process where it is put down"
+START_REMEDY = "correct its initial pose by that, or remove it: a robot is joined without one"
 
 
 def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from teamslam.central.carried_off import REMEDY, cuts_of
+from teamslam.central.carried_off import REMEDY, START_REMEDY, cuts_of
 from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
@@ -134,7 +134,7 @@ def diagnose(
                 value=each.value,
                 sigma=each.sigma,
                 evidence=each.evidence / each.dof,
-                remedy=_REMEDIES[each.cause],
+                remedy=START_REMEDY if _is_start(each) else _REMEDIES[each.cause],
                 at_ns=each.at_ns,
             )
             for each in accepted
@@ -146,6 +146,11 @@ def diagnose(
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)
+
+
+def _is_start(found: Hypothesis | m.Diagnosis) -> bool:
+    """Whether a jump is an error of an initial pose: it has no time."""
+    return found.cause == CARRIED_OFF and not found.at_ns
 
 
 def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
@@ -358,7 +363,10 @@ def _statement(found: m.Diagnosis) -> str:
             if not value:
                 return f"{text}, to an unknown place; its later submaps are a map of their own"
             dx, dy, turn = value
-            return f"{text} by ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
+            by = f"by ({dx:+.1f}, {dy:+.1f}) m and {math.degrees(turn):+.0f}°"
+            if _is_start(found):
+                return f"{found.robot}'s initial pose is wrong: the map puts the start off it {by}"
+            return f"{text} {by}"
         case "mirrored":
             return f"{found.robot}'s bearings have the wrong sign"
         case "wrong_minimum":

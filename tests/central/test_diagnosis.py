@@ -74,6 +74,28 @@ def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
 
 
+def test_a_wrong_initial_pose_is_named_with_its_error(tmp_path):
+    folder = write(TEAM, tmp_path)
+    start = folder / "r2" / "start.csv"
+    head, row = start.read_text("utf-8").split()
+    x, y, a = map(float, row.split(","))
+    start.write_text(f"{head}\n{x - 3.0},{y + 2.0},{a - 0.7}\n", "utf-8")
+    found, *_ = diagnosed(final_only(scenario_in(folder)))
+    assert (found.cause, found.robot) == ("carried_off", "r2")
+    assert found.value == pytest.approx((3.0, -2.0, 0.7), abs=0.2)
+    assert describe(found).startswith("r2's initial pose is wrong: ")
+    assert found.remedy.startswith("correct its initial pose")
+    assert "at_s" not in to_object(found)
+
+
+def test_a_robot_carried_off_in_its_first_window_has_a_right_initial_pose(tmp_path):
+    off = CarriedOff("r2", 4.0, 0.6, 6.0)
+    found, *_ = diagnosed(scenario(replace(TEAM, carried_off=(off,)), tmp_path))
+    assert (found.cause, found.robot) == ("carried_off", "r2")
+    assert 0 < found.at_ns <= 10_000_000_000
+    assert describe(found).startswith("r2 was carried off or slipped at ")
+
+
 def test_a_robot_that_was_carried_off_twice_is_named_with_both_times(tmp_path):
     off = CarriedOff("r2", 5.0, 0.7, 40.0), CarriedOff("r2", 5.0, 0.7, 70.0)
     found = diagnosed(scenario(replace(TEAM, carried_off=off), tmp_path))

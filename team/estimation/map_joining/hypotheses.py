@@ -25,6 +25,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import is_map
 from teamslam.team.estimation.map_joining.gauss_newton import (
     LANDMARK_GATE,
     Island,
@@ -33,6 +34,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 )
 from teamslam.team.estimation.map_joining.marginals import scale_of, terms
 from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
+from teamslam.team.estimation.map_joining.submap_graph import Graph
 from teamslam.team.estimation.se2 import compose, inverse, wrapped
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64
@@ -97,7 +99,8 @@ class Sights(NamedTuple):
 class Hypothesis(NamedTuple):
     """A cause: the solved graph, the cost that it removes, and its degrees of freedom.
 
-    robots: those that observe the less frequent place, or jump.
+    robots: those that observe the less frequent place, or jump. at_ns: of a jump at a stream's
+    start 0: its initial pose is wrong by `value`.
     """
 
     cause: SplitCause
@@ -342,7 +345,8 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the hypotheses of a jump beside a submap that disagrees with the rest.
 
-    A jump removes no more cost than leaving out the submap, which is solved first.
+    A jump removes no more cost than leaving out the submap, which is solved first. Before a first
+    submap it is an error of the initial pose.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -365,7 +369,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         if dropped is None or base.cost - dropped[1] > base.scale * (level + 2.0 * POSE):
             at_end = split(island, end, {at}, compose(begin, own.end_pose))
             trials.append((resolved(at_end), stamp, POSE))
-            if before:
+            if before or _is_known_start(graph, at):
                 trials.append((resolved(split(island, start, {at}, back)), before, POSE))
         for k, (found, when, dof) in enumerate(trials):
             if found is None:
@@ -388,6 +392,14 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
                 dof,
                 solved,
             )
+
+
+def _is_known_start(graph: Graph, place: int) -> bool:
+    """Whether a robot's submap begins at an initial pose, exact or with a covariance."""
+    start = int(graph.submaps[place].nodes[0])
+    if is_map(graph.submaps[place].contribution.stream):
+        return False
+    return bool(graph.fixed[start]) or any(each.nodes == (start,) for each in graph.priors)
 
 
 def _motion_beyond(

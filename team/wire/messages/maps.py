@@ -138,7 +138,8 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """A cause of misfit: of a robot, of a landmark, or of the team (neither).
 
     value, sigma: (dx, dy) [m] of a landmark's second place from its first; (dx, dy, dtheta) of a
-    robot that was carried off; else one number or none. evidence: removed cost per degree of
+    robot that was carried off, with at_ns 0 of its true from its initial pose; else one number or
+    none. evidence: removed cost per degree of
     freedom, or the log-likelihood ratio of a view that changed at once. at_ns: team time of the
     change; 0: none. place: (x, y) [m] of it, if known.
     """
