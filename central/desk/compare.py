@@ -17,7 +17,7 @@ from teamslam.central.desk.drawing import (
 )
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult, figure
 from teamslam.central.desk.names import OUTSIDE, in_order
-from teamslam.central.desk.pictures.run import new_figure, set_up_map
+from teamslam.central.desk.pictures.run import in_the_maps_frame, new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
 from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable, format_figure
 
@@ -86,8 +86,12 @@ def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
     at = range(len(names))
     axes[0].bar(at, [(e and e.aligned_rmse_m) or 0.0 for e in errors], color=GREY)
     axes[0].set_title("landmark RMSE, aligned [m]", fontsize=10)
-    axes[1].plot(at, [e.nees_per_dof if e else np.nan for e in errors], "o", color=GREY)
-    for k, error in enumerate(errors):
+    placed = [
+        None if run.arbitrary_frame else error
+        for run, error in zip(runs.values(), errors, strict=True)
+    ]
+    axes[1].plot(at, [e.nees_per_dof if e else np.nan for e in placed], "o", color=GREY)
+    for k, error in enumerate(placed):
         if error is not None:
             axes[1].plot([k, k], error.band, color=GREY, linewidth=6.0, alpha=0.25)
     axes[1].axhline(1.0, color=GREY, linewidth=0.7)
@@ -127,11 +131,15 @@ def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
 
 
 def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw two final maps with 95 % ellipses over the truth; False without a map."""
+    """Draw two final maps with 95 % ellipses over the truth; False without a map.
+
+    In an arbitrary frame the truth is aligned with the first map.
+    """
     if all(run.map is None for run in runs.values()):
         return False
     figure, ((axis,),) = new_figure(9.0, 9.0, 1, 1)
-    truth = next(iter(runs.values())).true_landmarks
+    first = next(run for run in runs.values() if run.map is not None)
+    truth = in_the_maps_frame(first).true_landmarks
     if len(truth):
         axis.plot(*truth.T, "x", color=TRUTH_COLOUR, markersize=8, label="true landmarks")
     for (name, run), (colour, marker) in zip(runs.items(), MAP_STYLES, strict=True):

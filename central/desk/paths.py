@@ -23,7 +23,7 @@ from teamslam.team.wire.arrays import floats, stamps
 
 @dataclass(frozen=True)
 class SmoothedPath:
-    """Poses (x [m], y [m], theta [rad]) in the final map by stamp, with covariances.
+    """Poses (x [m], y [m], theta [rad]) in the final map by ascending stamp, with covariances.
 
     at_keyframes: includes poses between submap ends.
     """
@@ -91,7 +91,12 @@ def _between_ends(
 
 
 def _join_parts(parts: list[SmoothedPath]) -> SmoothedPath:
+    """Join the parts by strictly ascending stamp.
+
+    A window's end, which the final map has, precedes a keyframe of the next window at that stamp.
+    """
     arrays = zip(*((part.stamps_ns, part.poses, part.covariances) for part in parts), strict=True)
     stamps, poses, covariances = map(np.concatenate, arrays)
+    stamps, first = np.unique(stamps, return_index=True)
     dense = all(part.at_keyframes for part in parts)
-    return SmoothedPath(stamps, poses, covariances, at_keyframes=dense)
+    return SmoothedPath(stamps, poses[first], covariances[first], at_keyframes=dense)

@@ -42,6 +42,12 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
     return with_options(Scenario(name="small", team="small", world=world, robots=names), seed=seed)
 
 
+def without_starts(of: Scenario) -> Scenario:
+    """The scenario with no known initial pose, so that the map's frame is arbitrary."""
+    world = msgspec.structs.replace(of.world, unknown_starts=("*",))
+    return msgspec.structs.replace(of, world=world)
+
+
 def streams(of: Scenario) -> WorldStreams:
     return simulate(of.world, of.robots, of.seed)
 

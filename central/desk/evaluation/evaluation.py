@@ -89,7 +89,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     truth_from_map = _motion(logs.values()) if arbitrary else np.zeros(3)
     fused = None
     if message is not None:
-        fused = map_result(log, message, true, label_of, truth_from_map)
+        fused = map_result(log, message, true, label_of, truth_from_map, arbitrary=arbitrary)
     motion = _team_motion(fused, logs.values())
     robots = {
         robot: _robot_result(
@@ -406,6 +406,8 @@ def map_result(
     true: TrueLandmarks,
     label_of: Mapping[int, int],
     truth_from_map: Float[np.ndarray, "3"] | None,
+    *,
+    arbitrary: bool,
 ) -> MapResult:
     """Evaluate the final map.
 
@@ -434,7 +436,9 @@ def map_result(
         errors=errors,
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
-        diagnosis=tuple(each for each in message.diagnosis if not _is_refuted(each, errors)),
+        diagnosis=tuple(
+            each for each in message.diagnosis if not _is_refuted(each, errors, arbitrary=arbitrary)
+        ),
         joined=message.joined,
         withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
@@ -445,9 +449,13 @@ def map_result(
     )
 
 
-def _is_refuted(found: m.Diagnosis, errors: MapErrors | None) -> bool:
-    is_small = found.cause == "noise_overestimated"
-    return is_small and errors is not None and errors.nees_per_dof > 1.0
+def _is_refuted(found: m.Diagnosis, errors: MapErrors | None, *, arbitrary: bool) -> bool:
+    """Whether the errors are larger than a cause allows; in an arbitrary frame those of shape."""
+    if found.cause != "noise_overestimated" or errors is None:
+        return False
+    if not arbitrary:
+        return errors.nees_per_dof > 1.0
+    return errors.shape is not None and errors.shape.nees_per_landmark > 2.0
 
 
 def _match_unnamed(

@@ -98,6 +98,14 @@ _ROBOT = {
     "uplink_bytes": "uplink_bytes",
     "uplink_bytes_per_step": "uplink_bytes_per_step",
 }
+IN_THE_FRAME = frozenset({
+    "landmark_rmse_m", "map_nees_per_dof", "map_nees_band", "map_nees_in_band",
+    "landmark_coverage_95", "position_rmse_m", "heading_rmse_rad", "pose_nees_per_dof",
+    "pose_coverage_95", "final_pose_nees_per_dof", "online_position_rmse_m",
+    "online_heading_rmse_rad", "online_pose_nees_per_dof", "online_pose_coverage_95",
+    "own_map_rmse_m", "own_map_nees_per_dof", "own_map_nees_in_band",
+})  # fmt: skip
+"""Unaligned figures, meaningless in an arbitrary frame."""
 _SCORES = {each: each for each in ("precision", "recall", "f1", "wrong_percent")}
 _ASSOCIATION = {
     each: each
@@ -112,15 +120,16 @@ _ASSOCIATION = {
 }  # fmt: skip
 
 
-def _named(of: object, paths: Mapping[str, str]) -> dict[str, Any]:
-    found = {name: figure(of, path) for name, path in paths.items()}
+def _named(of: object, paths: Mapping[str, str], *, arbitrary: bool = False) -> dict[str, Any]:
+    absent = IN_THE_FRAME if arbitrary else frozenset()
+    found = {name: None if name in absent else figure(of, path) for name, path in paths.items()}
     return {name: list(of) if isinstance(of, tuple) else of for name, of in found.items()}
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Collect the figures under their JSON names; `extra` replaces or adds some."""
     fused, association = evaluation.map, evaluation.association
-    states = evaluation.states
+    states, arbitrary = evaluation.states, evaluation.arbitrary_frame
     of_map: dict[str, Any] = {
         "landmarks": None,
         "landmark_matching": None,
@@ -141,7 +150,7 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
             "changes": [change_json(each) for each in fused.changes],
         }
     return {
-        **_named(evaluation, _TEAM),
+        **_named(evaluation, _TEAM, arbitrary=arbitrary),
         **of_map,
         "data_set": evaluation.data_set or None,
         "diagnosis": [to_object(each) for each in evaluation.diagnosis],
@@ -150,7 +159,8 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
         "warnings": _warning_objects(evaluation.other_warnings),
         "robot_states": {name: of._asdict() for name, of in states.items()},
         "robots": {
-            name: _named(robot, _ROBOT) | {"online_in_team_frame": not robot.outside}
+            name: _named(robot, _ROBOT, arbitrary=arbitrary)
+            | {"online_in_team_frame": not robot.outside}
             for name, robot in evaluation.robots.items()
         },
         "peers": {name: asdict(peer) for name, peer in evaluation.peers.items()},

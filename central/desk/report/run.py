@@ -57,6 +57,7 @@ def run_figures(run: Run) -> dict[str, Any]:
     """Figures that a report adds to an evaluation."""
     history, ledger = run.history, run.ledger
     span_s = (history.end_ns - history.start_ns) * 1e-9
+    unplaced = {"ape_m": None, "ape_rad": None} if run.evaluation.arbitrary_frame else {}
     return {
         "team_time_s": span_s,
         "nis_per_dof": {robot: of.per_dof for robot, of in history.innovations.items()},
@@ -73,7 +74,7 @@ def run_figures(run: Run) -> dict[str, Any]:
             for key, traffic in run.evaluation.channels.items()
         },
         "trajectories": {
-            robot: {kind: asdict(errors) for kind, errors in of.items()}
+            robot: {kind: asdict(errors) | unplaced for kind, errors in of.items()}
             for robot, of in run.trajectories().items()
         },
         "events": [

@@ -21,7 +21,7 @@ from teamslam.central.desk.evaluation.errors import (
     pose_errors,
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.evaluation.results import Evaluation
+from teamslam.central.desk.evaluation.results import Evaluation, figure
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
@@ -64,7 +64,7 @@ class BatchReference:
 
     cost = Σ‖r‖²; initial_cost: at the best start. gradient_norm: of the cost; newton_decrement:
     √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases: (bearing [rad],
-    range offset [m], range scale) by robot. team: the run's own final map.
+    range offset [m], range scale) by robot. team: the run's own final map. arbitrary: the frame is.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -83,14 +83,18 @@ class BatchReference:
     noise: NoiseKind
     biases: Mapping[str, tuple[float, float, float]]
     team: MapErrors | None
+    arbitrary: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Figures under the names of the JSON output."""
+        position_m = {} if self.arbitrary else self.position_rmse_m
+        pose_nees = {} if self.arbitrary else self.final_pose_nees_per_dof
         return {
             "noise": self.noise,
             "landmarks": len(self.ids),
-            **_map_figures(self.errors),
-            "team": _map_figures(self.team),
+            "frame_is_arbitrary": self.arbitrary,
+            **_map_figures(self.errors, arbitrary=self.arbitrary),
+            "team": _map_figures(self.team, arbitrary=self.arbitrary),
             "cost": self.cost,
             "initial_cost": self.initial_cost,
             "gradient_norm": self.gradient_norm,
@@ -98,8 +102,8 @@ class BatchReference:
             "robots": {
                 robot: {
                     "poses": len(path.stamps_ns),
-                    "position_rmse_m": self.position_rmse_m.get(robot),
-                    "final_pose_nees_per_dof": self.final_pose_nees_per_dof.get(robot),
+                    "position_rmse_m": position_m.get(robot),
+                    "final_pose_nees_per_dof": pose_nees.get(robot),
                     "bearing_bias_rad": self.biases.get(robot, NO_BIASES)[0],
                     "range_offset_bias_m": self.biases.get(robot, NO_BIASES)[1],
                     "range_scale_bias": self.biases.get(robot, NO_BIASES)[2],
@@ -111,15 +115,15 @@ class BatchReference:
         }
 
 
-def _map_figures(errors: MapErrors | None) -> dict[str, Any]:
-    shape = None if errors is None else errors.shape
+def _map_figures(errors: MapErrors | None, *, arbitrary: bool) -> dict[str, Any]:
+    placed = None if arbitrary else errors
     return {
-        "landmark_rmse_m": None if errors is None else errors.rmse_m,
-        "landmark_rmse_aligned_m": None if errors is None else errors.aligned_rmse_m,
-        "map_nees_per_dof": None if errors is None else errors.nees_per_dof,
-        "map_nees_in_band": None if errors is None else errors.in_band,
-        "shape_nees_per_landmark": None if shape is None else shape.nees_per_landmark,
-        "coverage": None if errors is None else errors.coverage,
+        "landmark_rmse_m": figure(placed, "rmse_m"),
+        "landmark_rmse_aligned_m": figure(errors, "aligned_rmse_m"),
+        "map_nees_per_dof": figure(placed, "nees_per_dof"),
+        "map_nees_in_band": figure(placed, "in_band"),
+        "shape_nees_per_landmark": figure(errors, "shape.nees_per_landmark"),
+        "coverage": figure(placed, "coverage"),
     }
 
 
@@ -295,5 +299,6 @@ def _reference_figures(
         final_pose_nees_per_dof=nees,
         biases=biases,
         team=run.map.errors,
+        arbitrary=run.arbitrary_frame,
         **figures,
     )

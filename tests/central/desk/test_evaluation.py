@@ -20,7 +20,7 @@ from teamslam.central.desk.report.tables import team_rows
 from teamslam.team.translate import joint_bytes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
@@ -32,6 +32,7 @@ from tests.sim.logs import (
     scenario,
     streams,
     trajectory,
+    without_starts,
     world_log,
 )
 
@@ -146,6 +147,42 @@ def test_covariances_are_not_called_too_large_where_the_errors_are_larger(shift,
         log.append(msgspec.structs.replace(sample, payload=payload))
     run = evaluate(log)
     assert run.map.diagnosis == ((too_large,) if is_shown else ())
+
+
+@pytest.mark.parametrize(("stretch", "is_shown"), [(1.0, True), (1.5, False)])
+def test_in_an_arbitrary_frame_the_shape_alone_refutes_too_large_covariances(stretch, is_shown):
+    """The truth lies elsewhere: its distance from the map is no error of it."""
+    too_large = m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,))
+    log = []
+    for sample in joined_log(without_starts(scenario(robots=2)), 3.0):
+        payload = sample.payload
+        if sample.key == ch.FINAL_MAP.key():
+            final = decoded(payload, m.FusedMap)
+            means = floats(final.means, "means") * stretch
+            changed = msgspec.structs.replace(
+                final, diagnosis=(too_large,), means=from_floats(means)
+            )
+            payload = encoded(changed)
+        log.append(msgspec.structs.replace(sample, payload=payload))
+    run = evaluate(log)
+    assert run.arbitrary_frame
+    assert run.map.errors.nees_per_dof > 100.0
+    assert run.map.diagnosis == ((too_large,) if is_shown else ())
+
+
+def test_the_json_has_no_unaligned_figure_of_an_arbitrary_frame():
+    of = scenario(robots=2)
+    known = to_json(evaluate(joined_log(of, 0.3)))
+    figures = to_json(evaluate(joined_log(without_starts(of), 0.3)))
+    assert figures["landmark_rmse_aligned_m"] == known["landmark_rmse_aligned_m"]
+    assert figures["shape_nees_per_landmark"] == known["shape_nees_per_landmark"]
+    for name in ("landmark_rmse_m", "map_nees_per_dof", "map_nees_in_band", "landmark_coverage_95"):
+        assert known[name] is not None
+        assert figures[name] is None
+    for name in ("position_rmse_m", "heading_rmse_rad", "pose_nees_per_dof", "pose_coverage_95"):
+        assert known["robots"]["r1"][name] is not None
+        assert figures["robots"]["r1"][name] is None
+    assert figures["robots"]["r1"]["position_rmse_aligned_m"] is not None
 
 
 @pytest.mark.parametrize(

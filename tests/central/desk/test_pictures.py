@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +9,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from PIL import Image
 
-from teamslam.central.desk.compare import compare_rows
+from teamslam.central.desk.compare import compare_rows, draw_maps
 from teamslam.central.desk.drawing import (
     ELLIPSE_SCALE,
     curve_through,
@@ -36,7 +35,7 @@ from teamslam.central.desk.report.tables import team_rows
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded
-from tests.sim.logs import joined_log, scenario
+from tests.sim.logs import joined_log, scenario, without_starts
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -144,9 +143,7 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
 
 def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):
     of = scenario(robots=2)
-    world = msgspec.structs.replace(of.world, unknown_starts=("*",))
-    log = joined_log(msgspec.structs.replace(of, world=world), 0.1)
-    run = evaluate(log)
+    run = evaluate(joined_log(without_starts(of), 0.1))
     assert run.arbitrary_frame
     assert not evaluate(joined_log(of, 0.1)).arbitrary_frame
     told = dict(team_rows(run))
@@ -156,6 +153,24 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):
     assert not error_picture(run, tmp_path / "errors.png")
     assert map_picture(run, tmp_path / "map.png")
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
+
+
+def test_compared_maps_in_an_arbitrary_frame_lie_over_the_aligned_truth(tmp_path, monkeypatch):
+    """The maps are off by a pure translation of 3 m on each axis."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(
+        "teamslam.central.desk.compare.save", lambda figure, _: drawn.append(figure)
+    )
+    of = scenario(robots=2)
+    for each in (of, without_starts(of)):
+        run = evaluate(joined_log(each, 3.0))
+        assert draw_maps({"recorded": run, "recomputed": run}, tmp_path / "maps.png")
+    known, arbitrary = (
+        next(x for x in figure.axes[0].lines if x.get_label() == "true landmarks").get_xydata()
+        for figure in drawn
+    )
+    np.testing.assert_allclose(known, run.map.means - [3.0, -3.0])
+    np.testing.assert_allclose(arbitrary, run.map.means)
 
 
 @pytest.mark.parametrize(("width_in", "inches"), [(None, 3.5), (2.5, 2.5)])

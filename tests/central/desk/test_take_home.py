@@ -1,9 +1,11 @@
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from teamslam.central.desk import paths
 from teamslam.central.desk.evaluation.errors import Path as Poses
 from teamslam.central.desk.evaluation.errors import pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -14,10 +16,11 @@ from teamslam.central.desk.export.take_home import (
     write_map,
     write_paths,
 )
-from teamslam.central.desk.paths import smoothed_paths
+from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team.datum import Datum
+from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.wire.bus import Sample
 from tests.sim.logs import scenario, streams
@@ -47,6 +50,35 @@ def test_a_path_has_every_keyframe_and_the_final_maps_ends(log):
         assert (np.diff(path.stamps_ns) > 0).all()
         at_ends = np.searchsorted(path.stamps_ns, ends.stamps_ns)
         np.testing.assert_array_equal(path.poses[at_ends], ends.poses)
+
+
+def test_a_keyframe_at_a_windows_start_is_not_a_second_pose_of_that_stamp(log, monkeypatch):
+    """A window that ends with a scan leaves it to the next one, whose first keyframe it is."""
+
+    def windows(*of) -> dict[int, ClosedWindow]:
+        return {
+            end_ns: replace(closed, keyframes_ns=(closed.start_ns, *closed.keyframes_ns[1:]))
+            for end_ns, closed in computed(*of).items()
+            if closed.keyframes_ns
+        }
+
+    computed = paths._windows
+    monkeypatch.setattr(paths, "_windows", windows)
+    for path in smoothed_paths(recorded_of(log)).values():
+        assert path.at_keyframes
+        assert (np.diff(path.stamps_ns) > 0).all()
+
+
+def test_parts_that_meet_have_one_pose_there(log):
+    path = smoothed_paths(recorded_of(log))["r1"]
+    middle = len(path.stamps_ns) // 2
+    parts = [
+        SmoothedPath(path.stamps_ns[of], path.poses[of], path.covariances[of], at_keyframes=True)
+        for of in (slice(0, middle + 1), slice(middle, None))
+    ]
+    joined = paths._join_parts(parts)
+    np.testing.assert_array_equal(joined.stamps_ns, path.stamps_ns)
+    np.testing.assert_array_equal(joined.poses, path.poses)
 
 
 def test_between_the_ends_the_covariance_is_that_of_the_errors(log):
