@@ -27,27 +27,45 @@ async def done(team: Processes, name: str, command: Sequence[object]) -> str:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    """The wheel, built from a copy without network, and without the core, as already built."""
+def source(tmp_path_factory):
+    """A copy of the sources."""
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     for package in (*FOLDERS, "teamslam"):
         leave = shutil.ignore_patterns("__pycache__", "*.so")
         shutil.copytree(ROOT / package, source / package, ignore=leave, symlinks=True)
+    return source
+
+
+def build_wheel(source: Path, levels: str) -> subprocess.CompletedProcess[str]:
+    """Build the wheel into `dist`, without network."""
     build = [
         *PIP,
         "wheel",
         *OFFLINE,
         "--no-build-isolation",
-        "--config-settings=cmake.define.TEAMSLAM_LEVELS=",
+        f"--config-settings=cmake.define.TEAMSLAM_LEVELS={levels}",
         "--wheel-dir",
         source / "dist",
         source,
     ]
-    subprocess.run(build, check=True, capture_output=True, timeout=600)
+    return subprocess.run(build, capture_output=True, text=True, timeout=600, check=False)
+
+
+@pytest.fixture(scope="module")
+def wheel(source):
+    """The wheel without the core, as already built."""
+    ended = build_wheel(source, levels="")
+    assert ended.returncode == 0, ended.stderr
     (built,) = (source / "dist").glob("*.whl")
     return built
+
+
+def test_an_unknown_level_of_the_core_ends_the_build(source):
+    ended = build_wheel(source, levels="base;avx9")
+    assert ended.returncode != 0
+    assert "has no level avx9; choose of base" in " ".join((ended.stdout + ended.stderr).split())
 
 
 def test_the_wheel_holds_one_package_and_nothing_else(wheel):

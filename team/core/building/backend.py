@@ -40,6 +40,8 @@ Building the core needs a C++20 compiler (g++ 11, clang 14 or newer), and none i
 Install one (Debian and Ubuntu: apt install g++; Fedora: dnf install gcc-c++), name one by CXX, or
 install that of a wheel (pip install ziglang), which takes about four minutes, once.\
 """
+LEVELS = "cmake.define.TEAMSLAM_LEVELS"
+"""The setting that names the levels of a wheel or an editable install."""
 Settings = dict[str, str | list[str]] | None
 
 
@@ -102,6 +104,26 @@ def own_level() -> str:
     except OSError:
         flags = ""
     return "avx2" if "avx2" in flags.split() else "base"
+
+
+def known_levels() -> tuple[str, ...]:
+    """Levels that CMakeLists.txt has for this kind of processor."""
+    return ("base", "avx2") if platform.machine() in ("x86_64", "AMD64") else ("base",)
+
+
+def chosen_levels(settings: Settings) -> list[str] | None:
+    """Levels that the settings name, `own` resolved; None: all. An unknown one ends the build."""
+    named = (settings or {}).get(LEVELS)
+    if named is None:
+        return None
+    names = [name for name in (named.split(";") if isinstance(named, str) else named) if name]
+    if unknown := [name for name in names if name not in (*known_levels(), "own")]:
+        known = ", ".join(known_levels())
+        sys.exit(
+            f"{LEVELS}: {platform.machine()} has no level {', '.join(unknown)}; choose of {known},"
+            f" or own: that of this machine ({own_level()})"
+        )
+    return [own_level() if name == "own" else name for name in names]
 
 
 def build_in_place(*, checked: bool = False, own: bool = False) -> None:
@@ -179,10 +201,12 @@ get_requires_for_build_editable = get_requires_for_build_wheel
 def build_wheel(
     directory: str, config_settings: Settings = None, metadata_directory: str | None = None
 ) -> str:
-    """Build the wheel."""
+    """Build the wheel, with all levels of the core or those that the settings name."""
     from scikit_build_core import build
 
     settings = dict(config_settings or {})
+    if (levels := chosen_levels(config_settings)) is not None:
+        settings[LEVELS] = ";".join(levels)
     for option in compiler_options():
         name, _, value = option.removeprefix("-D").partition("=")
         settings[f"cmake.define.{name}"] = value
@@ -198,7 +222,7 @@ def build_editable(
     """
     from scikit_build_core import build
 
-    build_in_place(own=(config_settings or {}).get("cmake.define.TEAMSLAM_LEVELS") == "own")
+    build_in_place(own=chosen_levels(config_settings) == [own_level()])
     link = ROOT / "build" / "editable" / "teamslam"
     if not link.is_symlink():
         link.parent.mkdir(parents=True, exist_ok=True)
