@@ -72,7 +72,7 @@ bench: $(VENV)/.dev $(VENV)/.core
 PICTURES := docs/generated
 RUNS := run hidden peers
 docs: $(VENV)/.dev $(VENV)/.core $(RUNS:%=$(PICTURES)/%/report.html) $(PICTURES)/without/maps.png $(PICTURES)/team.gif $(PICTURES)/fastslam.png $(PICTURES)/join_two_maps.png \
-  $(PICTURES)/benchmarks.png
+  $(PICTURES)/benchmarks.png $(PICTURES)/terminal.png
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -b html docs docs/_build/site
 	@echo "docs/_build/site/index.html"
 
@@ -80,10 +80,13 @@ $(PICTURES)/hidden/report.html: OPTIONS := --identities hidden
 $(PICTURES)/peers/report.html: OPTIONS := --without-centre
 $(PICTURES)/%/report.html: | $(VENV)/.dev
 	rm -rf $(@D)
-	$(BIN)/teamslam launch waypoints --speed max $(OPTIONS) --output $(@D)
+	COLUMNS=80 $(BIN)/teamslam launch waypoints --speed max $(OPTIONS) --output $(@D) > $(@D).txt
 
 $(PICTURES)/without/maps.png: $(PICTURES)/run/report.html
 	$(BIN)/teamslam rerun $(<D) --without r3 --output $(@D)
+
+$(PICTURES)/terminal.png: docs/terminal.py $(PICTURES)/run/report.html
+	$(BIN)/python $< $(PICTURES)/run.txt $@
 
 # README shows a copy: docs/team.gif.
 $(PICTURES)/team.gif: $(PICTURES)/run/report.html
