@@ -225,6 +225,8 @@ def calibrate(
 
     if output is not None and output.suffix != ".toml":
         fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)  # fails before minutes of computation
     read: list[tuple[str, WorldStreams, Scenario]] = []
     own = scenario
     for path in source:

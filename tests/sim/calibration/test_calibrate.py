@@ -285,3 +285,12 @@ def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path
     result = CliRunner().invoke(app, ["calibrate", "a.zip", "-o", str(tmp_path / "a.json")])
     assert result.exit_code == 2
     assert "ends in .toml" in result.output
+
+
+def test_an_output_in_a_folder_that_can_not_be_made_is_refused_before_the_data_is_read(tmp_path):
+    (tmp_path / "file").touch()
+    for folder, reads in (("file", False), ("new/folder", True)):
+        output = str(tmp_path / folder / "mine.toml")
+        result = CliRunner().invoke(app, ["calibrate", str(tmp_path / "none"), "-o", output])
+        assert result.exit_code != 0
+        assert ("reading" in result.output) == reads
