@@ -43,6 +43,13 @@ LEAST_BELOW, MOST_BELOW = 2, 0.1
 MOST_RAD = 2.0 * np.pi + 1e-3
 """Largest bearing that can be in radians."""
 
+CHORD_M, LEAST_CHORDS = 0.2, 20
+"""Length of a path's chords [m], and the least number that shows the unit of its headings."""
+FOLLOWS, DIFFERS = 0.9, 0.5
+"""Concentration of headings about the motion in the right unit, at least, and in the wrong one, at
+most.
+"""
+
 
 class Rows:
     """Ordered rows of a table, and notes on omitted ones."""
@@ -281,7 +288,41 @@ def truth_of(
     rows = Rows(table, "true pose")
     if driven is not None:
         _check_clock(rows, driven)
-    return rows.stamps_ns, rows.table.numbers(*POSES), rows.notes
+    poses = rows.table.numbers(*POSES)
+    if _are_degrees(poses):
+        row = int((np.abs(poses[:, 2]) > MOST_RAD).argmax())
+        raise rows.table.error(
+            row,
+            "theta_rad",
+            f"{poses[row, 2]:g}: the headings follow the path's direction as degrees, and must be "
+            f"in radians: {rows.table.conversion('theta_rad', 'degrees', DEGREE)}",
+        )
+    return rows.stamps_ns, poses, rows.notes
+
+
+def _are_degrees(poses: Float[np.ndarray, "N 3"]) -> bool:
+    """Whether headings θ follow the directions δ of the path's chords in degrees, not in radians.
+
+    Concentration: |mean of exp(2i(δ − θ))|, 1 for a robot that drives forward or backward, at any
+    constant offset. Degrees must explain twice as much as θ = 0, which small angles are: a robot
+    that spins along a straight path does not follow it. Radians may exceed a whole turn.
+    """
+    if len(poses) < LEAST_CHORDS:
+        return False
+    lengths = np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))
+    ends = np.flatnonzero(np.diff(np.append(0.0, lengths) // CHORD_M, prepend=-1.0))
+    dx, dy = np.diff(poses[ends, :2], axis=0).T
+    straight = np.hypot(dx, dy) > 0.5 * CHORD_M
+    if np.count_nonzero(straight) < LEAST_CHORDS:
+        return False
+    directions = np.arctan2(dy, dx)[straight]
+    headings = poses[(ends[:-1] + ends[1:]) // 2, 2][straight]
+    in_radians, in_degrees, fixed = (
+        abs(np.exp(2j * (directions - scale * headings)).mean())
+        for scale in (1.0, float(DEGREE), 0.0)
+    )
+    explains = 1.0 - in_degrees < 0.5 * (1.0 - fixed)
+    return bool(in_degrees > FOLLOWS and in_radians < DIFFERS and explains)
 
 
 def start_of(table: CsvTable) -> StartPose | None:

@@ -196,6 +196,28 @@ def test_a_turn_in_degrees_of_a_robot_that_mostly_drives_straight_is_refused(tmp
     )
 
 
+@pytest.mark.parametrize("offset", [0.0, np.pi])
+def test_true_headings_in_degrees_are_refused_and_unwrapped_radians_are_not(tmp_path, offset):
+    """Truth of a robot that drives around a circle three times, forward or backward."""
+
+    def truth(scale: float) -> str:
+        turns = np.linspace(0.0, 6.0 * np.pi, 300)
+        rows = [f"{a / 10},{np.sin(a)},{-np.cos(a)},{scale * (a + offset)}" for a in turns.tolist()]
+        return "\n".join(["t_s,x_m,y_m,theta_rad", *rows]) + "\n"
+
+    assert only(data_set(tmp_path / "r", odometry=SPEEDS, truth=truth(1.0))).truth is not None
+    words = "r1/truth.csv, line [0-9]+, column theta_rad: [0-9.]+: the headings follow the path's "
+    with pytest.raises(DatasetError, match=words) as refused:
+        only(data_set(tmp_path / "d", odometry=SPEEDS, truth=truth(180 / np.pi)))
+    assert "to convert from degrees, add a column map" in str(refused.value)
+
+
+def test_true_headings_of_a_robot_that_spins_along_a_straight_path_stay(tmp_path):
+    rows = [f"{k / 10},{k / 20},0,{k / 10}" for k in range(300)]
+    truth = "\n".join(["t_s,x_m,y_m,theta_rad", *rows]) + "\n"
+    assert only(data_set(tmp_path, odometry=SPEEDS, truth=truth)).truth is not None
+
+
 def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
     seen = SEEN + "1,7,2.5,0.5\n2,9,0,0.1\n2,9,-1,0.1\n0.5,9,1,0.1\n9,9,1,0.1\n"
     stream = only(data_set(tmp_path, odometry=SPEEDS + "3,1,1\n", observations=seen))
