@@ -276,10 +276,13 @@ def _usual_maximum(rate: Float[np.ndarray, " N"], seconds: Float[np.ndarray, " N
     single wrong rows and jittering stamps do not raise. NaN rates, of another form, count as 0.
     """
     ends = np.append(0.0, np.cumsum(seconds))
-    edges = np.linspace(0.0, ends[-1], 1 + max(1, min(int(ends[-1]), len(rate))))
+    stretches = min(int(ends[-1]), len(rate))
+    if stretches < LEAST_WHIRLS:
+        return 0.0
+    edges = np.linspace(0.0, ends[-1], 1 + stretches)
     turned = np.append(0.0, np.cumsum(np.nan_to_num(rate) * seconds))
     means = np.sort(np.diff(np.interp(edges, ends, turned)) / edges[1])
-    return float(means[-min(max(LEAST_WHIRLS, int(WHIRLS * len(means))), len(means))])
+    return float(means[-max(LEAST_WHIRLS, int(WHIRLS * stretches))])
 
 
 def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
