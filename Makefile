@@ -80,6 +80,7 @@ $(PICTURES)/hidden/report.html: OPTIONS := --identities hidden
 $(PICTURES)/peers/report.html: OPTIONS := --without-centre
 $(PICTURES)/%/report.html: | $(VENV)/.dev
 	rm -rf $(@D)
+	mkdir -p $(PICTURES)
 	COLUMNS=80 $(BIN)/teamslam launch waypoints --speed max $(OPTIONS) --output $(@D) > $(@D).txt
 
 $(PICTURES)/without/maps.png: $(PICTURES)/run/report.html
