@@ -37,6 +37,8 @@ MAP_COLUMNS = (
 )  # fmt: skip
 DEGREES = ("latitude_deg", "longitude_deg")
 """Further columns of a map with a datum."""
+STATE = "state"
+"""Further column of a map that was compared with saved ones: moved, gone, new, unchanged."""
 CLASSES = ("class", "class_probability")
 """Further columns of a map whose landmarks have classes."""
 NO_CLASSES: Mapping[int, tuple[str, float]] = MappingProxyType({})
@@ -156,6 +158,11 @@ def write_map(
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
         rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
     columns: tuple[str, ...] = MAP_COLUMNS
+    if fused.changes:
+        columns += (STATE,)
+        states = {each.landmark: each.state for each in fused.changes}
+        for row in rows:
+            row[STATE] = states.get(row["id"])
     if classes:
         columns += CLASSES
         for row in rows:

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from teamslam.central.desk.drawing import (
+    GREEN,
     MAP_COLOUR,
+    ORANGE,
     TRUE_LANDMARK_COLOUR,
     TRUTH_COLOUR,
+    VERMILION,
     curve_through,
     draw_ellipses,
     ellipses,
@@ -26,6 +29,7 @@ from teamslam.central.desk.pictures.style import save
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
+from teamslam.team.wire import messages as m
 
 # Matplotlib takes half a second to import.
 if TYPE_CHECKING:
@@ -41,6 +45,12 @@ DRAWN_ERRORS = 1200
 DRAWN_BARS = 60
 """Most error bars."""
 LABELLED_LANDMARKS = 60
+CHANGE_MARKS = {
+    "moved": (ORANGE, "o", 140.0, "-"),
+    "gone": (VERMILION, "o", 110.0, "--"),
+    "new": (GREEN, "s", 110.0, "-"),
+}
+"""Colour, marker, its size [pt²] and line of landmarks that differ from the saved maps."""
 MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 SAME_M = 1e-9
 """Distance of equal points [m]."""
@@ -192,7 +202,10 @@ def _draw_paths(
         )
         axis.plot([], [], color=colour, marker="o", label=label)
     elif apart or robot.outside:
-        axis.plot([], [], color=colour, linestyle=":", label=f"{name}: not in this map")
+        start = "s" if len(known.stamps_ns) else ""
+        axis.plot(
+            [], [], color=colour, linestyle="", marker=start, label=f"{name}: not in this map"
+        )
     else:
         x, y, _ = _thinned(robot.online_path).poses.T
         axis.plot(x, y, color=colour, linewidth=1.0, zorder=3, label=f"{label}, online")
@@ -216,14 +229,21 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
         )  # fmt: skip
     if fused is None or blocks is None:
         return
+    changes = {each.landmark: each for each in fused.changes}
+    there = np.array([_state(changes, landmark) != "gone" for landmark in fused.ids.tolist()])
+    label = "landmarks, 95 % ellipses" + (f" × {times}" if times > 1 else "")
+    label += "\nwith the frame's own error" if evaluation.arbitrary_frame else ""
     axis.plot(
-        *fused.means.T, linestyle="", marker=".", markersize=2, color=MAP_COLOUR, zorder=7,
-        label="landmarks, 95 % ellipses" + (f" × {times}" if times > 1 else ""),
+        *fused.means[there].T, linestyle="", marker=".", markersize=2, color=MAP_COLOUR, zorder=7,
+        label=label,
     )  # fmt: skip
-    draw_ellipses(axis, fused.means, times**2 * blocks, MAP_COLOUR, width=1.1, zorder=7)
+    draw_ellipses(
+        axis, fused.means[there], times**2 * blocks[there], MAP_COLOUR, width=1.1, zorder=7
+    )
+    places = _draw_changes(axis, fused, changes)
     named = fused.ids < UNNAMED  # numbers of unnamed landmarks have no meaning
     if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
-        means = fused.means[named]
+        means = places[named]
         for landmark, mean, offset in zip(
             fused.ids[named], means, label_offsets(means), strict=True
         ):
@@ -238,6 +258,43 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
                 color=MAP_COLOUR,
                 zorder=8,
             )
+
+
+def _state(changes: Mapping[int, m.LandmarkChange], landmark: int) -> str:
+    return changes[landmark].state if landmark in changes else "unchanged"
+
+
+def _draw_changes(
+    axis: "Axes", fused: MapResult, changes: Mapping[int, m.LandmarkChange]
+) -> Float[np.ndarray, "L 2"]:
+    """Mark the landmarks that are not as the saved maps have them; return each one's place.
+
+    As on the live page: an arrow from a moved one's old place to a ring, a hollow dashed mark at
+    that of one that is gone, a square around a new one.
+    """
+    places = fused.means.copy()
+    found: dict[str, list[int]] = {state: [] for state in CHANGE_MARKS}
+    for row, landmark in enumerate(fused.ids.tolist()):
+        state = _state(changes, landmark)
+        if state not in found:
+            continue
+        found[state].append(row)
+        before = fused.means[row] - (changes[landmark].dx, changes[landmark].dy)
+        if state == "gone":
+            places[row] = before
+        elif state == "moved":
+            axis.annotate(
+                "", xy=fused.means[row].tolist(), xytext=before.tolist(), zorder=9,
+                arrowprops={"arrowstyle": "-|>", "color": CHANGE_MARKS[state][0], "linewidth": 1.6},
+            )  # fmt: skip
+    for state, (colour, marker, size, dashes) in CHANGE_MARKS.items():
+        if found[state]:
+            axis.scatter(
+                places[found[state], 0], places[found[state], 1], s=size, marker=marker,
+                facecolors="none", edgecolors=colour, linewidths=1.6, linestyle=dashes, zorder=9,
+                label=f"{state} since the saved map",
+            )  # fmt: skip
+    return places
 
 
 def magnification(evaluation: Evaluation, blocks: Float[np.ndarray, "L 2 2"]) -> int:

@@ -207,7 +207,9 @@ def _events(run: Run) -> list[str]:
     ]
     more = len(events) - len(rows)
     left = _note(f"{more} more in report.json") if more else ""
-    return [_table(("", "node", "event"), rows, words=True), left]
+    start_s = run.history.start_ns * 1e-9
+    clock = _note(f"Times are from the start, {start_s:,.1f} s of the clock that the texts give.")
+    return [_table(("", "node", "event"), rows, words=True), clock if start_s >= 1.0 else "", left]
 
 
 def _traffic(run: Run) -> list[str]:

@@ -59,6 +59,7 @@ def run_figures(run: Run) -> dict[str, Any]:
     span_s = (history.end_ns - history.start_ns) * 1e-9
     unplaced = {"ape_m": None, "ape_rad": None} if run.evaluation.arbitrary_frame else {}
     return {
+        "team_start_s": history.start_ns * 1e-9,
         "team_time_s": span_s,
         "nis_per_dof": {robot: of.per_dof for robot, of in history.innovations.items()},
         "nis_dof": {robot: of.total_dof for robot, of in history.innovations.items()},

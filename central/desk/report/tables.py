@@ -142,7 +142,9 @@ def team_rows(evaluation: Evaluation) -> Rows:
     states = state_rows(evaluation)
     if not len(fused.ids) and fused.reasons:
         return [("final map", f"empty: {'; '.join(fused.reasons)}"), *states]
-    rows = [("landmarks", f"{len(fused.ids)} in the final map"), *states]
+    gone = sum(each.state == "gone" and each.landmark in fused.ids for each in fused.changes)
+    of_them = f", {gone} of them gone" if gone else ""
+    rows = [("landmarks", f"{len(fused.ids)} in the final map{of_them}"), *states]
     if errors is None:
         rows.append(("landmark errors", f"can not be computed: {_without_truth(evaluation)}"))
     else:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 from PIL import Image
 
@@ -100,6 +101,8 @@ def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_p
     labels = [text.get_text() for text in legend.get_texts()]
     assert "r1" in labels
     assert "r2: not in this map" in labels
+    entry = legend.legend_handles[labels.index("r2: not in this map")]
+    assert (entry.get_linestyle(), entry.get_marker()) == ("None", "s")  # its start alone is drawn
     assert not any("online" in label for label in labels)
 
 
@@ -141,17 +144,58 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     np.testing.assert_allclose(found[: len(expected)], expected)
 
 
-def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path):
+def test_changes_since_the_saved_map_are_drawn_as_on_the_page(run, tmp_path, monkeypatch):
+    """Landmark 1 moved by (2, 1), 2 is gone, 3 is new."""
+    drawn: list[Figure] = []
+    monkeypatch.setattr(
+        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
+    )
+    first, second, third = run.map.ids[:3].tolist()
+    changes = (
+        m.LandmarkChange(landmark=first, state="moved", dx=2.0, dy=1.0),
+        m.LandmarkChange(landmark=second, state="gone", dx=0.5),
+        m.LandmarkChange(landmark=third, state="new"),
+        *(m.LandmarkChange(landmark=i, state="unchanged") for i in run.map.ids[3:].tolist()),
+    )
+    changed = replace(run, map=replace(run.map, changes=changes))
+    assert map_picture(run, tmp_path / "map.png")
+    assert map_picture(changed, tmp_path / "map.png")
+    before, after = (figure.axes[0] for figure in drawn)
+    assert not before.collections
+    count = len(run.map.ids)
+    assert [len(axis.findobj(Ellipse)) for axis in (before, after)] == [count, count - 1]
+    marks = {each.get_label().split()[0]: each for each in after.collections}
+    place = dict(zip(run.map.ids.tolist(), run.map.means.tolist(), strict=True))
+    gone = [place[second][0] - 0.5, place[second][1]]
+    for state, at in (("moved", place[first]), ("gone", gone), ("new", place[third])):
+        np.testing.assert_allclose(marks[state].get_offsets(), [at])
+        assert not len(marks[state].get_facecolor())
+    (arrow,) = (x for x in after.texts if x.arrow_patch is not None)
+    np.testing.assert_allclose(arrow.xy, place[first])
+    np.testing.assert_allclose(arrow.xyann, np.array(place[first]) - [2.0, 1.0])
+    assert dict(team_rows(changed))["landmarks"] == f"{count} in the final map, 1 of them gone"
+    assert dict(team_rows(run))["landmarks"] == f"{count} in the final map"
+
+
+def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, monkeypatch):
     of = scenario(robots=2)
     run = evaluate(joined_log(without_starts(of), 0.1))
     assert run.arbitrary_frame
-    assert not evaluate(joined_log(of, 0.1)).arbitrary_frame
+    known = evaluate(joined_log(of, 0.1))
+    assert not known.arbitrary_frame
     told = dict(team_rows(run))
     assert "arbitrary" in told["landmark RMSE"]
     assert told["after rigid alignment"] != "–"
     assert "map NEES per dof" not in told
     assert not error_picture(run, tmp_path / "errors.png")
-    assert map_picture(run, tmp_path / "map.png")
+    drawn: list[Figure] = []
+    monkeypatch.setattr(
+        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
+    )
+    for each in (run, known):
+        assert map_picture(each, tmp_path / "map.png")
+    texts = [[x.get_text() for x in figure.legends[0].get_texts()] for figure in drawn]
+    assert [any("the frame's own error" in x for x in of) for of in texts] == [True, False]
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
 
 

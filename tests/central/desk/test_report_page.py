@@ -91,6 +91,15 @@ def test_what_a_log_says_can_not_become_markup(log, tmp_path):
     assert "<td>&lt;b&gt;</td>" in page
 
 
+@pytest.mark.usefixtures("_without_pictures")
+def test_the_page_says_where_its_times_start_on_the_clock_of_the_texts(log, tmp_path):
+    run = run_of(log)
+    note = "of the clock that the texts give"
+    assert note not in page_of(run, tmp_path)
+    later = replace(run.history, start_ns=1_000 * 10**9)
+    assert f"from the start, 1,000.0 s {note}" in page_of(replace(run, history=later), tmp_path)
+
+
 def test_without_truth_there_are_the_monitor_and_nis(log, tmp_path):
     blind = [s for s in log if not s.key.startswith("truth")]
     run = run_of(blind)

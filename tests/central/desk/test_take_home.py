@@ -22,6 +22,7 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.team.datum import Datum
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.geodesy import local_from_geodetic
+from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from tests.sim.logs import scenario, streams
 
@@ -115,6 +116,21 @@ def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
         read = np.array([[float(v) for v in row] for row in list(csv.reader(lines))[1:]])
     np.testing.assert_array_equal(read[:, 1:4], home.paths["r1"].poses)
     np.testing.assert_array_equal(read[:, 5], home.paths["r1"].covariances[:, 0, 1])
+
+
+def test_a_map_beside_a_saved_one_has_each_landmarks_state(log, tmp_path):
+    fused = evaluate(log).map
+    first, second = fused.ids[:2].tolist()
+    changes = (
+        m.LandmarkChange(landmark=first, state="gone"),
+        m.LandmarkChange(landmark=second, state="moved", dx=1.0),
+    )
+    write_map(replace(fused, changes=changes), {}, tmp_path)
+    with (tmp_path / "map.csv").open() as lines:
+        rows = list(csv.DictReader(lines))
+    assert [row["state"] for row in rows[:3]] == ["gone", "moved", ""]
+    data = json.loads((tmp_path / "map.json").read_text())
+    assert [each["state"] for each in data["landmarks"][:3]] == ["gone", "moved", None]
 
 
 def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_path):
