@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
+from itertools import chain
 from math import isfinite, nan
 from typing import TypeVar
 
@@ -38,11 +39,13 @@ class UnknownColumnError(DatasetError):
 class Origin:
     """Columns of a map that a table comes from.
 
-    place: of the table in the map. columns: the user's column and its scale, by ours.
+    place: of the table in the map. columns: the user's column and its scale, by ours. unassigned:
+    further columns of the file.
     """
 
     place: str
     columns: Mapping[str, tuple[str, float]]
+    unassigned: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,16 @@ class CsvTable:
     def fault(self, problem: str) -> DatasetError:
         """Error for the table's columns."""
         return DatasetError(f"{self.name}, line 1: {problem}")
+
+    def lack(self, thing: str, forms: Sequence[Sequence[str]]) -> DatasetError:
+        """Error for columns that make up none of these forms; names those to assign in the map."""
+        given = ", ".join(column for column in self.columns if column in chain(*forms))
+        problem = f"no {thing} in its columns" + (f" ({given} alone)" if given else "")
+        remedy = f"give {' or '.join(','.join(form) for form in forms)}"
+        if self.origin is not None:
+            left = ", ".join(self.origin.unassigned) or "none"
+            remedy += f" in {self.origin.place}; columns of the file not assigned there: {left}"
+        return self.fault(f"{problem}; {remedy}")
 
     def _parsed(self, column: str, parse: Callable[[str], T]) -> list[T]:
         cells = self.columns[column]

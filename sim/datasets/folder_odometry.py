@@ -289,9 +289,12 @@ def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
     found = tuple(form for form in FORMS if table.has(*form))
     if len(found) == 1 or (found in MIXED and table.has("duration_s")):
         return found
+    if not found:
+        raise table.lack("odometry", FORMS)
     forms = " or ".join(",".join(form) for form in FORMS)
-    problem = "more than one form of odometry" if found else "no odometry"
-    raise table.fault(f"{problem} in its columns; give t_s with one of {forms}")
+    raise table.fault(
+        f"more than one form of odometry in its columns; give t_s with one of {forms}"
+    )
 
 
 def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:

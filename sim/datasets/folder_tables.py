@@ -181,9 +181,7 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
     table = rows.table
     forms = [form for form in (POLAR, POINTS) if table.has(*form)]
     if not forms:
-        raise table.fault(
-            f"no measurement in its columns; give {','.join(POLAR)} or {','.join(POINTS)}"
-        )
+        raise table.lack("measurement", (POLAR, POINTS))
     polar, points = (numbers_in(table, form, forms) for form in (POLAR, POINTS))
     ranges, bearings = polar.T.copy()
     check_polar(table, ranges, bearings)

@@ -161,6 +161,7 @@ def _take(
             ours: (theirs, 1.0) if isinstance(theirs, str) else (theirs.column, theirs.scale)
             for ours, theirs in table.columns.items()
         },
+        [column for column in _unassigned(whole, table) if column not in table.drop],
     )
     tables.sources[kind] = CsvTable(whole.name, found, whole.lines, origin if place else None)
     tables.columns[kind] = list(found)
@@ -168,14 +169,18 @@ def _take(
     return notes
 
 
+def _unassigned(rows: CsvTable, table: Table) -> list[str]:
+    used = {each if isinstance(each, str) else each.column for each in table.columns.values()}
+    return [column for column in rows.columns if column not in used]
+
+
 def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) -> None:
     """Raise DatasetError for an unused column that names several robots."""
     if kind not in (*MEASURED, "truth"):
         return
-    used = {each if isinstance(each, str) else each.column for each in table.columns.values()}
-    for column, cells in rows.columns.items():
-        names = list(dict.fromkeys(cells))
-        if column not in used and names_robot(column) and 1 < len(names) <= MOST_ROBOTS:
+    for column in _unassigned(rows, table):
+        names = list(dict.fromkeys(rows.columns[column]))
+        if names_robot(column) and 1 < len(names) <= MOST_ROBOTS:
             raise rows.fault(
                 f"column {column} has {len(names)} values, {', '.join(names)}, and the rows of one "
                 f"robot are imported. To import {names[0]}, write "

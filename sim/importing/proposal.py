@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -105,7 +105,8 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
 
     A table that not all robots have alike, with `own` every table, is the robot's own,
     `[robots.NAME.KIND]`. One file is the truth of one robot. A robot without odometry has the table
-    of the file that it should have. Missing columns and files without a table are comments.
+    of the file that it should have. Missing and unassigned columns and files without a table are
+    comments.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
     _drop_shared_truth(robots, found, drops)
@@ -119,17 +120,40 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
             for robot, (tables, _) in found.items()
             if kind in tables
         }
+        left = {robot: _unassigned(kind, found[robot][0], robots[robot], of[robot]) for robot in of}
         if len(of) == len(found) and len(set(of.values())) == 1 and not own:
-            shared.append(next(iter(of.values())).replace(KIND, kind))
+            text = next(iter(of.values())).replace(KIND, kind)
+            shared.append(text + _name_unassigned(chain(*left.values())))
             continue
         for robot, text in of.items():
-            by_robot[robot].append(text.replace(KIND, f"robots.{robot}.{kind}"))
+            own_text = text.replace(KIND, f"robots.{robot}.{kind}")
+            by_robot[robot].append(own_text + _name_unassigned(left[robot]))
     lacking = dict.fromkeys(
         f"# {robot}: {line}\n" if len(found) > 1 else f"# {line}\n"
         for robot, (_, lines_of) in found.items()
         for line in lines_of
     )
     return comments + "\n".join([*shared, *chain(*by_robot.values())]) + "".join(lacking)
+
+
+def _unassigned(
+    kind: str, tables: Mapping[str, _Proposed], files: Files, text: str
+) -> Sequence[str]:
+    """Columns of a table's file that neither this table, with its `drop`, nor another one has."""
+    file = tables[kind].file
+    texts = [text, *(each.text for each in tables.values() if each.file == file)]
+    columns = files[file].columns if file in files else ()
+    return [
+        each
+        for each in columns
+        if drop_line(each, []).removesuffix("[] }") not in text
+        and not any(f'"{each}"' in of for of in texts)
+    ]
+
+
+def _name_unassigned(columns: Iterable[str]) -> str:
+    names = ", ".join(dict.fromkeys(columns))
+    return f"# not assigned: {names}\n" if names else ""
 
 
 def _text_of(table: _Proposed, drops: Mapping[str, str]) -> str:

@@ -16,6 +16,7 @@ from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO, robots_of
 from teamslam.sim.datasets.folder_odometry import intervals_of
 from teamslam.sim.datasets.folder_tables import (
+    POINTS,
     POLAR,
     POSES,
     check_polar,
@@ -506,6 +507,9 @@ def check_sources(robots: Iterable[RobotTables]) -> None:
 
 
 def _check_detections(table: CsvTable | None) -> None:
-    if table is not None and table.has(*POLAR):
-        ranges, bearings = table.numbers(*POLAR).T
-        check_polar(table, ranges, bearings)
+    if table is None:
+        return
+    if not table.has(*POLAR):
+        raise table.lack("measurement", (POLAR, POINTS))
+    ranges, bearings = table.numbers(*POLAR).T
+    check_polar(table, ranges, bearings)

@@ -247,7 +247,11 @@ def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
             "r1/odometry.csv, column t_s: most rows of its odometry are 100 s apart: times",
         ),
         ("odometry", "t_s,t_s\n", "line 1: two columns are called 't_s'"),
-        ("odometry", "t_s,x_m\n0,1\n", "line 1: no odometry in its columns; give t_s with one of"),
+        (
+            "odometry",
+            "t_s,x_m\n0,1\n",
+            "line 1: no odometry in its columns (x_m alone); give forward",
+        ),
         ("odometry", SPEEDS + "4,1\n", "line 5: 2 columns, 3 expected (t_s, forward_m_s"),
         ("odometry", SPEEDS + "4,1,x\n", "line 5, column yaw_rate_rad_s: 'x' is not a number"),
         ("odometry", SPEEDS + "4,nan,0\n", "line 5, column forward_m_s: 'nan' is not finite"),

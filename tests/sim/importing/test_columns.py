@@ -1,11 +1,14 @@
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.importing.proposal import drops_by_robot, propose_map
 from tests.sim.importing.test_import import read, run
 
 TRACK = "t,x,y,yaw\n0,0,0,0\n1,1,0,0\n2,2,0,0\n"
@@ -307,3 +310,37 @@ def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path, place)
         DatasetError, match=r"names of their own .*: `teamslam import .* --columns columns.toml`"
     ):
         kind_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("column", "alone"), [("phi", "range_m alone"), ("far", "bearing_rad alone")]
+)
+def test_a_column_that_no_name_assigns_is_named_in_the_proposal_and_in_the_next_error(
+    tmp_path, column, alone
+):
+    """A bearing called phi, and a range that is not there."""
+    logs, columns = tmp_path / "logs", tmp_path / "columns.toml"
+    (logs / "r1").mkdir(parents=True)
+    (logs / "r1" / "wheels.csv").write_text("time,v,omega,volts\n0,1,0,12\n1,1,0,12\n")
+    found = {"phi": "range,phi", "far": "bearing,far"}[column]
+    (logs / "r1" / "tags.csv").write_text(f"time,tag,{found}\n0,3,2,0.1\n")
+    given = (logs, "-o", tmp_path / "set", "--columns", columns)
+    run(*given)
+    sections = columns.read_text().split("\n\n")
+    assert [each.partition("# not assigned: ")[2].strip() for each in sections] == [column, "volts"]
+    refused = str(run(*given).exception)
+    assert (
+        f"no measurement in its columns ({alone}); give range_m,bearing_rad or x_m,y_m" in refused
+    )
+    named = f"[observations] of {columns}; columns of the file not assigned there: {column}"
+    assert refused.endswith(named)
+
+
+def test_columns_of_another_table_of_the_file_and_dropped_robots_are_assigned():
+    header = ["t", "robot", "v", "omega", "gt_x", "gt_y", "gt_yaw", "volts"]
+    cells = [["0", "1"], ["r1", "r2"], *[["0", "0"] for _ in header[2:]]]
+    log = {"log.csv": CsvTable("log.csv", dict(zip(header, cells, strict=True)), [2, 3])}
+    drops = drops_by_robot(log)
+    text = propose_map(dict.fromkeys(drops, log), drops=drops)
+    assert "[robots.r2.truth]" in text
+    assert set(re.findall("# not assigned: .*", text)) == {"# not assigned: volts"}
