@@ -2,6 +2,9 @@
 
 from enum import StrEnum
 
+REJECTED = "rejected: "
+"""Begins the disposition of a rejected measurement."""
+
 
 class Rejection(StrEnum):
     """A reason to reject a measurement, as spelt by the ledger, `Done` and `teamslam
@@ -35,7 +38,7 @@ class Rejection(StrEnum):
     @property
     def disposition(self) -> str:
         """The disposition under which the ledger counts it."""
-        return f"rejected: {self.value}"
+        return f"{REJECTED}{self.value}"
 
 
 UNMEASURED = frozenset({None, Rejection.SPEED, Rejection.STEERING})

@@ -1,21 +1,24 @@
-"""Ledger of a log: the disposition of every measurement (law 1), and the maps of every submap.
+"""Ledger of a log: the disposition of every measurement (law 1), each rejected one with its reason,
+and the maps of every submap.
 
 The robot's node recomputes rejections. Measurements after the last submap are open if consumed,
 else lost.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
 from teamslam.central.desk.verification.robot import dispositions
+from teamslam.team.rejection import REJECTED
 from teamslam.team.robot.ledger import IN_SIGHTING
 from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import ids
 
 IN_SUBMAP = "in a submap"
 OPEN = "open"
@@ -34,16 +37,48 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Rejected:
+    """A rejected measurement; number: the robot's counter; kind: its message, as `observations`.
+
+    landmarks, teammates: those of a scan with identities, as far as it has them.
+    """
+
+    robot: str
+    incarnation: int
+    number: int
+    stamp_s: float
+    kind: str
+    landmarks: tuple[int, ...]
+    teammates: tuple[str, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Number of detections of used scans that the window of a submap rejected as outliers."""
+
+    robot: str
+    incarnation: int
+    submap: int
+    start_s: float
+    stamp_s: float
+    detections: int
+
+
+@dataclass(frozen=True)
 class Ledger:
     """Entries by stream and counter, maps by submap, and violations.
 
-    maps: digests in log order. withdrawn: robots that the last map leaves out.
+    maps: digests in log order. withdrawn: robots that the last map leaves out. rejected: by stream
+    and number.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
     maps: Mapping[SubmapName, tuple[str, ...]]
     offenders: tuple[str, ...]
     withdrawn: tuple[str, ...] = ()
+    rejected: tuple[Rejected, ...] = ()
+    outliers: tuple[Outliers, ...] = ()
 
     @property
     def measurements(self) -> int:
@@ -73,7 +108,7 @@ class Ledger:
         return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
-        """Totals, violations, and measurements and maps of each submap."""
+        """Totals, violations, rejected measurements, and measurements and maps of each submap."""
         counts = Counter(
             (*stream, entry.submap)
             for stream, entries in self.entries.items()
@@ -95,6 +130,8 @@ class Ledger:
                 }
                 for n, maps in sorted(self.maps.items())
             ],
+            "rejected": [asdict(each) for each in self.rejected],
+            "outliers": [asdict(each) for each in self.outliers],
             "withdrawn": self.withdrawn,
             "offenders": self.offenders,
         }
@@ -107,13 +144,37 @@ def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> L
     ]
     streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
+    outliers: list[Outliers] = []
     for stream in streams:
         progress(stream[0])
         intervals, wrong = _intervals(log, stream)
         entries[stream], more = _entries(log, stream, intervals)
         offenders += [*wrong, *more, *_contradictions(log, stream, entries[stream])]
+        outliers += [
+            Outliers(*stream, s.sequence, s.start_ns / 1e9, s.stamp_ns / 1e9, s.gated)
+            for s in intervals
+            if s.gated
+        ]
     maps, unknown = _maps(log)
-    return Ledger(entries, maps, (*offenders, *unknown), _withdrawn(log))
+    rejected = tuple(_rejected(log, entries))
+    return Ledger(entries, maps, (*offenders, *unknown), _withdrawn(log), rejected, tuple(outliers))
+
+
+def _rejected(log: Recorded, entries: Mapping[Stream, Sequence[Entry]]) -> Iterator[Rejected]:
+    for stream, own in entries.items():
+        for number, entry in enumerate(own):
+            if not entry.disposition.startswith(REJECTED):
+                continue
+            each = log.measurements[stream][number]
+            yield Rejected(
+                *stream,
+                number,
+                each.stamp_ns / 1e9,
+                m.tag_of(type(each)).partition("/")[0],
+                tuple(ids(each.ids, "ids").tolist()) if isinstance(each, m.AnyScan) else (),
+                each.teammates if isinstance(each, m.Sightings) else (),
+                entry.disposition.removeprefix(REJECTED),
+            )
 
 
 def _withdrawn(log: Recorded) -> tuple[str, ...]:

@@ -379,14 +379,26 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     )
 
 
-@app.command(name="verify-ledger", cls=Command, epilog="teamslam verify-ledger runs/first")
-def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
+@app.command(name="verify-ledger", cls=Command, epilog="teamslam verify-ledger runs/first --list")
+def verify_ledger(
+    log: LogArgument,
+    lists: Annotated[
+        bool,
+        typer.Option("--list", help="List each rejected measurement with its reason."),
+    ] = False,
+    json_file: JsonFile = None,
+) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
 
     from teamslam.central.desk.ledger import ledger
     from teamslam.central.desk.names import in_order
-    from teamslam.central.desk.report.tables import disposition_sheet, terminal_table
+    from teamslam.central.desk.report.tables import (
+        disposition_sheet,
+        outlier_sheet,
+        rejected_sheet,
+        terminal_table,
+    )
     from teamslam.central.desk.verification.recorded import RerunError, index_log
     from teamslam.team.recording.reader import open_log
 
@@ -400,6 +412,12 @@ def verify_ledger(log: LogArgument, json_file: JsonFile = None) -> None:
     console.print(terminal_table(sheet))
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
+    if lists:
+        for listed in (rejected_sheet(found), outlier_sheet(found)):
+            if listed.rows:
+                console.print(terminal_table(listed))
+    elif found.rejected or found.outliers:
+        console.print("--list shows each rejected measurement with its reason", highlight=False)
     if not opened.complete:
         typer.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
     write_json(json_file, found.to_json())

@@ -14,17 +14,19 @@ from rich.text import Text
 from teamslam.central.desk.evaluation.association import AssociationResult
 from teamslam.central.desk.evaluation.errors import MapErrors
 from teamslam.central.desk.evaluation.results import Evaluation, RobotResult, figure
+from teamslam.central.desk.ledger import Ledger
 from teamslam.central.desk.names import OUTSIDE, in_order, not_joined, short
 from teamslam.central.desk.report.run import Run
 from teamslam.central.diagnosis import describe
 from teamslam.team.config import MAP
+from teamslam.team.estimation.contribution import named
 from teamslam.team.wire import messages as m
 
 ABSURD_NEES = 1000
 """NEES per degree of freedom above which words replace it."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 _COUNT_AGAIN = ("kalman", "kalman-per-axis")
-LEFT = ("robot", "disposition", "channel")
+LEFT = ("robot", "disposition", "channel", "kind", "landmarks", "reason")
 """Headings of text columns."""
 Rows = Sequence[tuple[str, str]]
 
@@ -427,6 +429,37 @@ def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
         counts = [of.get(disposition, 0) for of in ledgers.values()]
         rows.append((disposition, *(f"{count:,}" for count in (*counts, sum(counts)))))
     return Sheet(("disposition", *ledgers, "all"), rows)
+
+
+def rejected_sheet(ledger: Ledger) -> Sheet:
+    """Each rejected measurement of a ledger with its reason."""
+    rows = [
+        (
+            short(named((each.robot, each.incarnation))),
+            str(each.number),
+            f"{each.stamp_s:.3f}",
+            each.kind,
+            " ".join((*map(str, each.landmarks), *each.teammates)),
+            each.reason,
+        )
+        for each in ledger.rejected
+    ]
+    return Sheet(("robot", "number", "stamp [s]", "kind", "landmarks", "reason"), rows)
+
+
+def outlier_sheet(ledger: Ledger) -> Sheet:
+    """Detections that windows rejected as outliers, by submap."""
+    rows = [
+        (
+            short(named((each.robot, each.incarnation))),
+            str(each.submap),
+            f"{each.start_s:.3f}",
+            f"{each.stamp_s:.3f}",
+            str(each.detections),
+        )
+        for each in ledger.outliers
+    ]
+    return Sheet(("robot", "submap", "from [s]", "to [s]", "outliers"), rows)
 
 
 NIS_NOTE = (

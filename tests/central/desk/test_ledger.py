@@ -1,19 +1,26 @@
+import json
+import re
+from dataclasses import asdict
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from teamslam.central.desk.ledger import Ledger, ledger
+from teamslam.central.desk.ledger import Ledger, Rejected, ledger
 from teamslam.central.desk.verification.recorded import index_log
 from teamslam.sim.cli.rerun import app
+from teamslam.team.rejection import Rejection
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Sample
 from tests.sim.recorded.test_rerun import restless
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
 
 STEPS = 60
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +101,60 @@ def test_the_command_ends_with_1_and_names_the_offender(samples, tmp_path):
     result = runner.invoke(app, ["verify-ledger", str(path)])
     assert result.exit_code == 1
     assert "is in two submaps: 0 and 1" in result.output
+
+
+def with_far_landmarks(samples: list[Sample]) -> tuple[list[Sample], m.Observations]:
+    """The log with a scan of r1 whose ranges are beyond the bounds."""
+    scan = messages(samples, ch.OBSERVATIONS, "r1")[5]
+    far = msgspec.structs.replace(
+        scan,
+        ids=from_ids(np.array([3, 7], np.uint32)),
+        ranges=from_floats(np.full(2, 1e7)),
+        bearings=from_floats(np.zeros(2)),
+        covariances=b"",
+    )
+    return changed(samples, ch.OBSERVATIONS, lambda each: far if each == scan else each), far
+
+
+def test_each_rejected_measurement_is_listed_with_stamp_landmarks_and_reason(samples, tmp_path):
+    of, far = with_far_landmarks(samples)
+    log = written(tmp_path / "log.mcap", of)
+    found = ledger(index_log(log))
+    reason, stamp_s = "a range beyond the bounds", far.stamp_ns / 1e9
+    assert [each for each in found.rejected if each.landmarks] == [
+        Rejected("r1", 1, far.number, stamp_s, "observations", (3, 7), (), reason)
+    ]
+    sightings = {
+        (s.robot, s.number) for r in ("r1", "r2") for s in messages(samples, ch.SIGHTINGS, r)
+    }
+    no_nodes = [each for each in found.rejected if each.kind == "sightings"]
+    assert {(each.robot, each.number) for each in no_nodes} == sightings
+    assert {each.reason for each in no_nodes} == {Rejection.NO_NODES.value}
+    assert {each.teammates for each in no_nodes} == {("r1",), ("r2",)}
+    out = tmp_path / "ledger.json"
+    result = CliRunner().invoke(
+        app,
+        ["verify-ledger", str(log.path), "--list", "--json", str(out)],
+        env={"COLUMNS": "120"},
+    )
+    (row,) = (line for line in result.output.splitlines() if " observations " in line)
+    words = ["r1", str(far.number), f"{stamp_s:.3f}", "observations", "3", "7", *reason.split()]
+    assert row.split() == words
+    listed = json.loads(out.read_text("utf-8"))["rejected"]
+    assert listed == [
+        {**asdict(each), "landmarks": [*each.landmarks], "teammates": [*each.teammates]}
+        for each in found.rejected
+    ]
+
+
+def test_the_outliers_of_a_window_are_counted_by_submap(samples, tmp_path):
+    of = submap_changed(samples, 1, gated=5)
+    (found,) = ledger_of(of, tmp_path).outliers
+    assert (found.robot, found.submap, found.detections) == ("r1", 1, 5)
+    assert found.start_s < found.stamp_s
+
+
+def test_the_page_explains_each_reason():
+    page = (DOCS / "report.md").read_text("utf-8").partition("## Rejected measurements")[2]
+    explained = re.findall(r"^\| (.+?) \|", page, re.MULTILINE)[1:]
+    assert explained == [each.value for each in Rejection]
