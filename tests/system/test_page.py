@@ -4,6 +4,7 @@ Skipped without a Chromium; `make test` installs one where it may (tests/get-chr
 """
 
 import asyncio
+import json
 import re
 import signal
 from xml.etree import ElementTree
@@ -160,6 +161,18 @@ def test_the_map_is_written_as_svg_with_all_that_is_shown(page):
     paths = [each.get("d", "") for each in written.iter("{http://www.w3.org/2000/svg}path")]
     assert len(paths) > 2 * len(shown)
     assert not any("NaN" in path for path in paths)
+
+
+@pytest.mark.parametrize(("ends", "drawn"), [(True, 3), (False, 1)])
+def test_smoothed_poses_at_ends_of_submaps_are_dots_without_chords(page, ends, drawn):
+    def shapes() -> int:
+        return page.ask("teamslam.map.svg(30)").count("<path")
+
+    seek(page, 30)
+    before = shapes()
+    frame = {"k": "path", "r": "r1", "t": [10, 20, 30], "v": [0, 0, 0, 4, 0, 0, 4, 4, 0]}
+    page.ask(f"teamslam.store.take({json.dumps({**frame, 'ends': ends})})")
+    assert shapes() - before == drawn
 
 
 def test_the_keyboard_moves_time_and_follows_a_robot(page):

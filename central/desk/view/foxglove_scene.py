@@ -132,6 +132,15 @@ def path_entity(
     return _entity(stamp_ns, name, lines=[_line(points, shade, pixels)])
 
 
+def dots_entity(
+    stamp_ns: int, name: str, points: Sequence[tuple[float, float]], shade: Shade, size_m: float
+) -> SceneEntity:
+    """Places as dots."""
+    across = 0.3 * size_m
+    dots = [_disc(_pose(x, y, 0.0, _FLAT_M), across, across, shade) for x, y in points]
+    return _entity(stamp_ns, name, cylinders=dots)
+
+
 def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]]) -> bytes:
     """map_from_robot of each robot."""
     found = []

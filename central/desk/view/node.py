@@ -58,7 +58,8 @@ class Shown(NamedTuple):
 class _Robot:
     """State of one robot; its team pose is preferred to its own.
 
-    coming: estimates after the view's time. reached_ns: the robot's team time.
+    coming: estimates after the view's time. reached_ns: the robot's team time. at_ends: the
+    smoothed poses are those at the ends of submaps.
     """
 
     coming: deque[m.PoseEstimate] = field(default_factory=deque)
@@ -70,6 +71,7 @@ class _Robot:
     track: Track = field(default_factory=Track)
     true_track: Track = field(default_factory=Track)
     smoothed: list[tuple[float, float]] = field(default_factory=list)
+    at_ends: bool = False
     cloud: m.ParticleCloud | None = None
     lost: bool = False
     done: bool = False
@@ -186,7 +188,9 @@ class ViewerNode:
                 self._of(message.robot).cloud = message
             case m.Trajectory():
                 poses = floats(message.poses, "poses").reshape(-1, 3)
-                self._of(message.robot).smoothed = [(x, y) for x, y, _ in poses.tolist()]
+                robot = self._of(message.robot)
+                robot.smoothed = [(x, y) for x, y, _ in poses.tolist()]
+                robot.at_ends = bool(message.crosses)
             case m.Done():
                 self._of(message.robot).done = True
             case m.Status():
@@ -322,7 +326,10 @@ class ViewerNode:
                 ("path", robot.track.points, (colour, 0.5), 1.5),
                 ("smoothed path", robot.smoothed, (colour, 1.0), 2.5),
             ):
-                if len(points) > 1:
+                if what == "smoothed path" and robot.at_ends:
+                    named = f"smoothed poses {name}"
+                    entities.append(fox.dots_entity(now_ns, named, points, shade, self._size_m()))
+                elif len(points) > 1:
                     named = f"{what} {name}"
                     entities.append(fox.path_entity(now_ns, named, points, shade, pixels))
         return fox.scene(entities)

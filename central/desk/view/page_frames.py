@@ -5,13 +5,13 @@ particles base64 of little-endian float32 and uint32. Frames, by `k`: hello: tea
 live. now: team time of all active robots. pose: rows x, y, heading, xx, xy, yy, heading variance.
 outside: whether the robot is outside the team's map; its poses are then not sent. frame: the
 robot's pose frame changes. err: rows of three errors, three 3σ bounds, NEES per degree of freedom.
-truth: rows x, y, heading. truth_map, map, cloud, path: as named; a map's `changes` since the saved
-maps: number of unchanged landmarks, then landmark, state, place in the saved map, displacement, its
-sigma [m], χ², expected observations. align: x, y, theta of the truth's frame in another map frame,
-null while undetermined. sensor: range, field of view and mount. see: rows of a measurement:
-landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a submap (to) or a prior
-(from) `central`. fig: a node's figures. wait: start-up states of a node. bytes: [key, t, messages,
-bytes] of one second. ev: event. eof: end of the log.
+truth: rows x, y, heading. truth_map, map, cloud, path (`ends`: of submaps alone): as named; a map's
+`changes` since the saved maps: number of unchanged landmarks, then landmark, state, place in the
+saved map, displacement, its sigma [m], χ², expected observations. align: x, y, theta of the truth's
+frame in another map frame, null while undetermined. sensor: range, field of view and mount. see:
+rows of a measurement: landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a
+submap (to) or a prior (from) `central`. fig: a node's figures. wait: start-up states of a node.
+bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of the log.
 """
 
 import base64
@@ -189,7 +189,8 @@ class PageFrames:
             case m.Trajectory():
                 times = [self._t(at) for at in stamps(message.stamps, "stamps").tolist()]
                 poses = floats(message.poses, "poses").tolist()
-                self._add_frame("path", r=message.robot, t=times, v=poses)
+                ends = bool(message.crosses)
+                self._add_frame("path", r=message.robot, t=times, v=poses, ends=ends)
                 self._align()
             case _:
                 pass

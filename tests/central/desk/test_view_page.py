@@ -324,6 +324,30 @@ def test_foxgloves_true_landmarks_are_in_the_frame_of_the_map(known, moved):
     np.testing.assert_allclose(places, transform_points(MAP_FROM_TRUTH, TRUE) if moved else TRUE)
 
 
+@pytest.mark.parametrize("at_ends", [True, False])
+def test_smoothed_poses_at_ends_of_submaps_are_dots_and_those_at_keyframes_a_line(at_ends):
+    *before, (channel, trajectory), last = in_an_arbitrary_frame(landmarks=True, known=False)
+    if at_ends:
+        trajectory = msgspec.structs.replace(trajectory, crosses=from_floats(np.zeros((3, 9))))
+    pose = build.pose_estimate(
+        stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
+        pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3)),
+    )  # fmt: skip
+    log = [*before, (ch.TEAM_POSE, pose), (channel, trajectory), last]
+    (path,) = (each for each in told_of(*log) if each["k"] == "path")
+    assert path["ends"] is at_ends
+    node = ViewerNode()
+    views = [shown for channel, message in log for shown in node.handle(channel, message)]
+    scenes = [SceneUpdate.FromString(each.payload) for each in views if each.key == "view/paths"]
+    entities = {each.id: each for each in scenes[-1].entities}
+    assert ("smoothed path r1" in entities) is not at_ends
+    if at_ends:
+        dots = entities["smoothed poses r1"].cylinders
+        places = [(dot.pose.position.x, dot.pose.position.y) for dot in dots]
+        np.testing.assert_allclose(places, transform_points(MAP_FROM_TRUTH, TRUE + 1.0))
+        assert not entities["smoothed poses r1"].lines
+
+
 def test_a_submap_and_a_prior_are_links_to_and_from_the_centre():
     page = PageFrames()
     for channel in (ch.SUBMAP, ch.OWN_MAP, ch.PRIOR):

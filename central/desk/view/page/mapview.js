@@ -388,13 +388,25 @@ export class MapView {
     g.lineJoin = 'bevel';
     for (const robot of this.store.robots.values()) {
       if (this.on.truth && motion) this.extendPath(g, ends, `truth ${robot.name}`, robot.truth, time, this.colours.truth, 1 * r, 0.55, 0, motion);
-      const beside = this.on.smoothed && robot.smoothed.length;
+      const smoothed = this.on.smoothed && robot.smoothed.length, beside = smoothed && !robot.atEnds;
       if (beside) this.extendPath(g, ends, `smoothed ${robot.name}`, robot.smoothed, time, robot.colour, 2.2 * r, 0.95);
       // Poses from before a robot was in the team's frame are in its own frame.
       if (this.on.paths && !this.store.isOutside(robot, time)) {
         this.extendPath(g, ends, `pose ${robot.name}`, robot.pose, time, robot.colour, (beside ? 1 : 2) * r, beside ? 0.5 : 0.75, this.store.firstInFrame(robot, time));
       }
+      if (smoothed && robot.atEnds) this.paintEnds(g, ends, `smoothed ${robot.name}`, robot.smoothed, time, robot.colour);
     }
+  }
+
+  /** Smoothed poses at the ends of submaps: between them the path is not a chord. */
+  paintEnds(g, ends, key, series, time, colour) {
+    const to = series.at(time);
+    g.fillStyle = colour;
+    for (let i = ends.get(key) || 0; i <= to; i++) {
+      const [x, y] = this.screen(series.get(i, 0), series.get(i, 1));
+      g.beginPath(); g.arc(x, y, 3.2 * this.ratio, 0, 2 * Math.PI); g.fill();
+    }
+    ends.set(key, to + 1);
   }
 
   extendPath(g, ends, key, series, time, colour, width, alpha, first = 0, motion = null) {

@@ -73,7 +73,7 @@ export class Store {
     if (!found) {
       found = {
         name, pose: new Series(POSE), error: new Series(ERROR), truth: new Series(TRUTH),
-        clouds: [], cloudTimes: [], smoothed: new Series(TRUTH), seen: new Series(SEEN), sensor: null, reach: 0, states: [], stateTimes: [], colour: '#888',
+        clouds: [], cloudTimes: [], smoothed: new Series(TRUTH), atEnds: false, seen: new Series(SEEN), sensor: null, reach: 0, states: [], stateTimes: [], colour: '#888',
         outside: new Series(1), frames: new Series(0),
       };
       this.robots.set(name, found);
@@ -113,7 +113,12 @@ export class Store {
         robot.cloudTimes.push(frame.t);
         break;
       }
-      case 'path': this.robot(frame.r).smoothed.push(frame.t, frame.v); break;
+      case 'path': {
+        const robot = this.robot(frame.r);
+        robot.smoothed.push(frame.t, frame.v);
+        robot.atEnds = frame.ends;
+        break;
+      }
       case 'sensor': this.robot(frame.r).sensor = frame; break;
       case 'see': this.takeSeen(this.robot(frame.r), frame); break;
       case 'link': this.takeLink(frame.t, frame.a, frame.b); break;
