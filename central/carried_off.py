@@ -25,6 +25,8 @@ SEAM_DOF = 3.0
 Pose = Float[np.ndarray, "3"]
 REMEDY = "leave the robot on the ground, or restart its process where it is put down"
 START_REMEDY = "correct its initial pose by that, or remove it: a robot is joined without one"
+OTHER_START = "; two initial poses contradict each other, so {other}'s may be the wrong one"
+"""Of a team with two known initial poses: a majority would tell."""
 
 
 def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:

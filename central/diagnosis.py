@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from teamslam.central.carried_off import REMEDY, START_REMEDY, cuts_of
+from teamslam.central.carried_off import OTHER_START, REMEDY, START_REMEDY, cuts_of
 from teamslam.central.monitor import SCALE_SIGMAS, finding
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
-from teamslam.team.estimation.contribution import Contribution, moment
+from teamslam.team.estimation.contribution import Contribution, moment, named
 from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.hypotheses import (
     CARRIED_OFF,
@@ -134,7 +134,7 @@ def diagnose(
                 value=each.value,
                 sigma=each.sigma,
                 evidence=each.evidence / each.dof,
-                remedy=START_REMEDY if _is_start(each) else _REMEDIES[each.cause],
+                remedy=_start_remedy(fold, each) if _is_start(each) else _REMEDIES[each.cause],
                 at_ns=each.at_ns,
             )
             for each in accepted
@@ -151,6 +151,16 @@ def diagnose(
 def _is_start(found: Hypothesis | m.Diagnosis) -> bool:
     """Whether a jump is an error of an initial pose: it has no time."""
     return found.cause == CARRIED_OFF and not found.at_ns
+
+
+def _start_remedy(fold: Fold, found: Hypothesis) -> str:
+    """Describe the remedy for a wrong initial pose; of two it names the other one."""
+    own = fold.main.graph.streams
+    others = {each for each in fold.starts if each in own and each[0] != found.subject}
+    if len(others) != 1:
+        return START_REMEDY
+    (other,) = others
+    return START_REMEDY + OTHER_START.format(other=named(other).removesuffix(" (incarnation 1)"))
 
 
 def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:

@@ -74,18 +74,33 @@ def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
     assert found.at_ns * 1e-9 == pytest.approx(50.0, abs=10.0)
 
 
-def test_a_wrong_initial_pose_is_named_with_its_error(tmp_path):
-    folder = write(TEAM, tmp_path)
+def wrong_start(world: StressWorld, place: Path) -> m.Diagnosis:
+    """Best cause where r2's initial pose is stated (-3, 2) m and -0.7 rad off."""
+    folder = write(world, place)
     start = folder / "r2" / "start.csv"
     head, row = start.read_text("utf-8").split()
     x, y, a = map(float, row.split(","))
     start.write_text(f"{head}\n{x - 3.0},{y + 2.0},{a - 0.7}\n", "utf-8")
     found, *_ = diagnosed(final_only(scenario_in(folder)))
+    return found
+
+
+def test_a_wrong_initial_pose_is_named_with_its_error(tmp_path):
+    found = wrong_start(TEAM, tmp_path)
     assert (found.cause, found.robot) == ("carried_off", "r2")
     assert found.value == pytest.approx((3.0, -2.0, 0.7), abs=0.2)
     assert describe(found).startswith("r2's initial pose is wrong: ")
     assert found.remedy.startswith("correct its initial pose")
+    assert "may be the wrong one" not in found.remedy, "the other two agree"
     assert "at_s" not in to_object(found)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_two_initial_poses_that_contradict_each_other_both_are_named(tmp_path, seed):
+    found = wrong_start(replace(WORLD, seed=seed), tmp_path)
+    (other,) = {"r1", "r2"} - {found.robot}
+    assert "initial pose is wrong" in describe(found)
+    assert found.remedy.endswith(f"{other}'s may be the wrong one")
 
 
 def test_a_robot_carried_off_in_its_first_window_has_a_right_initial_pose(tmp_path):
