@@ -54,7 +54,7 @@ class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     """closure_llr between robots with unknown initial poses."""
     context: NonNegative = 2.0
     """Fewest landmarks outside the matched place, relative to the pairs; with fewer the place may
-    not be unique."""
+    not be unique. 0: not tested. A saved map needs none where `share` of the overlap is matched."""
     share: Share = 0.7
     """Least share of matched landmarks near the matched places, on the side with fewer."""
     undone_below: Share = 0.5
@@ -68,19 +68,29 @@ SCALE_M = 0.03
 """Sensor error [m] of the default profile at the far end of its view."""
 
 
-def profile_for(sensor: Sensor, farthest_m: float) -> AssociationProfile:
-    """Scale the lengths of the default profile by a sensor's error at the far end of its view.
+LENGTHS = ("slack", "density", "tight", "near", "same")
+"""The thresholds that `profile_for` scales."""
+
+
+def has_default_lengths(profile: AssociationProfile) -> bool:
+    """Return whether a profile states none of its lengths."""
+    return all(getattr(profile, name) == getattr(DEFAULT_PROFILE, name) for name in LENGTHS)
+
+
+def profile_for(
+    sensor: Sensor, farthest_m: float, profile: AssociationProfile = DEFAULT_PROFILE
+) -> AssociationProfile:
+    """Scale the lengths of a profile by a sensor's error at the far end of its view.
 
     The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m.
     """
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)
-    default = DEFAULT_PROFILE
     return msgspec.structs.replace(
-        default,
-        slack=default.slack * scale,
-        density=default.density / scale**2,
-        tight=default.tight * scale,
-        near=default.near * scale,
-        same=default.same * scale,
+        profile,
+        slack=profile.slack * scale,
+        density=profile.density / scale**2,
+        tight=profile.tight * scale,
+        near=profile.near * scale,
+        same=profile.same * scale,
     )

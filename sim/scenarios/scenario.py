@@ -32,7 +32,7 @@ from teamslam.sim.world.config import (
     UtiasWorld,
     World,
 )
-from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile, profile_for
+from teamslam.team.association import AssociationProfile, has_default_lengths, profile_for
 from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import ESTIMATORS, PAIRS, RULES, named_pairs, rules_for
@@ -122,13 +122,13 @@ def with_options(
     world = fields["world"]
     if identities is not None:
         world["identities"] = identities
-        if identities == "hidden" and scenario.central.association == DEFAULT_PROFILE:
+        if identities == "hidden" and has_default_lengths(scenario.central.association):
             fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario))
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
         from teamslam.sim.datasets.folder_files import robots_of
 
         fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
-    if world["kind"] == "folder" and scenario.central.association == DEFAULT_PROFILE:
+    if world["kind"] == "folder" and has_default_lengths(scenario.central.association):
         from teamslam.sim.datasets.folder_files import has_detections
 
         if has_detections(world["path"]):
@@ -150,10 +150,12 @@ def _profile_of(scenario: Scenario, share: float = 1.0) -> AssociationProfile:
     world = scenario.world
     seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
     far_m = FAR_M if seen_m is None else seen_m
+    stated = scenario.central.association
     of_each = [
-        profile_for(r.sensor, share * min(r.sensor.max_range, far_m)) for r in scenario.robots
+        profile_for(r.sensor, share * min(r.sensor.max_range, far_m), stated)
+        for r in scenario.robots
     ]
-    return max(of_each, key=lambda profile: profile.tight, default=DEFAULT_PROFILE)
+    return max(of_each, key=lambda profile: profile.tight, default=stated)
 
 
 def _world_of(scenario: Scenario, path: str) -> Fields:

@@ -36,6 +36,7 @@ from teamslam.team.estimation.association.verification import (
     find_failed_test,
     matched_share,
     nearest_distance,
+    overlap_share,
 )
 from teamslam.team.estimation.association.visibility import (
     Views,
@@ -365,7 +366,9 @@ def search_other_island(
 ) -> Closure | None:
     """Search another island for a stream's submaps up to `last`.
 
-    Pairs are indices in the two views; the motion maps the first island's frame into the second's.
+    Two statements replace the context: a verdict on a pair, and a saved map, which is of this site,
+    where most of the overlap is matched. Pairs are indices in the two views; the motion maps the
+    first island's frame into the second's.
     """
     profile = mine.profile
     submaps = mine.find_latest(stream, last)
@@ -383,25 +386,53 @@ def search_other_island(
     def aliases() -> list[Placement]:
         return align(of_patch, *target_of(mine), profile, profile.island_pairs, is_own=True)
 
+    tests = ClosureTests(
+        profile.island_pairs,
+        profile.island_llr,
+        profile.context,
+        len(mine.ids) + len(theirs.ids),
+    )
+    has_saved = bool(len(mine.saved) or len(theirs.saved))
+    declared = mine.find_declared(theirs)
     found = find_closure(
         of_patch,
         *target_of(theirs),
         profile,
-        ClosureTests(
-            profile.island_pairs,
-            profile.island_llr,
-            profile.context,
-            len(mine.ids) + len(theirs.ids),
-        ),
+        tests._replace(context=0.0) if has_saved or declared else tests,
         aliases,
     )
     if found is None:
         return None
     centroid = own.mean.mean(axis=0)
-    return found._replace(
+    found = found._replace(
         pairs=tuple(pair._replace(first=int(patch[pair.first])) for pair in found.pairs),
         motion=compose(found.motion, np.array([*-centroid, 0.0])),
     )
+    if found.why or declared.intersection((pair.first, pair.second) for pair in found.pairs):
+        return found
+    why = find_failed_test(found, profile, tests)
+    if why and has_saved:
+        share = _saved_share(mine, theirs, found)
+        words = f"share {share:.2f} < {profile.share:g} of the overlap with a saved map is matched"
+        why = words if share < profile.share else ""
+    return found._replace(why=why)
+
+
+def _saved_share(mine: IslandView, theirs: IslandView, found: Closure) -> float:
+    """Compute the matched share of the overlap between a saved map and the other island.
+
+    All landmarks of the other island count, also those beside the patch.
+    """
+    first, second = np.array([(pair.first, pair.second) for pair in found.pairs]).T
+    sides = [
+        (mine, apply_motion(found.motion, mine.joint.mean), first),
+        (theirs, theirs.joint.mean, second),
+    ]
+    if not len(theirs.saved):
+        sides.reverse()
+    (day, others, _), (site, points, at) = sides
+    places = points[at[np.isin(at, site.saved)]]
+    return overlap_share(others[~day.missed], points[site.saved], places, mine.profile)
 
 
 def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:

@@ -36,7 +36,7 @@ from teamslam.team.estimation.association.joint_compatibility import (
 from teamslam.team.estimation.association.landmark_sets import Landmarks
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from teamslam.team.estimation.association.visibility import mark_missed, miss_probabilities
-from teamslam.team.estimation.contribution import Observation, Stream
+from teamslam.team.estimation.contribution import Observation, Stream, is_map
 from teamslam.team.shapes import Bool, Float, Int64
 
 COMPARED = 6
@@ -83,8 +83,9 @@ class IslandView:
 
     ids: the identity of each landmark; place_of: its index, by identity. seen_by: landmarks of each
     submap. missed: landmarks that are probably false (`mark_missed`), with which no closure is
-    searched. sees: landmarks of each submap, updated by merges. merged: landmarks that are merged
-    into another one. ties: the merges. stamp_ns: last end of a submap.
+    searched. saved: landmarks of saved maps. sees: landmarks of each submap, updated by merges.
+    merged: landmarks that are merged into another one. ties: the merges. stamp_ns: last end of a
+    submap.
     """
 
     def __init__(
@@ -113,6 +114,10 @@ class IslandView:
         for row, places in zip(self.sees, self.seen_by, strict=True):
             row[places] = True
         self.missed = mark_missed(self.sees)
+        is_saved = [is_map(each.observation.stream) for each in submaps]
+        self.saved = join_indices(
+            places for places, saved in zip(self.seen_by, is_saved, strict=True) if saved
+        )
         self._merged_into = np.arange(count)
         self._landmarks = landmarks
         self.ties: list[tuple[int, MergeRecord]] = []
@@ -150,7 +155,7 @@ class IslandView:
             one, two = np.nonzero(submap.observation.distinct[known][:, known])
             apart[places[one], places[two]] = True
         for first, second, same in self._landmarks.verdicts:
-            here, there = self._find_place(first), self._find_place(second)
+            here, there = self.find_place(first), self.find_place(second)
             if not same and here is not None and there is not None:
                 apart[here, there] = apart[there, here] = True
         np.fill_diagonal(apart, False)
@@ -166,7 +171,8 @@ class IslandView:
         np.fill_diagonal(apart, False)
         return apart
 
-    def _find_place(self, member: LocalLandmark) -> int | None:
+    def find_place(self, member: LocalLandmark) -> int | None:
+        """Find the index of the landmark that a submap's landmark is part of, if it is here."""
         identity = self._landmarks.identity(member)
         return None if identity is None else self.place_of.get(identity)
 
@@ -195,6 +201,19 @@ class IslandView:
     def _resolve(self, places: Indices) -> Indices:
         return np.unique(self._merged_into[places])
 
+    def find_declared(self, other: "IslandView") -> set[tuple[int, int]]:
+        """Find the landmarks of two islands, by their indices, that an operator declared to be one.
+
+        A pair that another verdict declares to be two is left out.
+        """
+        found: dict[bool, set[tuple[int, int]]] = {True: set(), False: set()}
+        for one, two, same in self._landmarks.verdicts:
+            for first, second in ((one, two), (two, one)):
+                here, there = self.find_place(first), other.find_place(second)
+                if here is not None and there is not None:
+                    found[same].add((here, there))
+        return found[True] - found[False]
+
     def apply_verdicts(self) -> None:
         """Merge the landmarks that an operator has declared to be one.
 
@@ -203,8 +222,8 @@ class IslandView:
         declared = [
             (here, there, each.same)
             for each in self._landmarks.verdicts
-            if (here := self._find_place(each.first)) is not None
-            and (there := self._find_place(each.second)) is not None
+            if (here := self.find_place(each.first)) is not None
+            and (there := self.find_place(each.second)) is not None
         ]
         into = self._merged_into
         for first, second, same in declared:

@@ -17,6 +17,11 @@ MOST_REPEATED = 40
 """Largest number of landmarks that another place is expected to repeat (36 lamps of a corridor),
 which limits the context that tells a place from its repetitions.
 """
+NO_CONTEXT = (
+    "too few others to exclude a like place. Give starts, tags on some landmarks or a verdict, "
+    "or if all robots are in one place central.association.context = 0"
+)
+"""Behind a closure without context: its reason and remedy."""
 
 
 class Closure(NamedTuple):
@@ -75,7 +80,7 @@ def find_failed_test(closure: Closure, profile: AssociationProfile, tests: Closu
     outside = tests.known - 2 * pairs
     least = tests.context * min(pairs, MOST_REPEATED)
     if tests.context and outside < least:
-        return f"context {outside} < {least:.0f} landmarks: nothing to tell it from"
+        return f"context {outside} < {least:.0f} landmarks: {NO_CONTEXT}"
     return ""
 
 

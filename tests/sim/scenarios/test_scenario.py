@@ -229,6 +229,12 @@ def test_hidden_identities_take_thresholds_in_the_lengths_of_the_sensor():
     assert with_options(load("thesis"), seed=2).central.association == AssociationProfile()
     given = with_options(load("victoria"), identities="hidden").central.association
     assert given == load("victoria").central.association
+    thesis = load("thesis")
+    stated = msgspec.structs.replace(AssociationProfile(), context=0.0)
+    central = msgspec.structs.replace(thesis.central, association=stated)
+    thesis = msgspec.structs.replace(thesis, central=central)
+    without_context = with_options(thesis, identities="hidden").central.association
+    assert without_context == msgspec.structs.replace(coarse.central.association, context=0.0)
 
 
 def test_a_folder_of_detections_without_names_takes_thresholds_in_the_lengths_of_its_sensor(
