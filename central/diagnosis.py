@@ -351,6 +351,12 @@ def widening(found: Sequence[m.Diagnosis]) -> float:
     return next(scales, 1.0)
 
 
+def contradicts(found: m.Diagnosis) -> bool:
+    """Whether measurements contradict each other by more than noise does: a wrong map."""
+    is_data = found.cause == NOISY and not found.robot.startswith(MAP)
+    return is_data and found.value[0] >= MOST_SCALE
+
+
 def describe(found: m.Diagnosis) -> str:
     """Describe a cause, with figures and remedy."""
     return f"{_statement(found)}: {found.remedy}"

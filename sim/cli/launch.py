@@ -391,7 +391,7 @@ def _conclude(
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
-        outcome.failures += evaluation.missing  # with the reasons
+        outcome.failures += evaluation.failures  # with the reasons
         is_whole = not outcome.failures and len(evaluation.notes) == len(plain.notes)
         if outcome.deaths and is_whole:
             text = "; ".join(outcome.deaths)

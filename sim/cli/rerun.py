@@ -267,8 +267,8 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
             console.print(f"wrote {output / 'maps.png'}", highlight=False, soft_wrap=True)
     if changed.map is None:
         fail("the changed run ended without a final map", FAILED)
-    if missing := changed.missing:
-        fail("; ".join(missing), FAILED)
+    if failures := changed.failures:
+        fail("; ".join(failures), FAILED)
     if isinstance(log, Log) and not log.complete:
         fail(
             f"{log.path} is cut, so the result is of the part before the cut: `teamslam repair "

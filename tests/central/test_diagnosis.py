@@ -6,11 +6,14 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.diagnosis import describe, to_object
+from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
@@ -144,6 +147,33 @@ def test_noise_that_no_robot_has_is_answered_by_the_data_and_not_by_other_sigmas
     assert found.cause == "noise_underestimated"
     assert "check the columns" in found.remedy
     assert "multiply" not in found.remedy
+
+
+def test_measurements_that_contradict_each_other_beyond_any_noise_are_no_success():
+    """A covariance scale of 25; one of 4 is answered by other sigmas."""
+    (failure,) = evaluate(noisy(5.0)).failures
+    assert failure.startswith("the measurements contradict each other far beyond the stated noise")
+    assert "check the columns" in failure
+    assert "sensor's frame" not in failure, "these robots measure range and bearing"
+    assert evaluate(noisy(2.0)).failures == ()
+
+
+def test_points_in_the_axes_of_the_world_fail_the_run_and_name_their_frame(tmp_path):
+    place = write(TEAM, tmp_path / "set")
+    for robot in sorted(place.glob("r*")):
+        t, _, _, theta = np.loadtxt(robot / "truth.csv", delimiter=",", skiprows=1).T
+        seen = np.loadtxt(robot / "observations.csv", delimiter=",", skiprows=1)
+        angle = seen[:, 3] + np.interp(seen[:, 0], t, np.unwrap(theta))
+        x, y = seen[:, 2] * np.cos(angle), seen[:, 2] * np.sin(angle)
+        rows = zip(seen[:, 0], seen[:, 1].astype(int), x, y, strict=True)
+        lines = ["t_s,landmark,x_m,y_m", *(f"{a!s},{b},{c!s},{d!s}" for a, b, c, d in rows)]
+        (robot / "observations.csv").write_text("\n".join(lines) + "\n")
+    result = CliRunner().invoke(app, ["rerun", str(place)])
+    assert result.exit_code == 1, result.output
+    *_, error = result.stderr.splitlines()
+    assert "the measurements contradict each other far beyond the stated noise" in error
+    frame = "points are in the sensor's frame (ahead, left): check those of r1, r2, r3"
+    assert frame in error
 
 
 def test_noise_that_is_stated_far_too_large_is_answered_by_sigmas_and_units():

@@ -53,7 +53,8 @@ class Timed:
     """Stamps, motions and measurements of named landmarks of one stream, in any order.
 
     motions: per interval (forward [m/s], left [m/s], turn [rad/s]), or (wheel speed [m/s], steering
-    [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement.
+    [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement. has_points: whether
+    some were sent as points.
     """
 
     ends_ns: "array[int]" = field(default_factory=lambda: array("q"))
@@ -63,6 +64,7 @@ class Timed:
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     ids: "array[int]" = field(default_factory=lambda: array("q"))
     seen: "array[float]" = field(default_factory=lambda: array("d"))
+    has_points: bool = False
 
     def span_ns(self, clock_offset_s: float) -> tuple[int, int] | None:
         """Team times of the first and last measurement."""
@@ -75,6 +77,7 @@ class Timed:
         """Add an odometry interval or a scan."""
         if isinstance(message, m.AnyScan):
             scan = translate.scan_of(message)
+            self.has_points |= isinstance(message, m.Points)
             self.stamps_ns.extend([message.stamp_ns] * len(scan.ids))
             self.ids.extend(scan.ids.tolist())
             self.seen.extend(np.column_stack([scan.ranges, scan.bearings]).ravel().tolist())

@@ -42,6 +42,7 @@ from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.evaluation.states import robot_states
 from teamslam.central.desk.evaluation.verdicts import verdicts_given
 from teamslam.central.desk.names import data_set_name, in_order
+from teamslam.central.diagnosis import contradicts
 from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
@@ -437,7 +438,9 @@ def map_result(
         cost_per_dof=message.chi2 / message.dof if message.dof > 0 else None,
         reasons=message.reasons,
         diagnosis=tuple(
-            each for each in message.diagnosis if not _is_refuted(each, errors, arbitrary=arbitrary)
+            _name_points(log, each)
+            for each in message.diagnosis
+            if not _is_refuted(each, errors, arbitrary=arbitrary)
         ),
         joined=message.joined,
         withdrawn=message.withdrawn,
@@ -447,6 +450,18 @@ def map_result(
         matching=matching,
         changes=message.changes,
     )
+
+
+def _name_points(log: Collected, found: m.Diagnosis) -> m.Diagnosis:
+    """Add the frame of points to the remedy of a scale that noise does not explain, where the
+    robots measure points.
+    """
+    robots = in_order({robot for (robot, _), timed in log.timed.items() if timed.has_points})
+    of = [robot for robot in robots if found.robot in ("", robot)]
+    if not of or not contradicts(found):
+        return found
+    frame = f"points are in the sensor's frame (ahead, left): check those of {', '.join(of)}"
+    return msgspec.structs.replace(found, remedy=f"{found.remedy}; {frame}")
 
 
 def _is_refuted(found: m.Diagnosis, errors: MapErrors | None, *, arbitrary: bool) -> bool:

@@ -17,7 +17,7 @@ from teamslam.central.desk.evaluation.matching import Gospa, Matching
 from teamslam.central.desk.evaluation.robot import Consumption, PeerResult
 from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
 from teamslam.central.desk.names import not_joined, short
-from teamslam.central.diagnosis import describe
+from teamslam.central.diagnosis import contradicts, describe
 from teamslam.central.team_config import TeamConfig
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.shapes import Bool, Float, UInt32
@@ -172,6 +172,21 @@ class Evaluation:
         """Robots missing from the final map, and all landmarks if it has none: no success."""
         is_empty = self.map is not None and not len(self.map.ids)
         return (*not_in_the_map(self.states), *[NO_LANDMARK] * is_empty)
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Why the result is no success: missing robots, or measurements that contradict each other
+        by a covariance scale of MOST_SCALE or more.
+        """
+        of_map = () if self.map is None else self.map.diagnosis
+        if not any(contradicts(each) and not each.robot for each in of_map):
+            return self.missing
+        causes = "; ".join(map(describe, self.diagnosis))
+        return (
+            *self.missing,
+            "the measurements contradict each other far beyond the stated noise, so the map is not "
+            f"to be used: {causes}",
+        )
 
     @property
     def other_warnings(self) -> tuple[str, ...]:
