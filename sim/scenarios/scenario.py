@@ -105,7 +105,7 @@ def with_options(
     """Apply command-line changes; None leaves a field unchanged. Raises ScenarioError.
 
     peers, centre: whether they exist. robots: number; further ones repeat the scenario's in turn,
-    with new ids.
+    with new ids, or those of the data set's folder, which limits their number.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -119,15 +119,13 @@ def with_options(
         fields["world"] = _world_of(scenario, str(dataset))
         if scenario.name == ASSUMED_NAME:
             fields["name"] = fields["team"] = named_after(Path(dataset)) or ASSUMED_NAME
-    world = fields["world"]
+    world, names = fields["world"], tuple[str, ...]()
     if identities is not None:
         world["identities"] = identities
         if identities == "hidden" and has_default_lengths(scenario.central.association):
             fields["central"]["association"] = msgspec.to_builtins(_profile_of(scenario))
     if world["kind"] == "folder" and world["path"] and (dataset is not None or robots is not None):
-        from teamslam.sim.datasets.folder_files import robots_of
-
-        fields["robots"] = _present(fields["robots"], robots_of(world["path"]))
+        fields["robots"], names = _of_folder(fields["robots"], world["path"], robots)
     if world["kind"] == "folder" and has_default_lengths(scenario.central.association):
         from teamslam.sim.datasets.folder_files import has_detections
 
@@ -138,7 +136,7 @@ def with_options(
 
         robots = robot_count(world["path"])
     if robots is not None:
-        fields["robots"] = _fit_count(fields["robots"], robots)
+        fields["robots"] = _fit_count(fields["robots"], robots, names)
     if world["kind"] in ("unlabelled", "graph"):  # its log is cut into r1, r2, …
         numbered = enumerate(fields["robots"], start=1)
         fields["robots"] = [robot | {"id": f"r{number}"} for number, robot in numbered]
@@ -185,6 +183,19 @@ def _kind_of(path: str, otherwise: str) -> str:
         return otherwise
 
 
+def _of_folder(
+    robots: Sequence[Fields], path: str, count: int | None
+) -> tuple[list[Fields], tuple[str, ...]]:
+    """Robots that the folder has, and all names in it; raises ScenarioError if it has fewer."""
+    from teamslam.sim.datasets.folder_files import robots_of
+
+    names = robots_of(path)
+    if count is not None and count > len(names):
+        has = f"{Path(path).resolve().name} has {len(names)}: {', '.join(names)}"
+        raise ScenarioError(f"--robots {count}: {has}; give at most as many, or none")
+    return _present(robots, names), names
+
+
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
     """Robots that the data set has; without any, its own robots by their pattern."""
     chosen = [robot for robot in robots if robot["id"] in names]
@@ -216,10 +227,12 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
     ]
 
 
-def _fit_count(robots: Sequence[Fields], count: int) -> list[Fields]:
+def _fit_count(robots: Sequence[Fields], count: int, names: Sequence[str]) -> list[Fields]:
+    """The first robots; further ones have names of the data set, else r1, r2, …"""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
-    unused = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1) if f"r{i}" not in taken)
+    numbered = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1))
+    unused = (name for name in (*names, *numbered) if name not in taken)
     further = [robots[i % len(robots)] | {"id": next(unused)} for i in range(len(robots), count)]
     return [*robots[:count], *further]
 

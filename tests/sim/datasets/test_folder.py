@@ -15,7 +15,7 @@ from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.publisher.source import Source
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.config import FolderWorld
 from teamslam.sim.world.streams import FIXES as FIXES_KIND
@@ -341,10 +341,14 @@ def test_the_robots_are_the_folders_whatever_the_scenario_calls_its_own(tmp_path
     assert [robot.id for robot in scenario.robots] == ["alice", "bob"]
     assert scenario.robots[0].motion == load("recorded").robots[0].motion
     assert len(with_options(scenario, robots=1).robots) == 1
+    with pytest.raises(ScenarioError, match=f"--robots 3: {tmp_path.name} has 2: alice, bob; give"):
+        with_options(scenario, robots=3)
     own = tmp_path / "scenario.toml"
     own.write_text('base = "recorded"\n[world]\npath = "."\n[[robots]]\nid = "bob"\n')
     assert scenario_beside(tmp_path) == str(own)
     assert [robot.id for robot in with_options(load(own), dataset=tmp_path).robots] == ["bob"]
+    both = with_options(load(own), dataset=tmp_path, robots=2)
+    assert [robot.id for robot in both.robots] == ["bob", "alice"]
 
 
 def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
