@@ -27,6 +27,7 @@ from teamslam.team.estimation.map_joining.distinctness import (
     find_lost_streams,
     find_missed,
     find_odometry_ties,
+    find_parts,
     find_repetitions,
     find_weakly_placed,
 )
@@ -172,13 +173,16 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     weak = find_weakly_placed(fold.main, unnamed)
     seldom = find_missed(fold, {*unnamed} - {*weak})
     out, view = {*weak, *seldom}, view_island(fold.main, fold.landmarks)
-    undecided = find_possible_duplicates(view, {*unnamed} - out)
+    unnamed = [id_ for id_ in unnamed if id_ not in out]
+    parts = find_parts(fold.main) if not fold.condensed_count else {}
+    undecided = find_possible_duplicates(view, unnamed, parts)
     left = [id_ for id_ in ids if id_ not in out | {*undecided}]
     repeated = find_repetitions(fold.main, left)
     copies = {id_ for each in repeated for id_ in each.ids}
     left = [id_ for id_ in left if id_ not in copies]
-    tied = find_odometry_ties(fold.main, left) if not fold.condensed_count else []
-    return Shown(left, undecided, weak, seldom, find_lost_streams(fold.main), repeated, tied)
+    lost = find_lost_streams(fold.main)
+    tied = find_odometry_ties(fold.main, left, undecided) if not fold.condensed_count else []
+    return Shown(left, undecided, weak, seldom, lost, repeated, tied)
 
 
 def reasons(
@@ -238,8 +242,8 @@ def _tied(shown: Shown) -> Iterator[str]:
             f"the map may be wrong from submap {each.first} of {named(each.stream)} on (t = "
             f"{each.begin_ns * 1e-9:.0f} to {each.end_ns * 1e-9:.0f} s): odometry alone, to "
             f"{metres:.1f} m and {np.degrees(radians):.0f}°, places its {each.later} landmarks "
-            f"beside the {each.earlier} others; if the robot was carried off or slipped there, "
-            "no landmark shows it"
+            f"beside the {each.earlier} others; some of them may be the same, and if the robot was "
+            "carried off or slipped there, no landmark shows it: drive past landmarks of both"
         )
 
 

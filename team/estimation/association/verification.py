@@ -1,6 +1,6 @@
 """The tests of a closure, at its proposal and during its audit, and of a map's landmarks."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -154,20 +154,25 @@ def nearest_distance(
     return away
 
 
-def find_possible_duplicates(view: IslandView, ids: Collection[int]) -> dict[int, int]:
+def find_possible_duplicates(
+    view: IslandView, ids: Collection[int], parts: Mapping[int, int]
+) -> dict[int, int]:
     """Map each of these landmarks that may be one with another of them to the likeliest, which
     stays.
 
     They are within the gate, with the evidence of a pair that is merged, or in such a density that
-    no pair would have it. The landmark with the most certain position stays, by the area of its
-    covariance's ellipse.
+    no pair would have it, or in two `parts` that no common landmark ties: their pairs have one
+    error, which no single pair decides. The landmark with the most certain position stays, by the
+    area of its covariance's ellipse.
     """
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
     one, two = (own[each] for each in np.triu_indices(len(own), 1))
     at = evaluate_pairs(joint, one, two, profile)
     decidable = at.llr + 0.5 * at.chi2 >= profile.llr_tight
-    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~decidable)
+    part = np.array([parts.get(id_, 0) for id_ in sorted(ids)], np.int64)
+    by_odometry = np.not_equal(*(part[each] for each in np.triu_indices(len(own), 1)))
+    maybe = (at.chi2 < profile.gate) & ((at.llr >= profile.llr_tight) | ~decidable | by_odometry)
     maybe &= ~joint.apart[one, two]
     llr: dict[int, dict[int, float]] = {}
     for a, b, ratio in zip(

@@ -97,6 +97,16 @@ def find_lost_streams(island: Island) -> dict[Stream, float]:
     return {stream: sigma for stream, sigma in worst.items() if sigma > limit}
 
 
+def find_parts(island: Island) -> dict[int, int]:
+    """Label the landmarks by the part of the island that common landmarks tie."""
+    node_of = island.graph.landmarks
+    part = np.arange(len(node_of))
+    for sees in _tabulate(island, [*node_of.values()]):
+        labels = part[sees]
+        part[np.isin(part, labels)] = labels.min(initial=len(part))
+    return dict(zip(node_of, part.tolist(), strict=True))
+
+
 LEAST_TIED = 2
 """Least number of landmarks on either side of a place that odometry alone ties."""
 
@@ -117,15 +127,21 @@ class OdometryTie(NamedTuple):
     sigmas: tuple[float, float]
 
 
-def find_odometry_ties(island: Island, ids: Collection[int]) -> list[OdometryTie]:
-    """Find the place of each stream with the most landmarks `ids` on both sides.
+def find_odometry_ties(
+    island: Island, shown: Collection[int], undecided: Collection[int] = ()
+) -> list[OdometryTie]:
+    """Find the place of each stream with the most landmarks on both sides, of which one at least is
+    shown: the others may be the same landmarks twice.
 
     An error of the odometry there beyond its covariance contradicts nothing.
     """
     unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)
     sees = _tabulate(island, unnamed)
     node_of = island.graph.landmarks
-    counted = np.isin(unnamed, [node_of[id_] for id_ in ids if id_ in node_of])
+    is_shown, counted = (
+        np.isin(unnamed, [node_of[id_] for id_ in ids if id_ in node_of])
+        for ids in (shown, {*shown, *undecided})
+    )
     submaps, found = island.graph.submaps, []
     for stream in sorted(island.graph.streams):
         rows = [k for k, each in enumerate(submaps) if each.contribution.stream == stream]
@@ -136,7 +152,9 @@ def find_odometry_ties(island: Island, ids: Collection[int]) -> list[OdometryTie
             beyond = sees[rows[k:]].any(axis=0)
             counts = int((rest & counted).sum()), int((beyond & counted).sum())
             least = min(counts)
-            if least >= LEAST_TIED and not (rest & beyond).any() and (not best or least > best[0]):
+            if (rest & beyond).any() or not ((rest & is_shown).any() and (beyond & is_shown).any()):
+                continue
+            if least >= LEAST_TIED and (not best or least > best[0]):
                 best = least, k, *counts
         if best is None:
             continue

@@ -15,7 +15,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.auditing import fold_tick
-from teamslam.team.estimation.map_joining.distinctness import find_odometry_ties
+from teamslam.team.estimation.map_joining.distinctness import find_odometry_ties, find_parts
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
@@ -106,6 +106,34 @@ def test_landmarks_on_both_sides_tie_a_map():
     path, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.1), many, rng, reach=6.0)
     fold = folded(path)
     assert find_odometry_ties(fold.main, fold.main.graph.landmarks) == []
+    assert len({*find_parts(fold.main).values()}) == 1
+
+
+def sides(main: Island, first: int) -> tuple[set[int], set[int]]:
+    """List the landmarks of the submaps before `first`, and those of the others."""
+    id_of = {node: id_ for id_, node in main.graph.landmarks.items()}
+    seen: tuple[set[int], set[int]] = set(), set()
+    for each in main.graph.submaps:
+        seen[each.contribution.sequence >= first].update(id_of[k] for k in each.landmarks.tolist())
+    return seen
+
+
+def test_a_tie_counts_possible_duplicates_beside_a_shown_landmark_on_each_side():
+    main = far_apart().main
+    (whole,) = find_odometry_ties(main, main.graph.landmarks)
+    near, far = sides(main, whole.first)
+    (tie,) = find_odometry_ties(main, [min(near), min(far)], near | far)
+    assert tie == whole
+    assert find_odometry_ties(main, [], near | far) == []
+    assert find_odometry_ties(main, [min(near), min(far)]) == []
+
+
+def test_no_part_of_a_map_has_landmarks_of_both_sides_of_a_tie():
+    main = far_apart().main
+    (tie,) = find_odometry_ties(main, main.graph.landmarks)
+    part = find_parts(main)
+    near, far = ({part[id_] for id_ in side} for side in sides(main, tie.first))
+    assert near.isdisjoint(far)
 
 
 def test_a_wall_that_hides_the_landmarks_of_each_side_is_no_seam():
@@ -123,11 +151,11 @@ def test_a_wall_that_hides_the_landmarks_of_each_side_is_no_seam():
     assert find_late_seam(folded(one, later(round_it, 13), later(two, 16)).main) is None
 
 
-def run(*off: CarriedOff, seed: int = 3) -> tuple[m.FusedMap, np.ndarray]:
-    """Run one robot among eleven landmarks; return the final map and the true landmarks."""
-    world = StressWorld(
-        seed=seed, robots=1, hidden=True, landmarks=11, seconds=240.0, carried_off=off
-    )
+SPARSE_WORLD = StressWorld(seed=3, robots=1, hidden=True, landmarks=11, seconds=240.0)
+
+
+def run(world: StressWorld) -> tuple[m.FusedMap, np.ndarray]:
+    """Run one robot; return the final map and the true landmarks."""
     with TemporaryDirectory() as folder:
         place = write(world, Path(folder))
         scenario = final_only(scenario_in(place))
@@ -138,7 +166,9 @@ def run(*off: CarriedOff, seed: int = 3) -> tuple[m.FusedMap, np.ndarray]:
 
 @pytest.mark.parametrize("metres", [5.0, 15.0])
 def test_the_final_map_of_few_landmarks_has_no_second_copy_and_names_the_time(metres):
-    final, landmarks = run(CarriedOff("r1", metres, 1.2, 120.0))
+    final, landmarks = run(
+        replace(SPARSE_WORLD, carried_off=(CarriedOff("r1", metres, 1.2, 120.0),))
+    )
     means = floats(final.means, "means").reshape(-1, 2)
     away = np.hypot(*(means[:, None] - landmarks).transpose(2, 0, 1))
     assert len(means) >= 5
@@ -150,6 +180,20 @@ def test_the_final_map_of_few_landmarks_has_no_second_copy_and_names_the_time(me
 
 
 def test_the_same_robot_left_alone_is_not_cut():
-    final, _ = run()
+    final, _ = run(SPARSE_WORLD)
     assert not any(each.cause == "carried_off" for each in final.diagnosis)
     assert not any("refused" in each for each in final.reasons)
+
+
+@pytest.mark.parametrize("seed", [401, 425])
+def test_a_landmark_that_two_parts_may_share_is_shown_once(seed):
+    """The robot returns to a few landmarks, too few for a closure."""
+    landmarks, half, reach = {401: (8, 20.0, 10.0), 425: (9, 15.0, 6.0)}[seed]
+    final, truth = run(
+        replace(SPARSE_WORLD, seed=seed, landmarks=landmarks, half_m=half, reach_m=reach)
+    )
+    means = floats(final.means, "means").reshape(-1, 2)
+    nearest = np.hypot(*(means[:, None] - truth).transpose(2, 0, 1)).argmin(axis=1)
+    assert len(means) >= 5
+    assert len({*nearest.tolist()}) == len(means)
+    assert any("odometry alone" in each for each in final.reasons)
