@@ -68,8 +68,10 @@ class _SharedError(NamedTuple):
 
 
 NOISY: Final = "noise_underestimated"
-MOST_SCALE = 10.0
-"""Largest covariance scale, and inverse of the least one, that other sigmas are advised for."""
+DOUBTFUL_SCALE = 10.0
+"""Covariance scale, and inverse of one, from which the data are doubted beside the sigmas."""
+MOST_SCALE = 100.0
+"""Least covariance scale that no noise explains: sigmas ten times too small."""
 _CLOCK = "add {value:.3g} to its clock_offset_s"
 _ERRORS: Mapping[str, _SharedError] = {
     "clock_offset": _SharedError("clock_offset", 0.02, " s", "late", "early", _CLOCK),
@@ -328,21 +330,21 @@ def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
 
 
 def _remedy_of_scale(robot: str, value: float) -> str:
-    """Describe the remedy: other sigmas up to MOST_SCALE; none for a saved map."""
+    """Describe the remedy: other data, other sigmas; none for a saved map."""
     if robot.startswith(MAP):
         if value < 1.0:
             return "leave out days that the saved map contains already: each counts once"
         return "the place has changed since the map was saved, or the map is of another place"
+    data = "the columns (range and bearing, ids), units, clocks and robots' names of the data"
     if value >= MOST_SCALE:
-        return (
-            "noise is not stated that far off: check the columns (range and bearing, ids), units, "
-            "clocks and robots' names of the data (docs/faq.md)"
-        )
+        return f"noise is not stated that far off: check {data} (docs/faq.md)"
     remedy = (
         f"multiply the sigmas of sensor and odometry by {math.sqrt(value):.2g}, or with ground "
         "truth learn them by `teamslam calibrate`"
     )
-    return remedy if value > 1.0 / MOST_SCALE else f"{remedy}; check the units of the data, too"
+    if value >= DOUBTFUL_SCALE:
+        return f"check {data} first (docs/faq.md); if they are right, {remedy}"
+    return remedy if value > 1.0 / DOUBTFUL_SCALE else f"{remedy}; check the units of the data, too"
 
 
 def widening(found: Sequence[m.Diagnosis]) -> float:

@@ -142,20 +142,23 @@ def test_noise_that_is_stated_wrong_is_named_with_its_factor(noise, cause):
     assert found.value[0] == pytest.approx(noise**2, rel=0.35)
 
 
-def test_noise_that_no_robot_has_is_answered_by_the_data_and_not_by_other_sigmas():
-    (found,) = final_map(noisy(5.0)).diagnosis
+def test_noise_far_from_the_stated_one_is_answered_by_the_data_first_and_is_no_failure():
+    result = evaluate(noisy(5.0))
+    (found,) = result.diagnosis
     assert found.cause == "noise_underestimated"
-    assert "check the columns" in found.remedy
-    assert "multiply" not in found.remedy
+    assert found.remedy.index("check the columns") < found.remedy.index("multiply the sigmas")
+    assert result.failures == ()
 
 
 def test_measurements_that_contradict_each_other_beyond_any_noise_are_no_success():
-    """A covariance scale of 25; one of 4 is answered by other sigmas."""
-    (failure,) = evaluate(noisy(5.0)).failures
+    result = evaluate(noisy(16.0))
+    (of_team,) = [each for each in result.diagnosis if each.cause == "noise_underestimated"]
+    assert of_team.robot == ""
+    assert "multiply" not in of_team.remedy
+    (failure,) = result.failures
     assert failure.startswith("the measurements contradict each other far beyond the stated noise")
     assert "check the columns" in failure
     assert "sensor's frame" not in failure, "these robots measure range and bearing"
-    assert evaluate(noisy(2.0)).failures == ()
 
 
 def test_points_in_the_axes_of_the_world_fail_the_run_and_name_their_frame(tmp_path):
