@@ -175,6 +175,13 @@ def test_smoothed_poses_at_ends_of_submaps_are_dots_without_chords(page, ends, d
     assert shapes() - before == drawn
 
 
+def test_after_a_jump_only_the_latest_messages_are_on_their_way(page):
+    page.ask("teamslam.seek(5); teamslam.seek(60)")
+    page.wait("teamslam.state.time === 60")
+    page.ask("new Promise((done) => setTimeout(done, 200))")
+    assert page.ask("teamslam.map.pace") == page.ask("teamslam.state.speed")
+
+
 def test_the_keyboard_moves_time_and_follows_a_robot(page):
     seek(page, 30)
     for name, key in (("ArrowRight", "ArrowRight"), ("ArrowLeft", "ArrowLeft"), ("r", "r")):

@@ -184,7 +184,8 @@ function turn(now) {
       state.following = !store.complete;
     }
   }
-  if (moving() && passed > 0) map.pace = state.playing ? state.speed : Math.max(0.95 * map.pace + 0.05 * ((state.time - earlier) / passed), 1);
+  if (!moving() || state.playing) map.pace = state.speed;  // also after a jump, and once a log is loaded
+  else if (passed > 0) map.pace = Math.max(0.95 * map.pace + 0.05 * ((state.time - earlier) / passed), 1);
   const wanted = `${state.time}|${store.version}|${map.centre}|${map.scale}|${map.chosen}|${map.fitted}|${Object.values(map.on)}|${innerWidth}|${innerHeight}`;
   if (wanted !== drawn || map.pending || map.canvas.width !== Math.round(map.canvas.clientWidth * map.ratio)) {
     drawn = wanted;
