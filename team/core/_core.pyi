@@ -353,14 +353,6 @@ def upper_and_product(U: NDArray[numpy.float64], among: NDArray[numpy.int64], si
     `size` rows. Below the diagonal U is not read and the result is undefined.
     """
 
-def packed_upper(U: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """Pack the upper triangle, row after row."""
-
-def unpacked_upper(packed: NDArray[numpy.float64], n: int) -> NDArray[numpy.float64]:
-    """
-    Unpack an upper triangle to a square matrix with zeros below the diagonal.
-    """
-
 def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.

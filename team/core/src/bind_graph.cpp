@@ -183,24 +183,6 @@ void bind_graph(nb::module_& m) {
         "U"_a, "among"_a, "size"_a, "A"_a, "B"_a,
         "Add the upper triangle of U among some ascending rows and columns and that of A B, at the corner of a square of\n"
         "`size` rows. Below the diagonal U is not read and the result is undefined.");
-  m.def("packed_upper",
-        [](const Table& U) {
-          const std::size_t n = U.shape(0);
-          check(U.shape(1) == n, "the matrix must be square");
-          std::vector<double> packed;
-          packed.reserve(n * (n + 1) / 2);
-          for (std::size_t i = 0; i < n; i++) packed.insert(packed.end(), &U(i, i), U.data() + (i + 1) * n);
-          return packed;
-        },
-        "U"_a, "Pack the upper triangle, row after row.");
-  m.def("unpacked_upper",
-        [](Values packed, std::size_t n) {
-          check(n <= packed.size() && packed.size() == n * (n + 1) / 2, "a triangle of n rows has n (n + 1) / 2 numbers");
-          Matrix U(n, n);
-          for (std::size_t i = 0, at = 0; i < n; at += n - i, i++) std::copy_n(&packed[at], n - i, U[i] + i);
-          return U;
-        },
-        "packed"_a, "n"_a, "Unpack an upper triangle to a square matrix with zeros below the diagonal.");
   m.def("own_blocks",
         [](const Table& upper, const Table& spread) {
           const std::size_t count = spread.shape(0) / 2, n = spread.shape(1);

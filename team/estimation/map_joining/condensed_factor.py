@@ -153,14 +153,12 @@ class Resting:
         """The upper triangle of a square matrix; the rest is not read."""
         if self.covariance.ndim == 2:
             return self.covariance
-        return core.unpacked_upper(self.covariance, len(self.means))
+        return core.unpacked(self.covariance, len(self.means))
 
     @property
     def packed(self) -> "Resting":
         """The same in half the memory."""
-        packed = (
-            core.packed_upper(self.covariance) if self.covariance.ndim == 2 else self.covariance
-        )
+        packed = core.packed(self.covariance) if self.covariance.ndim == 2 else self.covariance
         return replace(self, covariance=packed)
 
     @cached_property
