@@ -243,7 +243,7 @@ def run_nodes(
     recorder = MemoryBus(network)
     for channel in ch.CHANNELS:
         if channel.recorded:
-            recorder.subscribe(channel, "**")
+            recorder.subscribe(channel)
     recorder.watch_alive()
     names = [config.id for config in scenario.robots]
     source = _Seat(world, MemoryBus(network), Link(), Boundary("world"))

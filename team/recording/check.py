@@ -1,14 +1,13 @@
 """Check that a log is whole, complete and valid."""
 
 import json
+from array import array
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from teamslam.team.recording.counters import Counters, match_totals, split_lives
+from teamslam.team.recording.counters import LATEST_NS, Counters
 from teamslam.team.recording.cut import CUT
 from teamslam.team.recording.inventory import MISSING, Inventory
 from teamslam.team.recording.reader import Declared, Log
@@ -70,59 +69,12 @@ def holes(log: Log) -> list[Finding]:
 
 
 @dataclass
-class LastWords:
-    """Statuses and final totals of each process; 24 bytes a status and more."""
-
-    _statuses: dict[str, list[tuple[int, int, int]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
-    """By node, in order of arrival: counter, wall clock [ns], team time [ns]."""
-    _totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
-    """By node and process start, the number of statuses in the process's final totals."""
-
-    def take_status(self, node: str, sample: Sample) -> None:
-        """Add a node's status."""
-        if sample.counter != NO_COUNTER:
-            status = sample.counter, min(sample.wall_ns, 2**63 - 1), sample.stamp_ns
-            self._statuses[node].append(status)
-
-    def take_tally(self, tally: m.Tally) -> None:
-        """Add a process's final totals."""
-        totals = dict(zip(tally.keys, tally.counts, strict=True))
-        count = totals.get(ch.STATUS.key(tally.node), 0)
-        self._totals[tally.node][tally.since_ns] = count
-
-    def findings(self) -> Iterator[tuple[str, str]]:
-        """Yield keys and gaps in the record of their processes; none if no process published
-        totals.
-
-        Logs of nodes in memory have no totals.
-        """
-        if not self._totals:
-            return
-        for node, statuses in sorted(self._statuses.items()):
-            counters, walls, stamps_ns = np.array(statuses, np.int64).T
-            lives = split_lives(counters, walls)
-            published = [int(counters[life[-1]]) + 1 for life in lives]
-            totals = tuple(self._totals.get(node, {}).values())
-            ended = {life for _, life in match_totals(published, totals)}
-            for k, life in enumerate(lives):
-                if k not in ended:
-                    last_s = stamps_ns[life[-1]] * 1e-9
-                    yield (
-                        ch.TALLY.key(node),
-                        f"the process with messages until {last_s:.1f} s announced no totals: "
-                        "it was killed or cut off, and its later messages may be missing",
-                    )
-
-
-@dataclass
 class _Evidence:
     """Evidence about missing samples.
 
     part: the log is a cut. repaired: it was unfinished. totals: by key, each process's final number
-    of publications, by its start. channels: those of `_READ` in the log. plain: keys of other
-    channels.
+    of publications, by its start. statuses: team times [ns] of the counted statuses of each node.
+    channels: those of `_READ` in the log. plain: keys of other channels.
     """
 
     part: bool
@@ -130,7 +82,7 @@ class _Evidence:
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
     totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
-    last_words: LastWords = field(default_factory=LastWords)
+    statuses: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(_stamps))
     last_word: tuple[str, ...] = ()
     channels: set[ch.Channel] = field(default_factory=set)
     plain: set[str] = field(default_factory=set)
@@ -146,19 +98,30 @@ class _Evidence:
         if row is None or row[0] not in _READ:
             self.plain.add(sample.key)
             return
-        self.channels.add(row[0])
-        if row[0] not in (ch.TALLY, ch.STATUS):
-            return
-        found = try_open(sample)
-        message = None if found is None else found[2]
-        if isinstance(message, m.Status) and row[1] == "recorder":
-            self.last_word = message.warnings
-        elif isinstance(message, m.Status):
-            self.last_words.take_status(row[1], sample)
-        elif isinstance(message, m.Tally):
-            self.last_words.take_tally(message)
-            for key, count in zip(message.keys, message.counts, strict=True):
-                self.totals[key][message.since_ns] = count
+        channel, node = row
+        self.channels.add(channel)
+        if channel is ch.STATUS and node != "recorder":
+            if sample.counter != NO_COUNTER:
+                self.statuses[sample.key].append(min(sample.stamp_ns, LATEST_NS))
+        elif channel in (ch.TALLY, ch.STATUS):
+            found = try_open(sample)
+            match None if found is None else found[2]:
+                case m.Status() as status:
+                    self.last_word = status.warnings
+                case m.Tally() as tally:
+                    for key, count in zip(tally.keys, tally.counts, strict=True):
+                        self.totals[key][tally.since_ns] = count
+
+    def killed(self) -> Iterator[Finding]:
+        """Yield processes that announced no totals; none if no process did, as in memory."""
+        for key, stamps_ns in sorted(self.statuses.items()) if self.totals else ():
+            node = key.removesuffix("/status")
+            for last in self.counters[key].unannounced(tuple(self.totals[key].values())):
+                yield Finding(
+                    ch.TALLY.key(node),
+                    f"the process with messages until {stamps_ns[last] * 1e-9:.1f} s announced no "
+                    "totals: it was killed or cut off, and its later messages may be missing",
+                )
 
     def findings(self) -> Iterator[Finding]:
         """Yield findings by key; of a cut only gaps between two messages of a publisher."""
@@ -177,8 +140,8 @@ class _Evidence:
         if self.repaired and not self.part and not self.channels & _FINAL:
             yield Finding(FILE, NO_FINAL)
         if not self.part:
-            for key, line in (*self.inventory.findings(), *self.last_words.findings()):
-                yield Finding(key, line)
+            yield from (Finding(*found) for found in self.inventory.findings())
+            yield from self.killed()
             if self.channels & set(_OF_AN_END) and not self.channels & {
                 ch.END,
                 ch.HEAD,
@@ -210,6 +173,10 @@ def _of_file(log: Log) -> list[Finding]:
                 damage = check_index(file)
             found += [] if damage is None else [Finding(FILE, damage)]
     return found
+
+
+def _stamps() -> "array[int]":
+    return array("q")
 
 
 def _evidence(log: Log) -> _Evidence:

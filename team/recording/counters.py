@@ -15,7 +15,7 @@ from teamslam.team.wire.intervals import Interval, IntervalSet, describe_interva
 
 Life = Int64[np.ndarray, "_"]
 """Positions of one life's publications, by counter."""
-_LATEST = 2**63 - 1
+LATEST_NS = 2**63 - 1
 """Largest wall clock [ns]; later ones are from damaged or hostile logs."""
 
 
@@ -33,7 +33,7 @@ class Counters:
             self._replies += 1
             return
         self._counters.append(sample.counter)
-        self._walls.append(sample.wall_ns if sample.wall_ns < _LATEST else _LATEST)
+        self._walls.append(sample.wall_ns if sample.wall_ns < LATEST_NS else LATEST_NS)
 
     def findings(
         self, *, part: bool, numbered: bool = False, totals: Sequence[int] = ()
@@ -43,7 +43,7 @@ class Counters:
         part: the log is a cut, so earlier publications are not missing. numbered: messages have
         their own numbers. totals: publishers' final counts.
         """
-        counters, walls = (np.frombuffer(each, np.int64) for each in (self._counters, self._walls))
+        counters, walls = self._arrays()
         order = np.lexsort((walls, counters))
         again = np.zeros(len(order), np.bool_)
         again[1:] = (np.diff(counters[order]) == 0) & (np.diff(walls[order]) == 0)
@@ -65,6 +65,17 @@ class Counters:
         if lost > self._replies:
             found.append(f"{_messages(lost)} missing: {describe_intervals(gaps)}")
         return found
+
+    def _arrays(self) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+        return np.frombuffer(self._counters, np.int64), np.frombuffer(self._walls, np.int64)
+
+    def unannounced(self, totals: Sequence[int]) -> list[int]:
+        """Return the position of the last publication of each life that has no total."""
+        counters, walls = self._arrays()
+        lives = split_lives(counters, walls)
+        published = [int(counters[life[-1]]) + 1 for life in lives]
+        ended = {life for _, life in match_totals(published, totals)}
+        return [int(life[-1]) for k, life in enumerate(lives) if k not in ended]
 
 
 def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"]) -> list[Life]:

@@ -12,43 +12,11 @@ from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream
 from teamslam.team.recording.part_files import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
-from teamslam.team.wire.channels import (
-    ALIVE,
-    CHANNELS,
-    CONCLUDED,
-    ENDS,
-    FINAL_MAP,
-    GIVEN_UP,
-    KEPT,
-    MEASUREMENTS,
-    ORDER,
-    ORDERS,
-    RECORDED,
-    RECORDER_PROGRESS,
-    SENSORS,
-    SENT,
-    STATUS,
-    SUBMAP,
-    TALLY,
-    WORLD_CONFIG,
-    channel_of,
-    robot_of,
-    row_of,
-)
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.intervals import describe_intervals
-from teamslam.team.wire.messages import (
-    Configuration,
-    KeptRequest,
-    Liveliness,
-    MeasurementsRequest,
-    Message,
-    Progress,
-    Status,
-    SubmapsRequest,
-    Tally,
-)
 from teamslam.team.wire.request_times import RequestTimes
 
 
@@ -120,13 +88,13 @@ class RecordLoop:
         self._messages = 0
         self._statuses = 0
         self._dropped = 0
-        self._leaving: dict[str, Tally] = {}
-        for channel in CHANNELS:
-            if channel.recorded and channel is not ALIVE:
+        self._leaving: dict[str, m.Tally] = {}
+        for channel in ch.CHANNELS:
+            if channel.recorded and channel is not ch.ALIVE:
                 bus.subscribe(channel, whole=True)
-        orders = tuple(channel.name for channel in ORDERS if channel.recorded)
+        orders = tuple(channel.name for channel in ch.ORDERS if channel.recorded)
         bus.request(
-            KEPT, "", KeptRequest(stamp_ns=0, channels=orders)
+            ch.KEPT, "", m.KeptRequest(stamp_ns=0, channels=orders)
         )  # their publisher may have left
         bus.watch_alive()
         bus.declare_alive(NODE)
@@ -152,7 +120,7 @@ class RecordLoop:
         behind stops the reports, which are credit.
         """
         noted = [
-            (each, self._note_sample(each)) for each in samples if row_of(each.key) is not None
+            (each, self._note_sample(each)) for each in samples if ch.row_of(each.key) is not None
         ]
         self._dropped += len(samples) - len(noted)
         self._write([own for sample, own in noted if self._inventory.is_new(sample)])
@@ -165,7 +133,7 @@ class RecordLoop:
         for (robot, incarnation), (measurements, submaps) in self._inventory.counts().items():
             before = self._reported.get((robot, incarnation), (0, 0))
             if measurements - before[0] >= every or submaps > before[1]:
-                progress = Progress(
+                progress = m.Progress(
                     stamp_ns=self._newest_ns,
                     node=NODE,
                     robot=robot,
@@ -173,27 +141,27 @@ class RecordLoop:
                     measurements=measurements,
                     submaps=submaps,
                 )
-                self._bus.publish(Outgoing(RECORDER_PROGRESS, robot, progress))
+                self._bus.publish(Outgoing(ch.RECORDER_PROGRESS, robot, progress))
                 self._reported[robot, incarnation] = (measurements, submaps)
 
     @property
     def _is_far_behind(self) -> bool:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
-    def _note_tally(self, sample: Sample) -> Tally | None:
-        if TALLY.owner(sample.key) is None:
+    def _note_tally(self, sample: Sample) -> m.Tally | None:
+        if ch.TALLY.owner(sample.key) is None:
             return None
         with suppress(WireError):
             message = opened(sample)[2]
-            if isinstance(message, Tally):
+            if isinstance(message, m.Tally):
                 self._leaving[message.node] = message
                 return message
         return None
 
-    def _report_lacking(self, tally: Tally) -> None:
+    def _report_lacking(self, tally: m.Tally) -> None:
         found = self._inventory.received.lacking(tally, self._bus.find_awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
-        self._bus.publish(Outgoing(RECORDED, tally.node, has))
+        self._bus.publish(Outgoing(ch.RECORDED, tally.node, has))
 
     def _write(self, samples: list[Sample]) -> None:
         if self._recorder is None:
@@ -244,7 +212,7 @@ class RecordLoop:
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
             if kind == "measurements":
-                requested = MeasurementsRequest(
+                requested = m.MeasurementsRequest(
                     stamp_ns=self._newest_ns,
                     robot=robot,
                     incarnation=incarnation,
@@ -252,12 +220,12 @@ class RecordLoop:
                     last=last,
                     only=True,
                 )
-                self._bus.request(MEASUREMENTS, robot, requested)
+                self._bus.request(ch.MEASUREMENTS, robot, requested)
             else:
                 self._bus.request(
-                    SENT,
+                    ch.SENT,
                     robot,
-                    SubmapsRequest(
+                    m.SubmapsRequest(
                         stamp_ns=self._newest_ns, robot=robot, incarnation=incarnation, first=first
                     ),
                 )
@@ -269,28 +237,28 @@ class RecordLoop:
         others = [
             f"{key}: {describe_intervals(lost)}"
             for key, lost in self._bus.find_missing().items()
-            if (found := channel_of(key)) is None or found[0] not in (*SENSORS, SUBMAP)
+            if (found := ch.channel_of(key)) is None or found[0] not in (*ch.SENSORS, ch.SUBMAP)
         ]
         return [*numbered, *others]
 
     def _note_sample(self, sample: Sample) -> Sample:
-        found = channel_of(sample.key)
+        found = ch.channel_of(sample.key)
         if found is None:
             return sample
         channel, name = found
-        if channel is ALIVE:
+        if channel is ch.ALIVE:
             return self._note_liveliness(sample, name)
         self._newest_ns = max(self._newest_ns, sample.stamp_ns)
-        self._has_map = self._has_map or channel is FINAL_MAP
-        if channel is CONCLUDED or channel is ORDER:
+        self._has_map = self._has_map or channel is ch.FINAL_MAP
+        if channel is ch.CONCLUDED or channel is ch.ORDER:
             self._unconcluded.discard(name)
-        elif channel is GIVEN_UP:
-            self._unconcluded.discard(robot_of(name) or "")
+        elif channel is ch.GIVEN_UP:
+            self._unconcluded.discard(ch.robot_of(name) or "")
         return sample
 
     def _note_liveliness(self, sample: Sample, node: str) -> Sample:
         try:
-            came = decoded(sample.payload, Liveliness).alive
+            came = decoded(sample.payload, m.Liveliness).alive
         except WireError as error:  # not a node name: recorded unchanged
             _LOG.warning("%.80s: %s", sample.key, error)
             return msgspec.structs.replace(sample, stamp_ns=self._newest_ns)
@@ -298,7 +266,7 @@ class RecordLoop:
         if not came:
             self._leaving.pop(node, None)
         self._missing.discard(node)
-        message = Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
+        message = m.Liveliness(stamp_ns=self._newest_ns, node=node, alive=came)
         return msgspec.structs.replace(sample, payload=encoded(message), stamp_ns=self._newest_ns)
 
     def check_end(self, end: EndQuery) -> None:
@@ -309,7 +277,7 @@ class RecordLoop:
         if missed and self._has_ended:
             self._alive = {node for node in self._alive if self._bus.is_alive(node)}
 
-    def status(self, *, last: bool = False) -> Status:
+    def status(self, *, last: bool = False) -> m.Status:
         """Publish and log the recorder's status; the last one lists missing messages."""
         for tally in [] if last or self._is_far_behind else self._leaving.values():
             self._report_lacking(tally)
@@ -322,7 +290,7 @@ class RecordLoop:
         absent = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
         lacking = tuple(f"{MISSING}{what}" for what in self.lacking) if last else ()
         state = "done" if last else "recording"
-        status = Status(
+        status = m.Status(
             stamp_ns=self._newest_ns,
             node=NODE,
             state=state,
@@ -330,12 +298,12 @@ class RecordLoop:
             warnings=(*failure, *absent, *lacking),
             run=self._run,
         )
-        self._bus.publish(Outgoing(STATUS, NODE, status))
-        self._write([_own(STATUS.key(NODE), status, self._statuses)])
+        self._bus.publish(Outgoing(ch.STATUS, NODE, status))
+        self._write([_own(ch.STATUS.key(NODE), status, self._statuses)])
         self._statuses += 1
         return status
 
-    def run(self, stop: threading.Event, scenario: Sequence[Configuration] = ()) -> int:
+    def run(self, stop: threading.Event, scenario: Sequence[m.Configuration] = ()) -> int:
         """Record until the final map is present and all nodes have left, or until `stop`; return
         the number of messages written.
 
@@ -343,11 +311,11 @@ class RecordLoop:
         write error: at once without `more`, else at the end.
         """
         with closing(self):
-            announced = [_own(WORLD_CONFIG.key(), each, 0) for each in scenario]
+            announced = [_own(ch.WORLD_CONFIG.key(), each, 0) for each in scenario]
             self._write([each for each in announced if self._inventory.is_new(each)])
             due = time.monotonic()
             remind_due = due + _REMIND_S
-            end = EndQuery(self._bus, NODE, ENDS if self._are_peers else (FINAL_MAP,))
+            end = EndQuery(self._bus, NODE, ch.ENDS if self._are_peers else (ch.FINAL_MAP,))
             while not stop.is_set():
                 if self.finished:
                     # A token has priority over data: overtaken messages still arrive.
@@ -388,5 +356,5 @@ def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Ev
     return published
 
 
-def _own(key: str, message: Message, counter: int) -> Sample:
+def _own(key: str, message: m.Message, counter: int) -> Sample:
     return Sample(key, encoded(message), message.stamp_ns, time.time_ns(), counter)

@@ -1,4 +1,4 @@
-"""Arrays on the wire: little-endian `bin` fields. The core checks their contents.
+"""Arrays on the wire: little-endian `bin` fields, whose contents the core checks.
 
 NumPy (14 MB) is imported at the first array; router and recorder receive none.
 """
@@ -43,7 +43,7 @@ def floats(data: Floats, what: str) -> "np.typing.NDArray[np.float64]":
 
 
 def derivatives(data: bytes, count: int, what: str) -> "np.typing.NDArray[np.float64]":
-    """Read `count` derivatives as float64: float32 on the wire, float64 in older logs."""
+    """Read `count` derivatives: float32 on the wire, float64 in older logs."""
     check_derivatives(data, count, what)
     return _array(data, "<f8" if len(data) == 8 * count else "<f4", what).astype(np.float64)
 
@@ -105,7 +105,7 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
 def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> "np.ndarray":
     """Extract the 2 × 2 covariance of each landmark [m²], (count, 2, 2).
 
-    joint: the bytes are the packed upper triangle of all landmarks, else packed blocks.
+    joint: the bytes are the packed upper triangle of all, else packed blocks.
     """
     values = floats(covariance, "covariance").astype(np.float64)
     if joint:  # row i of a packed upper triangle of n rows begins at i·n − i(i − 1)/2

@@ -5,55 +5,34 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import count
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
-from teamslam.team.wire.channels import (
-    ALIVE,
-    END_ORDER,
-    KEPT,
-    ORDER,
-    REPLIES,
-    VIEW,
-    Channel,
-    channel_of,
-)
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.channels import Channel, channel_of, row_of
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.logs import LOG
-from teamslam.team.wire.messages import (
-    Configuration,
-    Fault,
-    FusedMap,
-    GivenUp,
-    Kept,
-    Liveliness,
-    MapEstimate,
-    Members,
-    Message,
-    ParticleCloud,
-    Prior,
-    Progress,
-    SetSummary,
-    Status,
-    Tally,
-    TeamEnd,
-    Verdict,
-    Withdrawal,
-    WithdrawalHeard,
-)
 from teamslam.team.wire.text import make_printable
 
-_IN_WORDS = (Status, Fault, FusedMap, GivenUp, TeamEnd, Verdict, Withdrawal, WithdrawalHeard)
+_IN_WORDS = (
+    m.Status,
+    m.Fault,
+    m.FusedMap,
+    m.GivenUp,
+    m.TeamEnd,
+    m.Verdict,
+    m.Withdrawal,
+    m.WithdrawalHeard,
+)
 """Messages with texts for people."""
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
     """A received publication.
 
-    key: relative to the team. stamp_ns: team time. wall_ns: the publisher's clock. counter: the
-    publisher's for this key.
+    key: relative to the team. stamp_ns: team time. wall_ns, counter: the publisher's, for this key.
     """
 
     key: str
@@ -68,7 +47,7 @@ class Outgoing(NamedTuple):
 
     channel: Channel
     name: str
-    message: Message
+    message: m.Message
 
     @property
     def key(self) -> str:
@@ -106,9 +85,8 @@ class Bus(Protocol):
     dropped: int
 
     def publish(self, out: Outgoing) -> int:
-        """Publish a message and return the size of its payload [bytes].
-
-        Block for a limited time while receivers are slower.
+        """Publish a message, blocking while receivers are slower; return the payload's size
+        [bytes].
         """
 
     def publish_raw(self, sample: Sample) -> None:
@@ -126,17 +104,14 @@ class Bus(Protocol):
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer the queries of `channel` for one name, or `*`; a ValueError's text is a reply."""
 
-    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """Query, and return the payloads of the replies in order, none without an answer.
+    def ask(self, channel: Channel, name: str, request: m.Message, timeout_s: float) -> list[bytes]:
+        """Query; return the payloads of the replies in order, none without an answer.
 
         Raises `BusError` on an error.
         """
 
-    def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Send a query without waiting; `receive` returns the replies as samples.
-
-        No effect while the same query is open.
-        """
+    def request(self, channel: Channel, name: str, request: m.Message) -> None:
+        """Send a query, unless the same one is open; `receive` returns the replies."""
 
     def redeliver(self) -> None:
         """Request and deliver all samples of `all` channels and whole subscriptions again."""
@@ -149,7 +124,7 @@ class Bus(Protocol):
         """Return the keys with missing samples that their publisher may still have."""
         return set()
 
-    def publish_totals(self) -> Tally | None:
+    def publish_totals(self) -> m.Tally | None:
         """Publish the number of published samples of each key; None if no sample can be lost."""
         return None
 
@@ -166,7 +141,7 @@ class Bus(Protocol):
         """Leave the network and withdraw the tokens."""
 
 
-def opened(sample: Sample) -> tuple[Channel, str, Message]:
+def opened(sample: Sample) -> tuple[Channel, str, m.Message]:
     """Decode a sample and check it against its key; return channel, name and message.
 
     Raises `WireError`, also for a message of one robot or node on the key of another.
@@ -175,7 +150,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     if found is None:
         raise WireError("wrong tag", f"no channel has the key {sample.key[:200]!r}")
     channel, name = found
-    message: Message = decoded(sample.payload, *channel.kinds)
+    message: m.Message = decoded(sample.payload, *channel.kinds)
     robot = getattr(message, "robot", name)
     if robot != name and "{robot}" in channel.template:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
@@ -187,7 +162,7 @@ def opened(sample: Sample) -> tuple[Channel, str, Message]:
     return channel, name, message
 
 
-def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
+def try_open(sample: Sample) -> tuple[Channel, str, m.Message] | None:
     """Decode a sample; None if it is invalid or of no channel."""
     try:
         return opened(sample)
@@ -195,13 +170,13 @@ def try_open(sample: Sample) -> tuple[Channel, str, Message] | None:
         return None
 
 
-def open_printable(sample: Sample) -> tuple[Channel, str, Message]:
+def open_printable(sample: Sample) -> tuple[Channel, str, m.Message]:
     """Decode a sample, with printable texts."""
     channel, name, message = opened(sample)
     return channel, name, make_printable(message) if isinstance(message, _IN_WORDS) else message
 
 
-def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Message]]:
+def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, m.Message]]:
     """Decode the valid samples, with printable texts, and leave out the others."""
     for sample in samples:
         try:
@@ -210,15 +185,15 @@ def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, Messag
             LOG.debug("dropped %s: %s", sample.key[:80], error)
 
 
-_WITH_NODE = {Configuration, Progress, Status, Liveliness, Fault, SetSummary, Members}
+_WITH_NODE = {m.Configuration, m.Progress, m.Status, m.Liveliness, m.Fault, m.SetSummary, m.Members}
 """Messages that name the node that sends them."""
 
 
-def _sender_of(channel: Channel, message: Message) -> str | None:
+def _sender_of(channel: Channel, message: m.Message) -> str | None:
     if type(message) in _WITH_NODE:
         return message.node  # type: ignore[attr-defined, no-any-return]
-    is_order = channel is ORDER or channel is END_ORDER
-    return message.by if is_order and isinstance(message, Withdrawal | TeamEnd) else None
+    is_order = channel is ch.ORDER or channel is ch.END_ORDER
+    return message.by if is_order and isinstance(message, m.Withdrawal | m.TeamEnd) else None
 
 
 def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
@@ -226,10 +201,10 @@ def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sam
 
     Raises `WireError` if the message does not answer this query, or belongs to another robot.
     """
-    if channel is KEPT:
+    if channel is ch.KEPT:
         return _read_stored(payload)
-    message: Message = decoded(payload)
-    of = next((c for c in REPLIES[channel] if isinstance(message, c.kinds)), None)
+    message: m.Message = decoded(payload)
+    of = next((c for c in ch.REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
     named = _PLACES.search(channel.template) is not None
     if of is None or (named and robot != name):
@@ -239,9 +214,9 @@ def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sam
 
 
 def _read_stored(payload: bytes) -> Sample:
-    kept = decoded(payload, Kept)
+    kept = decoded(payload, m.Kept)
     sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
-    if opened(sample)[0] not in REPLIES[KEPT]:
+    if opened(sample)[0] not in ch.REPLIES[ch.KEPT]:
         raise WireError("wrong field", f"the router stores nothing on the key {kept.key[:80]!r}")
     return sample
 
@@ -252,12 +227,8 @@ NO_COUNTER = 2**32 - 1
 
 LATEST_CACHE = 8_192
 """Stored publications of a `latest` key: a robot may be 4096 measurements ahead."""
-CLOUDS_CACHE = 1_024
-"""Stored publications of particles, of kilobytes each."""
-MAPS_CACHE = 256
-"""Stored publications of maps, of tens of kilobytes each; a joint covariance is larger."""
-VIEWS_CACHE = 256
-"""Stored publications of views, of tens of kilobytes each."""
+_LARGE = {m.FusedMap: 256, m.MapEstimate: 256, m.Prior: 256, m.Message: 256, m.ParticleCloud: 1_024}
+"""The same for maps and views of tens of kilobytes each, and for particles of kilobytes."""
 WHOLE_CACHE = 1_000_000
 
 
@@ -265,59 +236,32 @@ def cache_size(channel: Channel) -> int:
     """Return the number of publications of a key that its publisher stores."""
     if channel.delivery == "all":
         return WHOLE_CACHE
-    if channel.message in (FusedMap, MapEstimate, Prior):
-        return MAPS_CACHE
-    if channel is VIEW:
-        return VIEWS_CACHE
-    return CLOUDS_CACHE if channel.message is ParticleCloud else LATEST_CACHE
+    return _LARGE.get(channel.message, LATEST_CACHE)
 
 
 @dataclass
 class MemoryNetwork:
-    """The keys of one process: publications are delivered at once, in order, to every other bus.
+    """The keys of one process: publications are delivered at once, in order.
 
-    Publications of `latest` and `all` channels are stored for late joiners.
+    Those of `latest` and `all` channels are stored for late joiners.
     """
 
     buses: list["MemoryBus"] = field(default_factory=list)
     stored: dict[str, deque[tuple["MemoryBus", Sample]]] = field(default_factory=dict)
     answers: list[tuple[Channel, str, Answer]] = field(default_factory=list)
     alive: dict[str, tuple["MemoryBus", Sample]] = field(default_factory=dict)
-    _numbers: Iterator[int] = field(default_factory=count)
-    _requests: dict[str, tuple[Channel, dict[str, set["MemoryBus"]]]] = field(default_factory=dict)
-    _receivers: dict[str, list["MemoryBus"]] = field(default_factory=dict)
+    receivers: dict[str, list["MemoryBus"]] = field(default_factory=dict)
+    """The buses that subscribed to a key, in the order in which they were made; a cache."""
 
-    def enter(self, bus: "MemoryBus") -> None:
-        """Add a bus; samples are delivered to it last."""
-        self.buses.append(bus)
-        bus.number = next(self._numbers)
-
-    def leave(self, bus: "MemoryBus") -> None:
-        """Remove a bus."""
-        self.buses.remove(bus)
-        for _, buses in self._requests.values():
-            for wanting in buses.values():
-                wanting.discard(bus)
-        self._receivers.clear()
-
-    def want(self, bus: "MemoryBus", channel: Channel, name: str) -> None:
-        """Add the subscription of a bus."""
-        _, buses = self._requests.setdefault(channel.name, (channel, {}))
-        buses.setdefault(name, set()).add(bus)
-        self._receivers.clear()
-
-    def receivers(self, key: str) -> list["MemoryBus"]:
-        """Return the buses that subscribed to a key, in the order in which they were added."""
-        found = self._receivers.get(key)
-        if found is None:
-            wanting: set[MemoryBus] = set()
-            for channel, buses in self._requests.values():
-                owner = channel.owner(key)
-                if owner is not None:
-                    names = buses if owner == "" else ("*", "**", owner)
-                    wanting.update(*(buses.get(name, ()) for name in names))
-            found = self._receivers[key] = sorted(wanting, key=lambda bus: bus.number)
-        return found
+    def receivers_of(self, key: str) -> list["MemoryBus"]:
+        """Return the buses that subscribed to a key, in the order in which they were made."""
+        if key not in self.receivers:
+            row = row_of(key)
+            owner = None if row is None else row.owner(key)
+            self.receivers[key] = [
+                bus for bus in self.buses if row is not None and bus.wants(row, owner)
+            ]
+        return self.receivers[key]
 
     def deliver(self, source: "MemoryBus", sample: Sample) -> None:
         """Deliver a sample to every other subscribed bus, and store it for late joiners."""
@@ -325,28 +269,33 @@ class MemoryNetwork:
         if found is not None and found[0].delivery != "stream":
             stored = self.stored.setdefault(sample.key, deque(maxlen=cache_size(found[0])))
             stored.append((source, sample))
-        for bus in self.receivers(sample.key):
+        self.notify(source, sample)
+
+    def notify(self, source: "MemoryBus", sample: Sample) -> None:
+        """Queue a sample for every other subscribed bus."""
+        for bus in self.receivers_of(sample.key):
             if bus is not source:
-                bus.queue(sample)
+                bus.arrived.append(sample)
 
 
 class MemoryBus(Bus):
-    """A bus within one process: synchronous and deterministic.
+    """A bus within one process: synchronous and deterministic; its wall clock is always zero.
 
-    number: its position among the buses of the network.
+    arrived: the samples that `receive` will return.
     """
 
     def __init__(self, network: MemoryNetwork) -> None:
-        self.number = 0
         self.dropped = 0
+        self.arrived: deque[Sample] = deque()
         self._network = network
-        self._arrived: deque[Sample] = deque()
+        self._names: dict[str, set[str]] = defaultdict(set)
         self._whole: set[str] = set()
         self._counters: dict[str, int] = defaultdict(int)
-        network.enter(self)
+        network.buses.append(self)
+        network.receivers.clear()
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and deliver at once; the wall clock is always zero."""
+        """Encode and deliver at once."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
         payload = encoded(out.message)
@@ -360,30 +309,35 @@ class MemoryBus(Bus):
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
         """Subscribe to a channel; the samples stored for late joiners come first."""
         for key, stored in self._network.stored.items():
-            if _is_of(channel, name, key) and not self._subscribed(key):
+            if _is_of(channel, name, key) and not self._is_subscribed(key):
                 requested = list(stored) if whole or channel.delivery == "all" else [stored[-1]]
-                self._arrived.extend(sample for source, sample in requested if source is not self)
+                self.arrived.extend(sample for source, sample in requested if source is not self)
         if whole:
             self._whole.add(channel.name)
-        self._network.want(self, channel, name)
+        self._want(channel, name)
 
-    def _subscribed(self, key: str) -> bool:
-        return self in self._network.receivers(key)
+    def _want(self, channel: Channel, name: str) -> None:
+        self._names[channel.name].add(name)
+        self._network.receivers.clear()
 
-    def queue(self, sample: Sample) -> None:
-        """Queue a sample for `receive`."""
-        self._arrived.append(sample)
+    def wants(self, channel: Channel, owner: str | None) -> bool:
+        """Return whether this bus subscribed to the channel's key of a robot or node."""
+        names = self._names.get(channel.name, ())
+        return bool(names) if owner == "" else "*" in names or owner in names
+
+    def _is_subscribed(self, key: str) -> bool:
+        return self in self._network.receivers_of(key)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """Return the samples since the last call; never wait."""
-        arrived = self._arrived  # one by one: another thread may be publishing
+        arrived = self.arrived  # one by one: another thread may be publishing
         return [arrived.popleft() for _ in range(len(arrived))]
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer queries, within `ask`."""
         self._network.answers.append((channel, name, answer))
 
-    def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
+    def ask(self, channel: Channel, name: str, request: m.Message, timeout_s: float) -> list[bytes]:
         """Compute and return the payloads of the replies at once."""
         for answered, names, answer in self._network.answers:
             if answered is channel and _is_of(channel, names, channel.key(name)):
@@ -393,54 +347,51 @@ class MemoryBus(Bus):
                     raise BusError(f"{channel.key(name)}: {error}") from error
         return []
 
-    def request(self, channel: Channel, name: str, request: Message) -> None:
+    def request(self, channel: Channel, name: str, request: m.Message) -> None:
         """Send a query; `receive` returns the replies with its next samples."""
         for payload in self.ask(channel, name, request, 0.0):
             with suppress(WireError):  # invalid replies are dropped
-                self._arrived.append(read_reply(channel, name, payload, 0))
+                self.arrived.append(read_reply(channel, name, payload, 0))
 
     def redeliver(self) -> None:
         """Deliver the stored samples of whole subscriptions and of `all` channels again."""
         for key, stored in self._network.stored.items():
-            found = channel_of(key)
-            if found is None or not self._subscribed(key):
+            row = row_of(key)
+            if row is None or not self._is_subscribed(key):
                 continue
-            if found[0].delivery == "all" or found[0].name in self._whole:
-                self._arrived.extend(sample for source, sample in stored if source is not self)
+            if row.delivery == "all" or row.name in self._whole:
+                self.arrived.extend(sample for source, sample in stored if source is not self)
 
     def declare_alive(self, node: str) -> None:
         """Hold a token."""
-        self._token(node, alive=True)
+        sample = _token(node, alive=True)
+        self._network.alive[node] = (self, sample)
+        self._network.notify(self, sample)
 
     def watch_alive(self, node: str = "*") -> None:
         """Receive changes of tokens, the present ones first."""
-        self._network.want(self, ALIVE, node)
+        self._want(ch.ALIVE, node)
         for source, sample in self._network.alive.values():
-            if source is not self and self._subscribed(sample.key):
-                self.queue(sample)
+            if source is not self and self._is_subscribed(sample.key):
+                self.arrived.append(sample)
 
     def is_alive(self, node: str) -> bool:
         """Return whether a bus holds the token."""
         return node in self._network.alive
 
-    def _token(self, node: str, *, alive: bool) -> None:
-        sample = Sample(
-            ALIVE.key(node), encoded(Liveliness(stamp_ns=0, node=node, alive=alive)), 0, 0, 0
-        )
-        if alive:
-            self._network.alive[node] = (self, sample)
-        else:
-            self._network.alive.pop(node, None)
-        for bus in self._network.receivers(sample.key):
-            if bus is not self:
-                bus.queue(sample)
-
     def close(self) -> None:
         """Leave the network and withdraw the tokens."""
-        self._network.leave(self)
+        self._network.buses.remove(self)
+        self._network.receivers.clear()
         own = [node for node, (source, _) in self._network.alive.items() if source is self]
         for node in own:
-            self._token(node, alive=False)
+            del self._network.alive[node]
+            self._network.notify(self, _token(node, alive=False))
+
+
+def _token(node: str, *, alive: bool) -> Sample:
+    token = m.Liveliness(stamp_ns=0, node=node, alive=alive)
+    return Sample(ch.ALIVE.key(node), encoded(token), 0, 0, 0)
 
 
 def _is_of(channel: Channel, name: str, key: str) -> bool:

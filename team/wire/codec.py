@@ -1,8 +1,7 @@
 """Encode messages, and decode them with all checks, so that only valid ones reach a node.
 
-A payload is decoded into the class of its tag. Values are never unpacked without a type: a list of
-empty lists takes 75 times its size. Number and nesting of the values of a large payload are checked
-before any is created.
+Values are never unpacked without a type: a list of empty lists takes 75 times its size. Number and
+nesting of the values of a large payload are checked before any is created.
 """
 
 from functools import cache
@@ -38,7 +37,6 @@ def encoded(message: Message) -> bytes:
 
 
 def _plain(value: object) -> float:
-    """Convert a NumPy number that is a `float` to a plain float."""
     if isinstance(value, float):
         return float(value)
     raise TypeError(f"no field of a message takes a {type(value).__name__}")
@@ -48,10 +46,7 @@ _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def decoded(payload: bytes, *expected: type[M]) -> M:
-    """Decode and check a payload; raises `WireError`.
-
-    expected: the accepted classes; without any, all.
-    """
+    """Decode and check a payload as one of the expected classes (none: any); raises `WireError`."""
     if len(payload) > LARGEST_PAYLOAD:
         raise WireError("too large", f"{len(payload)} bytes, {LARGEST_PAYLOAD} at most")
     try:
@@ -69,8 +64,6 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
 
 
 class _Head(msgspec.Struct, array_like=True):
-    """The tag of a message; further fields are skipped."""
-
     tag: str
 
 
@@ -79,7 +72,7 @@ _UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 def _refusal(payload: bytes, expected: tuple[type[Message], ...], error: Exception) -> WireError:
-    """Return the `WireError` of a payload that could not be decoded; a wrong tag comes first."""
+    """Explain why a payload could not be decoded; a wrong tag comes first."""
     kind: type[Message] = Message
     try:
         kind = _kind(_HEAD.decode(payload).tag, expected)

@@ -8,17 +8,14 @@ Interval = tuple[int, int]
 
 
 class IntervalSet:
-    """A set of integers; adjacent and overlapping intervals are merged.
-
-    `len` is the number of intervals, not of integers.
-    """
+    """A set of integers; `len` is the number of its intervals."""
 
     def __init__(self) -> None:
         self._begins: list[int] = []
         self._ends: list[int] = []
 
     def add(self, first: int, last: int) -> None:
-        """Add the integers first … last; nothing if last < first."""
+        """Add the integers first … last, and merge intervals that overlap or touch."""
         if last < first:
             return
         low = bisect_left(self._ends, first - 1)  # the first interval that overlaps or touches it
@@ -63,7 +60,7 @@ class IntervalSet:
         return self._begins[at] - 1 if inside else number
 
     def gaps(self, first: int, last: int) -> list[Interval]:
-        """Return the intervals of first … last that are not in the set, in ascending order."""
+        """Return the intervals of first … last that are not in the set, ascending."""
         found: list[Interval] = []
         at = bisect_left(self._ends, first)
         while first <= last:

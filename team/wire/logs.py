@@ -1,7 +1,7 @@
 """The log of a process, whose lines others can neither flood nor forge.
 
 Each place in the program may log AT_ONCE lines, and regains PER_S lines a second; the next line
-counts the omitted ones. A record is one printable line of at most LONGEST characters.
+counts the omitted ones.
 """
 
 import logging

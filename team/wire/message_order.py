@@ -14,8 +14,8 @@ SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
 def set_order(received: int, withdrawn: int, members: Sequence[m.VersionEntry]) -> SetOrder:
     """Return the sort key of a set: number of received submaps, of withdrawn robots, and size.
 
-    The first only grows; with the same submaps the fold may withdraw further robots, but reinstates
-    none; of sets with equal numbers the larger contains the other.
+    The first only grows; with the same submaps the fold may withdraw robots, but reinstates none;
+    of sets with equal numbers the larger contains the other.
     """
     vector = tuple(sorted((each.robot, each.incarnation, each.sequence) for each in members))
     return received, withdrawn, sum(each.sequence + 1 for each in members), vector
@@ -44,7 +44,7 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
 def merge_progress(new: m.Progress, known: m.Progress | None) -> m.Progress:
     """Return the larger numbers of both messages, or the message of the newer incarnation.
 
-    A restarted process first reports smaller numbers; the larger ones remain valid.
+    A restarted process first reports smaller numbers.
     """
     if known is None or new.incarnation > known.incarnation:
         return new

@@ -1,7 +1,6 @@
 r"""Printable forms of foreign texts, which may contain terminal escapes or forged lines.
 
-Control and other invisible characters are written as `\x1b` or `\u202e`. Stored texts keep their
-bytes.
+Control and other invisible characters are written as `\x1b` or `\u202e`.
 """
 
 import unicodedata

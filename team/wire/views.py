@@ -1,7 +1,7 @@
 """The table of views, which a viewer node publishes in the schemas of other tools.
 
-No estimate depends on a view, and verification skips it. Frames: `map` is that of the team's map,
-`robot/<name>` that of a robot; metres, radians, counter-clockwise; z = 0.
+No estimate depends on a view, and verification skips it. Frames: `map` is the team's,
+`robot/<name>` a robot's; metres, radians, counter-clockwise; z = 0.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Access control at the router: a node publishes its own keys and receives those of its team.
+"""Access control at the router: a node publishes its own keys and receives its team's.
 
 Each node has a rule, for its certificate's common name, with its advanced publishers' caches and
 heartbeats, `…/@adv/pub/*/*/*`.
@@ -8,20 +8,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from teamslam.team.keys.roster import REPLAY, Roster
-from teamslam.team.wire.channels import (
-    CHANNELS,
-    TRUTH,
-    TRUTH_LABELS,
-    TRUTH_LANDMARKS,
-    TRUTH_POSITIONS,
-    Channel,
-)
+from teamslam.team.wire import channels as ch
 from teamslam.team.wire.zenoh.session import DOOR
 
 _SAYS = ("put", "reply", "declare_queryable", "liveliness_token")
 _LISTENS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 _HEARS = ("put", "reply", "liveliness_token", "declare_subscriber", "query")
-TRUTHS = (TRUTH, TRUTH_LANDMARKS, TRUTH_LABELS, TRUTH_POSITIONS)
+TRUTHS = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
 """Channels that no estimator may receive."""
 
 
@@ -32,12 +25,12 @@ def list_owned_keys(node: str) -> tuple[str, ...]:
     """
     kind, _, name = node.partition("-")
     if node == REPLAY:
-        return tuple(key for channel in CHANNELS for key in channel.selectors())
-    found = [key for channel in CHANNELS for key in _keys_of(channel, kind, name)]
+        return tuple(key for channel in ch.CHANNELS for key in channel.selectors())
+    found = [key for channel in ch.CHANNELS for key in _keys_of(channel, kind, name)]
     return tuple(dict.fromkeys(found))
 
 
-def _keys_of(channel: Channel, kind: str, name: str) -> tuple[str, ...]:
+def _keys_of(channel: ch.Channel, kind: str, name: str) -> tuple[str, ...]:
     first, _, rest = channel.template.partition("/")
     if first == "{node}":
         return channel.selectors(f"{kind}/{name}" if name else kind)

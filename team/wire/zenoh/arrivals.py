@@ -24,8 +24,8 @@ T = TypeVar("T")
 class Arrivals(Generic[T]):
     """Publications of one publisher on one key; those before `first` are not requested.
 
-    Memory is proportional to the arrivals. in_order: delay publications after a gap until it is
-    closed or overdue. newest: last number received.
+    in_order: delay publications after a gap until it is closed or overdue. newest: last number
+    received.
     """
 
     first: int

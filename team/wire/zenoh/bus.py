@@ -11,7 +11,7 @@ from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import zenoh
 from zenoh.handlers import Callback
@@ -24,7 +24,6 @@ from teamslam.team.wire.messages import Liveliness, Message, Tally
 from teamslam.team.wire.text import cut
 from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declare_publisher, subscribe
-from teamslam.team.wire.zenoh.queries import Queries, Question, Reply
 from teamslam.team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
 from teamslam.team.wire.zenoh.session import RouterLink, client
 
@@ -32,6 +31,11 @@ if TYPE_CHECKING:  # not needed without keys
     from teamslam.team.keys.credentials import Credentials
 
 _ALIVE_TIMEOUT_S = 5.0
+_ANSWER_S = 10.0
+_EACH_REPLY: dict[str, Any] = {
+    "consolidation": zenoh.ConsolidationMode.NONE,  # each reply, not the newest per key
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+}
 _FLUSH = "router/flush"
 _FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly or is stopped
 MOST_WAITING = 1_000
@@ -45,7 +49,33 @@ class _Token:
     sample: zenoh.Sample
 
 
-_Item = Reply | zenoh.Sample | _Token | Question | Heartbeat | CacheAnswer | None
+@dataclass(frozen=True, repr=False)
+class _Question:
+    query: zenoh.Query
+    answer: Answer
+
+    def reply(self) -> None:
+        """Answer the query; the sender of an invalid request receives the error."""
+        request = b"" if self.query.payload is None else self.query.payload.to_bytes()
+        with self.query as query:
+            try:
+                for payload in self.answer(request):
+                    query.reply(query.key_expr, payload)  # blocks as its query does
+            except ValueError as error:
+                query.reply_err(str(error))
+
+
+@dataclass(frozen=True)
+class _Reply:
+    """One reply to a request; without a payload its end, or an error with its reason."""
+
+    channel: Channel
+    name: str
+    payload: bytes | None
+    wrong: str = ""
+
+
+_Item = _Reply | zenoh.Sample | _Token | _Question | Heartbeat | CacheAnswer | None
 """Items of the receiving thread's queue; None wakes a receiver when the bus closes."""
 
 
@@ -72,6 +102,7 @@ class ZenohBus:
         self._publishers: dict[str, Publisher] = {}
         self._counters: dict[str, int] = {}
         self._requested: set[tuple[str, str]] = set()
+        self._open_queries: set[tuple[str, str]] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._published: dict[str, int] = {}
         self._newest_ns = 0
@@ -88,7 +119,6 @@ class ZenohBus:
         self._keys = keys
         self._session = client(connect, patience_s, keys, stop)
         self._recovery = Recovery(self._session, self._prefix, self._admit)
-        self._queries = Queries(self._session, self._prefix, self._queue.put)
         self._link = RouterLink(self._session, connect, keys)
         # While the interpreter ends no thread of Zenoh may call it any more.
         atexit.register(self._end_session)
@@ -125,10 +155,7 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Publish the sample count of each key, this message included, to reveal lost samples.
-
-        None for a process without a token.
-        """
+        """Publish the sample count of each key, this message included; None without a token."""
         if not self._tokens:
             return None
         node = next(iter(self._tokens))
@@ -263,7 +290,7 @@ class ZenohBus:
 
     def _take(self, item: _Item, samples: list[Sample]) -> None:
         match item:
-            case Question():
+            case _Question():
                 item.reply()
             case _Token():
                 node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
@@ -275,8 +302,8 @@ class ZenohBus:
                 self._recovery.take_heartbeat(item)
             case CacheAnswer():
                 samples += self._recovery.take_answer(item)
-            case Reply():
-                samples += self._queries.read_reply(item)
+            case _Reply():
+                samples += self._read_reply(item)
             case zenoh.Sample():
                 self._take_sample(item, samples)
 
@@ -299,8 +326,8 @@ class ZenohBus:
         self._recovery.redeliver()
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return the missing samples, available or not: by key, intervals of a publisher's
-        counters.
+        """Return the missing samples, available or not, as intervals of a publisher's counters by
+        key.
         """
         return self._recovery.find_missing()
 
@@ -311,7 +338,13 @@ class ZenohBus:
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
         """Answer the queries of `channel` within `receive`; a ValueError's text is the reply."""
         self._check_open()
-        self._queries.answer(channel, name, answer)
+
+        def take(query: zenoh.Query) -> None:
+            self._queue.put(_Question(query, answer))
+
+        self._session.declare_queryable(
+            self._prefix + channel.key(name), Callback(take, indirect=False)
+        )
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
         """Query and return the replies' payloads in order; empty when nobody answers.
@@ -319,7 +352,15 @@ class ZenohBus:
         Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries.
         """
         self._check_open()
-        payloads = self._queries.ask(channel, name, request, timeout_s)
+        key = self._prefix + channel.key(name)
+        payloads: list[bytes] = []
+        for reply in self._session.get(
+            key, payload=encoded(request), timeout=timeout_s, **_EACH_REPLY
+        ):
+            if reply.ok is None:
+                text = _reason(reply.err)
+                raise BusError(f"{key}: {text} (waited at most {timeout_s} s)")
+            payloads.append(reply.ok.payload.to_bytes())
         if self.tap is not None and channel in REPLIES and channel is not KEPT:
             wall_ns = time.time_ns()
             with suppress(WireError):  # the caller decodes them and reports the error
@@ -327,12 +368,41 @@ class ZenohBus:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Query without waiting: `receive` returns the replies as samples.
-
-        No effect while the same query is open.
-        """
+        """Query without waiting, unless the same query is open; `receive` returns the replies."""
         self._check_open()
-        self._queries.request(channel, name, request)
+        if (channel.name, name) in self._open_queries:
+            return
+        self._open_queries.add((channel.name, name))
+
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self._queue.put(_Reply(channel, name, reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                self._queue.put(_Reply(channel, name, None, _reason(reply.err)))
+
+        def end() -> None:
+            self._queue.put(_Reply(channel, name, None))
+
+        self._session.get(
+            self._prefix + channel.key(name),
+            Callback(take, drop=end, indirect=False),
+            payload=encoded(request),
+            timeout=_ANSWER_S,
+            **_EACH_REPLY,
+        )
+
+    def _read_reply(self, reply: _Reply) -> list[Sample]:
+        key = reply.channel.key(reply.name)
+        if reply.payload is None:
+            self._open_queries.discard((reply.channel.name, reply.name))
+            if reply.wrong:
+                LOG.warning("%s: %s (waited at most %s s)", key, reply.wrong, _ANSWER_S)
+            return []
+        try:
+            return [read_reply(reply.channel, reply.name, reply.payload, time.time_ns())]
+        except WireError as error:
+            LOG.warning("%s: dropped a reply: %s", key, error)
+            return []
 
     def declare_alive(self, node: str) -> None:
         """Hold a liveliness token until the bus is closed or its process dies."""
@@ -382,3 +452,8 @@ class ZenohBus:
                 f"it by `teamslam keys {self._keys.team} -o DIR --renew {self._keys.node}`, copy "
                 "it, and start this process again"
             )
+
+
+def _reason(error: zenoh.ReplyError | None) -> str:
+    text = "" if error is None else error.payload.to_bytes().decode("utf-8", "replace")
+    return text or "no answer"

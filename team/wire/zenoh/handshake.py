@@ -36,7 +36,7 @@ class Examined:
 
     refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
     is no link yet; empty after success. router_ends: expiry of the router's certificate [s since
-    1970], if received. accepts: connections are accepted, though perhaps not answered.
+    1970]. accepts: connections are accepted, though perhaps not answered.
     """
 
     refused: str | None = None

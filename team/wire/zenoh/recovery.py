@@ -2,10 +2,8 @@
 
 Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
 publisher are therefore counted (`arrivals`) and compared with its heartbeats, and gaps older than
-half a second are requested.
-
-The tracked publishers are bounded, per node and in all; samples of further ones are delivered as
-they come. A team of 100 robots, each restarted 30 times, is within the bounds.
+half a second are requested. Publishers beyond the bounds are not tracked; a team of 100 robots,
+each restarted 30 times, is within them.
 """
 
 import struct
@@ -226,8 +224,8 @@ class Recovery:
         }
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return the missing samples, available or not: by key, intervals of a publisher's
-        counters.
+        """Return the missing samples, available or not, as intervals of a publisher's counters by
+        key.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):

@@ -160,7 +160,6 @@ class _Keeper:
 
 
 def _answer_door(session: zenoh.Session, roster: Roster) -> None:
-    """Answer to the authority's certificates whether the roster has their name."""
     names = {roster.common_name(node) for node in roster.nodes}
 
     def answer(query: zenoh.Query) -> None:

@@ -1,7 +1,4 @@
-"""Open a process's link to its team's router and monitor it.
-
-Every process is a client of one router, a star without discovery.
-"""
+"""Open a process's link to its team's router and monitor it: a star without discovery."""
 
 import json
 import threading
@@ -116,8 +113,7 @@ def _client_tls(keys: "Credentials") -> dict[str, object]:
 
 
 class RouterLink:
-    """The link of one session to its router: logs why it is down, and raises on evidence against
-    it.
+    """The link of one session to its router: logs why it is down; raises on evidence against it.
 
     Silence never ends a process. Evidence is the result of a handshake (`handshake`), or the
     router's statement that its roster lacks our certificate: Zenoh connects a revoked one and drops

@@ -1,11 +1,9 @@
 """Samples of a team that a router stores for absent processes: ends and orders.
 
 A stored sample keeps its key, bytes and attachment, and thereby its author; an end replaces only an
-end of the same author.
-
-Ends (`ENDS`) are stored until their author publishes another. A node that was in that run and never
-announced its end (`Tally`) is sent the end until one of its processes announces its own. Orders are
-valid until the centre's final map, or until no process of the team is present.
+end of the same author, and is sent to a node that was in that run and never announced its end
+(`Tally`), until one of its processes does. Orders are valid until the centre's final map, or until
+no process of the team is present.
 """
 
 import threading
