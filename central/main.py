@@ -4,13 +4,14 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
 from teamslam.team.missing_measurements import MissingMeasurements
-from teamslam.team.peers.members import CHANNELS, member_of
-from teamslam.team.peers.set_file import Keeper
+from teamslam.team.peers.members import CHANNELS, Member, member_of
+from teamslam.team.peers.set_file import SetFile
 from teamslam.team.shell import WAIT_S, Shell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -22,38 +23,24 @@ from teamslam.team.wire.request_times import RequestTimes
 _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
 
 
-class StoredSet(Keeper):
-    """A centre's set on disk: the messages of robots and operators.
+class StoredSet(SetFile):
+    """A centre's set on disk, from which a restarted centre continues with the same map."""
 
-    A restarted centre continues from it with the same map. Raises SetFileError.
-    """
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None) -> None:
         super().__init__(path)
-        self.path = path
         self._known = {member.hash for member in self.members}
 
-    def samples(self) -> list[Sample]:
-        """Return the members as samples that arrive now, once."""
-        now_ns, found = time.time_ns(), self.members
-        self.members = []
-        return [member.as_sample(now_ns) for member in found]
-
     def note(self, samples: Iterable[Sample]) -> None:
-        """Store valid and new members."""
-        news = []
-        for sample in samples:
+        """Store the valid and new members among these samples."""
+        news: dict[bytes, Member] = {}
+        for sample in samples if self.path else ():
             found = ch.channel_of(sample.key)
-            if found is None or found[0] not in _STORED:
-                continue
-            try:
-                member = member_of(sample.key, sample.payload)
-            except (WireError, ValueError):
-                continue  # the door counts and names it
-            if member.hash not in self._known:
-                self._known.add(member.hash)
-                news.append(member)
-        self.append(news)
+            if found is not None and found[0] in _STORED:
+                with suppress(WireError, ValueError):  # the door counts and names it
+                    member = member_of(sample.key, sample.payload)
+                    news[member.hash] = member
+        self.append([member for hash_, member in news.items() if hash_ not in self._known])
+        self._known.update(news)
 
 
 LOST_S = 3.0
@@ -90,7 +77,7 @@ class CentralShell:
         maps: Sequence[m.SavedMap] = (),
     ) -> None:
         self._bus = bus
-        self._stored = None if store is None else StoredSet(store)
+        self._stored = StoredSet(store)
         self.node = make_centre(config, robots, admit=admit, maps=maps)
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
@@ -120,8 +107,7 @@ class CentralShell:
         while self._shell.going:
             self._shell.query_end()
             samples = self._shell.receive()
-            if self._stored is not None:
-                self._stored.note(samples)
+            self._stored.note(samples)
             self._shell.take(self._patient(samples))
             self._shell.take(self._long_lost())
             self._give_up()
@@ -130,8 +116,7 @@ class CentralShell:
             self._request_orders()
             self._shell.report()
         self._shell.report(last=True)
-        if self._stored is not None:
-            self._stored.close()
+        self._stored.close()
         final = self.node.final
         if final is None:
             _LOG.info("ended without a final map")
@@ -143,12 +128,11 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        if self._stored is None or not self._shell.going:
-            return
-        stored = self._stored.samples()
-        self._shell.take(stored)
-        if stored:
-            _LOG.info("%d members of the set are stored in %s", len(stored), self._stored.path)
+        if self._stored.members and self._shell.going:
+            now_ns = time.time_ns()
+            self._shell.take(each.as_sample(now_ns) for each in self._stored.members)
+            count, path = len(self._stored.members), self._stored.path
+            _LOG.info("%d members of the set are stored in %s", count, path)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """Drop the tokens of lost robots that may return within LOST_S."""
@@ -194,7 +178,7 @@ class CentralShell:
     def _awaited(self) -> tuple[str, ...]:
         """The members missing in the set's file, and the awaited absent robots."""
         now = time.monotonic()
-        warnings = [] if self._stored is None else [*self._stored.warnings]
+        warnings = [*self._stored.warnings]
         for robot in self.node.awaited:
             since = self._since.get(ch.robot_node(robot))
             if since is None and self.node.ends:

@@ -15,7 +15,7 @@ from teamslam.central.peers.robot import PeerRobot
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.peers.members import Member
 from teamslam.team.peers.proofs import Proofs, Signs
-from teamslam.team.peers.set_file import Keeper
+from teamslam.team.peers.set_file import SetFile
 from teamslam.team.robot.main import SECOND_PATIENCE_S, RobotShell
 from teamslam.team.shell import Shell
 from teamslam.team.wire import channels as ch
@@ -105,7 +105,7 @@ class PeerShell(RobotShell):
         self.run_in(Shell(bus, self._peer, self._peer.name, stop, _ENDS))
         self.shell.take_end = self._peer.take_end
         self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
-        self._keeper = Keeper(store)
+        self._keeper = SetFile(store)
         self.shell.notes = lambda: self._keeper.warnings
         self._over_since: float | None = None
         self._alone = Alone()
@@ -203,7 +203,7 @@ class CentreShell:
         self._shell = Shell(bus, self._peer, CENTRE, stop, _ENDS)
         self._shell.take_end = self._peer.take_end
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
-        self._keeper = Keeper(store)
+        self._keeper = SetFile(store)
         self._shell.notes = lambda: self._keeper.warnings
         self._alone = Alone()
 

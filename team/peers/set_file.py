@@ -14,6 +14,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from io import FileIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -114,68 +115,101 @@ def missing_in(members: Iterable[Member]) -> list[str]:
 
 
 class SetFile:
-    """The file of one peer; raises SetFileError.
+    """The file of one set; without a path in memory only. Raises SetFileError for an unusable one.
 
     members: those in it when opened. torn: bytes of an incomplete last record, cut off. lost: other
-    damage, in words.
+    damage, in words. Members that cannot be written are reported and written later.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None) -> None:
         self.path = path
+        self.members: list[Member] = []
+        self.torn, self.lost = 0, ""
+        self._file: FileIO | None = None
+        self._pending: list[Member] = []
+        self._failure = ""
+        self._retry_s = 0.0
+        if path is None:
+            return
         try:
             content = path.read_bytes() if path.exists() else b""
             found = list(records_in(content))
             if _is_foreign(content) and not found:
                 raise SetFileError(f"{path} is not a peer's set: give --set another file")
             self.members = [each.member for each in found if each.member is not None]
-            self._open(content, found)
+            self._open(path, content, found)
         except OSError as error:
             raise SetFileError(f"{path} can not be written: {error}") from error
 
-    def _open(self, content: bytes, found: Sequence[Record]) -> None:
-        self.torn, self.lost = 0, ""
+    def _open(self, path: Path, content: bytes, found: Sequence[Record]) -> None:
         begins = [*(each.begin for each in found), len(content)]
         ends = [min(len(MAGIC), len(content)), *(each.end for each in found)]
         *inner, last = [begin - end for begin, end in zip(begins, ends, strict=True)]
         if _is_cut_off(content, ends[-1]):
             self.torn, last = last, 0
+            _LOG.info("%s: a record that was cut off, %d bytes", path, self.torn)
         holes = [size for size in (*inner, last) if size]
         self._size = max(ends[-1], len(MAGIC))
         if holes or content[: len(MAGIC)] != MAGIC[: len(content)]:
-            self.lost = _in_words(self.path, holes, self.members)
+            self.lost = _describe_damage(path, holes, self.members)
+            _LOG.warning("%s", self.lost)
             intact = b"".join(content[each.begin : each.end] for each in found)
             with suppress(OSError):  # without room the damage stays, and is skipped each time
-                _replace(self.path, MAGIC + intact)
+                _replace(path, MAGIC + intact)
                 self._size = len(MAGIC) + len(intact)
-        self._file = self.path.open("r+b" if self.path.exists() else "w+b", buffering=0)
+        self._file = path.open("r+b" if path.exists() else "w+b", buffering=0)
         self._file.truncate(self._size)
         if len(content) < len(MAGIC):
-            self._write(MAGIC, 0)
+            self._write(self._file, MAGIC, 0)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Members missing in the file, for the status of its process."""
+        failure = self._failure and f"{self._failure}: {len(self._pending)} members are not stored"
+        return tuple(text for text in (failure, self.lost) if text)
 
     def append(self, members: Iterable[Member]) -> None:
-        """Append members, all or none; raises SetFileError."""
-        records = b"".join(record_of(member) for member in members)
-        if records:
-            try:
-                self._write(records, self._size)
-            except OSError as error:
-                raise SetFileError(f"{self.path} can not be written: {error}") from error
-            self._size += len(records)
+        """Append members; after an error, with those not written before."""
+        if self._file is not None:
+            self._pending += members
+            if self._pending and time.monotonic() >= self._retry_s:
+                self._append_pending(self._file)
 
-    def _write(self, data: bytes, at: int) -> None:
+    def _append_pending(self, file: FileIO) -> None:
+        records = b"".join(map(record_of, self._pending))
+        try:
+            self._write(file, records, self._size)
+        except OSError as error:
+            failure = f"{self.path} can not be written: {error}"
+            if not self._failure:
+                _LOG.error("the set is not stored: %s; trying again every %g s", failure, RETRY_S)
+            self._failure = failure
+            self._retry_s = time.monotonic() + RETRY_S
+            return
+        self._size += len(records)
+        if self._failure:
+            _LOG.warning("the set is stored again, with %d members", len(self._pending))
+        self._pending, self._failure, self._retry_s = [], "", 0.0
+
+    def _write(self, file: FileIO, data: bytes, at: int) -> None:
         """Write all bytes, in as many pieces as the system takes; none after an error."""
         done = 0
         try:
             while done < len(data):
                 # A disk that becomes full takes a part without an error and refuses the next one.
-                done += os.pwrite(self._file.fileno(), data[done:], at + done)
+                done += os.pwrite(file.fileno(), data[done:], at + done)
         except OSError:
-            self._file.truncate(at)
+            file.truncate(at)
             raise
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Write the pending members, and close the file."""
+        if self._file is not None:
+            self._append_pending(self._file)
+            if self._pending:
+                _LOG.error("%d members of the set are not stored", len(self._pending))
+            self._file.close()
+            self._file = None
 
 
 def _is_cut_off(content: bytes, at: int) -> bool:
@@ -201,7 +235,7 @@ def _replace(path: Path, content: bytes) -> None:
     fresh.replace(path)
 
 
-def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
+def _describe_damage(path: Path, holes: Sequence[int], members: Sequence[Member]) -> str:
     places, damaged = max(len(holes), 1), sum(holes)
     lacks = missing_in(members)
     missing = f"; it lacks {', '.join(lacks)}, as far as known" if lacks else ""
@@ -209,60 +243,3 @@ def _in_words(path: Path, holes: Sequence[int], members: Sequence[Member]) -> st
         f"{path} was damaged in {places} place{'s' * (places != 1)}: {damaged} bytes are lost, "
         f"{len(members)} members are intact{missing}; the rest of the set is requested again"
     )
-
-
-class Keeper:
-    """Stores a set in its file; without a path in memory only.
-
-    members: those in it when opened. Members that cannot be written are reported and written later.
-    Raises SetFileError for an unusable file.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self._store = None if path is None else SetFile(path)
-        self.members = [] if self._store is None else self._store.members
-        self._waiting: list[Member] = []
-        self._failure = ""
-        self._retry_s = 0.0
-        if self._store is not None and self._store.lost:
-            _LOG.warning("%s", self._store.lost)
-        if self._store is not None and self._store.torn:
-            _LOG.info("%s: a record that was cut off, %d bytes", path, self._store.torn)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Members missing in the file, for the status of its process."""
-        lost = "" if self._store is None else self._store.lost
-        failure = self._failure and f"{self._failure}: {len(self._waiting)} members are not stored"
-        return tuple(text for text in (failure, lost) if text)
-
-    def append(self, members: Sequence[Member]) -> None:
-        """Append members; after an error, with those not written before."""
-        if self._store is None:
-            return
-        self._waiting += members
-        if self._waiting and time.monotonic() >= self._retry_s:
-            self._write()
-
-    def _write(self) -> None:
-        assert self._store is not None
-        try:
-            self._store.append(self._waiting)
-        except SetFileError as error:
-            if not self._failure:
-                _LOG.error("the set is not stored: %s; trying again every %g s", error, RETRY_S)
-            self._failure = str(error)
-            self._retry_s = time.monotonic() + RETRY_S
-            return
-        if self._failure:
-            _LOG.warning("the set is stored again, with %d members", len(self._waiting))
-        self._waiting, self._failure, self._retry_s = [], "", 0.0
-
-    def close(self) -> None:
-        """Write the pending members, and close the file."""
-        if self._store is not None:
-            self._write()
-            if self._waiting:
-                _LOG.error("%d members of the set are not stored", len(self._waiting))
-            self._store.close()
-            self._store = None

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from teamslam.central.main import StoredSet
+from teamslam.team.peers.members import Member
 from teamslam.team.peers.set_file import SetFileError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Sample
@@ -21,13 +22,13 @@ def a_life(path: Path) -> Iterator[StoredSet]:
     kept.close()
 
 
-def heard(found: list[Sample]) -> list[tuple[str, bytes]]:
-    return [(sample.key, sample.payload) for sample in found]
+def heard(found: list[Sample] | list[Member]) -> list[tuple[str, bytes]]:
+    return [(each.key, each.payload) for each in found]
 
 
 def kept_in(path: Path) -> list[tuple[str, bytes]]:
     with a_life(path) as kept:
-        return heard(kept.samples())
+        return heard(kept.members)
 
 
 def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path):
@@ -35,13 +36,12 @@ def test_a_later_life_hears_each_member_once_and_nothing_else(tmp_path):
     measured = Sample(ch.ODOMETRY.key("alpha"), encoded(odometry(1)), 0, 0, 0)
     unsound = Sample(ch.SUBMAP.key("alpha"), b"no message", 0, 0, 0)
     with a_life(path) as kept:
-        assert kept.samples() == []
+        assert kept.members == []
         kept.note([SENT[0], measured, unsound, SENT[0]])
         kept.note(SENT[:2])
     with a_life(path) as again:
         again.note(SENT)
-        assert heard(again.samples()) == heard(SENT[:2])
-        assert again.samples() == []
+        assert heard(again.members) == heard(SENT[:2])
     assert kept_in(path) == heard(SENT)
 
 
@@ -51,7 +51,7 @@ def test_what_a_death_tore_is_cut_off_and_the_rest_is_there(tmp_path):
         kept.note(SENT)
     path.write_bytes(path.read_bytes()[:-1])
     with a_life(path) as torn:
-        assert heard(torn.samples()) == heard(SENT[:2])
+        assert heard(torn.members) == heard(SENT[:2])
         torn.note(SENT)
     assert kept_in(path) == heard(SENT)
 

@@ -13,7 +13,7 @@ import pytest
 
 from teamslam.team.peers.members import member_of
 from teamslam.team.peers.replica import Replica
-from teamslam.team.peers.set_file import MAGIC, Keeper, SetFile, SetFileError, record_of
+from teamslam.team.peers.set_file import MAGIC, SetFile, SetFileError, record_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import encoded
@@ -104,9 +104,9 @@ def test_what_is_known_to_be_lost_is_named_by_its_number(tmp_path, caplog):
     damaged[ENDS[submaps[1]] + 30] ^= 4
     path = tmp_path / "r1.set"
     path.write_bytes(bytes(damaged))
-    keeper = Keeper(path)
-    (warning,) = keeper.warnings
-    keeper.close()
+    store = SetFile(path)
+    (warning,) = store.warnings
+    store.close()
     missing = MEMBERS[submaps[1]].message
     assert isinstance(missing, m.Submap)
     size = len(RECORDS[submaps[1]])
@@ -143,11 +143,11 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypat
 
     monkeypatch.setattr(os, "pwrite", into_room)
     monkeypatch.setattr("teamslam.team.peers.set_file.RETRY_S", 0.0)
-    keeper = Keeper(path)
+    store = SetFile(path)
     several = [MEMBERS[k % len(MEMBERS)] for k in range(60)]
     for each in several[:50]:
-        keeper.append([each])
-    (warning,) = keeper.warnings
+        store.append([each])
+    (warning,) = store.warnings
     assert "No space left on device" in warning
     assert "members are not stored" in warning
     assert caplog.text.count("the set is not stored") == 1
@@ -155,9 +155,9 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypat
     assert 0 < whole < 50
     room = 10**9
     for each in several[50:]:
-        keeper.append([each])
-    assert not keeper.warnings
-    keeper.close()
+        store.append([each])
+    assert not store.warnings
+    store.close()
     again = SetFile(path)
     again.close()
     assert again.members == several
