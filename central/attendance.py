@@ -1,8 +1,7 @@
 """Track the presence and progress of each robot, and which the final map awaits."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import InitVar, dataclass, field
-from heapq import heappop, heappush
 from typing import Generic, TypeVar
 
 from teamslam.team.wire import messages as m
@@ -53,6 +52,13 @@ class Attendance:
             return False
         return (done.incarnation, done.measurements) >= (head.incarnation, head.measurements)
 
+    def note_done(self, done: m.Done) -> None:
+        """Store a `Done`; that of the last incarnation counts, in whichever order they arrive."""
+        if done not in self.dones:
+            self.dones = [*self.dones[1 - MOST_NOTED :], done]
+        if self.done is None or self.done.incarnation <= done.incarnation:
+            self.done = done
+
 
 S = TypeVar("S")
 
@@ -73,59 +79,22 @@ class Awaited(Generic[S]):
         return not self._left
 
 
-class Least:
-    """The least of named values that change one by one; infinite without any."""
-
-    def __init__(self) -> None:
-        self._values: dict[str, float] = {}
-        self._heap: list[tuple[float, str]] = []
-
-    def put(self, name: str, value: float) -> None:
-        """Set the value of a name."""
-        if self._values.get(name) != value:
-            self._values[name] = value
-            heappush(self._heap, (value, name))
-
-    @property
-    def value(self) -> float:
-        """The least value."""
-        while self._heap and self._values[self._heap[0][1]] != self._heap[0][0]:
-            heappop(self._heap)
-        return self._heap[0][0] if self._heap else float("inf")
-
-
-T = TypeVar("T", m.Done, m.End)
-
-
-def note(message: T, noted: list[T]) -> None:
-    """Append a new message; the newest MOST_NOTED stay."""
-    if message not in noted:
-        noted.append(message)
-        del noted[:-MOST_NOTED]
-
-
-_OfAnEnd = tuple[m.End, Awaited[m.StreamEnd]]
-HasReceived = Callable[[m.Done], bool]
-"""Whether all messages announced in a robot's `Done` have been processed."""
-Processed = Callable[[tuple[str, int]], int]
-"""Number of processed submaps of a stream."""
-
-
 @dataclass
 class TeamAttendance:
     """Progress and presence of each robot of the team.
 
-    now_ns: the newest team time in any message. world_end: the world's last counters. ends: all
-    announced ends; one that the robots' `Done` messages confirm becomes world_end. ordered: an
-    operator has ordered the live team to end.
+    has_received: whether all messages announced in a `Done` are processed. processed: number of
+    processed submaps of a stream. now_ns: the newest team time. world_end: the world's last
+    counters. ends: the announced ends, with their unconfirmed streams. ordered: an operator has
+    ordered the live team to end.
     """
 
     names: InitVar[Sequence[str]]
-    has_received: HasReceived
-    processed: Processed
+    has_received: Callable[[m.Done], bool]
+    processed: Callable[[tuple[str, int]], int]
     robots: dict[str, Attendance] = field(init=False)
     world_end: m.End | None = None
-    ends: list[m.End] = field(default_factory=list)
+    ends: dict[m.End, Awaited[m.StreamEnd]] = field(default_factory=dict)
     now_ns: int = 0
     withdrawn: frozenset[str] = frozenset()
     ordered: bool = False
@@ -133,10 +102,10 @@ class TeamAttendance:
     _ended: m.End | None = field(default=None, init=False)
     _last: dict[str, int] = field(default_factory=dict, init=False)
     _unsettled: Awaited[str] = field(default_factory=Awaited, init=False)
-    _unconfirmed: dict[int, _OfAnEnd] = field(default_factory=dict, init=False)
     _changed: set[str] = field(default_factory=set, init=False)
     _of_all: tuple[object, ...] = field(default=(), init=False)
-    _least: Least = field(default_factory=Least, init=False)
+    _until: dict[str, float] = field(default_factory=dict, init=False)
+    _watermark_ns: float = field(default=float("inf"), init=False)
 
     def __post_init__(self, names: Sequence[str]) -> None:
         self.robots = {robot: Attendance() for robot in sorted(names)}
@@ -164,11 +133,7 @@ class TeamAttendance:
                 robot.progress = merge_progress(message, robot.progress)
                 self.now_ns = max(self.now_ns, message.stamp_ns)
             case m.Done() if message.robot in self.robots:
-                robot = self.robots[message.robot]
-                note(message, robot.dones)
-                # The `Done` of the last incarnation counts, in whichever order they arrive.
-                if robot.done is None or robot.done.incarnation <= message.incarnation:
-                    robot.done = message
+                self.robots[message.robot].note_done(message)
             case m.End():
                 self.note_end(message)
                 self.world_end = merge_ends(message, self.world_end)
@@ -197,7 +162,9 @@ class TeamAttendance:
 
     def note_end(self, end: m.End) -> None:
         """Keep an announced end, even a refused one: the robots' `Done` may confirm it."""
-        note(end, self.ends)
+        self.ends.setdefault(end, Awaited())
+        if len(self.ends) > MOST_NOTED:
+            del self.ends[next(iter(self.ends))]
 
     def _take_of_driver(self, message: m.InitialPose | m.StreamHead, robot: Attendance) -> None:
         robot.began = max(robot.began, message.incarnation)
@@ -318,7 +285,9 @@ class TeamAttendance:
         Without keys a stranger can announce a later end and a `Done`; the world and its robots
         still name the same counters.
         """
-        for end in self._possible_ends():
+        for end, unconfirmed in self.ends.items():
+            if not unconfirmed.is_none(end.streams, self._is_open):
+                continue
             found = {s.robot: self._confirmed(s) for s in end.streams}
             others = self.robots.keys() - found.keys()
             if all(self._is_excused(r) for r in others) and any(found.values()):
@@ -329,15 +298,8 @@ class TeamAttendance:
                 return True
         return False
 
-    def _possible_ends(self) -> Iterator[m.End]:
-        def is_open(stream: m.StreamEnd) -> bool:
-            return self._confirmed(stream) is None and not self._is_excused(stream.robot)
-
-        known = self._unconfirmed
-        self._unconfirmed = {id(end): known.get(id(end), (end, Awaited())) for end in self.ends}
-        for end, unconfirmed in self._unconfirmed.values():
-            if unconfirmed.is_none(end.streams, is_open):
-                yield end
+    def _is_open(self, stream: m.StreamEnd) -> bool:
+        return self._confirmed(stream) is None and not self._is_excused(stream.robot)
 
     def _is_excused(self, name: str) -> bool:
         robot = self.robots[name]
@@ -359,10 +321,12 @@ class TeamAttendance:
         if of_all != self._of_all:
             self._changed.update(self.robots)
         self._of_all = of_all
-        for name in self._changed:
-            self._least.put(name, self._until_ns(name))
+        changed = {name: self._until_ns(name) for name in self._changed}
         self._changed.clear()
-        return self._least.value
+        if not changed.items() <= self._until.items():
+            self._until |= changed
+            self._watermark_ns = min(self._until.values())
+        return self._watermark_ns
 
     def _until_ns(self, name: str) -> float:
         """Progress of one robot if all its submaps until then have arrived; infinite where it is

@@ -8,12 +8,10 @@ import numpy as np
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.fixes import fix_warnings
-from teamslam.central.fused_map import JOINT_LANDMARKS, version_entry
 from teamslam.central.monitor import miscalibrations
 from teamslam.central.saved_maps import sensor_warnings
 from teamslam.central.sent_priors import in_main_island
 from teamslam.central.survey import survey_warnings
-from teamslam.central.unnamed_landmarks import decisions_of, judgement_of, memberships_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.verification import find_possible_duplicates
@@ -36,7 +34,6 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.minima import MISFIT, RIVAL
 from teamslam.team.estimation.map_joining.refusal import describe_refusals
-from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
@@ -61,82 +58,17 @@ FEW = 3
 NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 
 
-def team_map(
-    fold: Fold,
-    tail: Tail,
-    shown: Sequence[int],
-    *,
-    digest: bytes,
-    members: Mapping[Stream, int],
-    withdrawn: tuple[str, ...],
-    missing: tuple[m.VersionEntry, ...],
-    arrived: int,
-    cost: tuple[float, float],
-    covariance_scale: float,
-    biases: Sequence[BiasEstimate],
-    reasons: tuple[str, ...],
-    diagnosis: tuple[m.Diagnosis, ...],
-    left_out: Mapping[Stream, int],
-    changes: tuple[m.LandmarkChange, ...] = (),
-) -> m.FusedMap:
-    """Make the map of a fold with the landmarks `shown`; cost: (χ², dof).
-
-    The covariance is joint in a final map of at most JOINT_LANDMARKS.
-    """
-    joint = tail == "final" and len(shown) <= JOINT_LANDMARKS and bool(fold.contributions)
-    ids, means, covariance = _landmarks(fold, shown, joint=joint)
-    frame = fold.frame
-    return m.FusedMap(
-        stamp_ns=fold.contributions[-1].end_ns if fold.contributions else 0,
-        rule="join",
-        digest=digest,
-        frame="" if frame is None else translate.frame_name(*frame),
-        final=tail == "final",
-        provisional=tail == "provisional",
-        exchange=0,
-        members=tuple(version_entry(*each) for each in members.items()),
-        missing=missing,
-        joint=joint,
-        ids=from_ids(ids),
-        means=from_floats(means),
-        covariance=covariance,
-        chi2=cost[0],
-        dof=round(cost[1]),
-        reasons=reasons,
-        diagnosis=diagnosis,
-        left_out=tuple(version_entry(*each) for each in left_out.items()),
-        biases=tuple(
-            m.BiasEstimate(
-                robot=b.stream[0],
-                incarnation=whole_of(b.stream)[1],
-                bias=b.bias,
-                value=b.value,
-                sigma=b.sigma,
-            )
-            for b in biases
-            if b.stream == fold.latest_part(whole_of(b.stream))
-        ),
-        joined=tuple(fold.joined[k] for k in sorted(fold.joined)),
-        withdrawn=withdrawn,
-        covariance_scale=covariance_scale,
-        heard=arrived,
-        memberships=memberships_of(fold.landmarks, tail == "final") if fold.has_unnamed else (),
-        decisions=decisions_of(fold.landmarks) if fold.has_unnamed else (),
-        verdicts=tuple(judgement_of(v) for v in fold.landmarks.verdicts),
-        changes=changes,
-    )
-
-
-def _landmarks(
+def encoded_landmarks(
     fold: Fold, shown: Sequence[int], *, joint: bool
-) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"], bytes]:
+) -> tuple[bytes, bytes, bytes]:
+    """Encode ids, means and covariance (joint, or by landmark) of the landmarks `shown`."""
     if not fold.contributions:
-        return np.empty(0, np.uint32), np.empty((0, 2)), b""
+        return b"", b"", b""
     if joint:
         ids, means, matrix = marginals.landmark_map(fold, shown)
-        return ids, means, translate.joint_bytes(matrix)
+        return from_ids(ids), from_floats(means), translate.joint_bytes(matrix)
     ids, means, blocks = marginals.landmark_blocks(fold, shown)
-    return ids, means, translate.block_bytes(blocks)
+    return from_ids(ids), from_floats(means), translate.block_bytes(blocks)
 
 
 class Shown(NamedTuple):

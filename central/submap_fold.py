@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose, widening
-from teamslam.central.fused_map import receivable
+from teamslam.central.fused_map import JOINT_LANDMARKS, receivable, version_entry
 from teamslam.central.join_messages import (
     PRIOR_LANDMARKS,
     Tail,
+    encoded_landmarks,
     gets_landmarks_alone,
     priors,
     reasons,
     shown_landmarks,
-    team_map,
     trajectories,
 )
 from teamslam.central.localising import (
@@ -31,7 +31,12 @@ from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, sa
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.survey import datum_of
 from teamslam.central.tick_fold import TickFold
-from teamslam.central.unnamed_landmarks import verdict_of
+from teamslam.central.unnamed_landmarks import (
+    decisions_of,
+    judgement_of,
+    memberships_of,
+    verdict_of,
+)
 from teamslam.team import translate
 from teamslam.team.config import MAP
 from teamslam.team.estimation.contribution import NO_OWN, is_map, whole_of
@@ -255,22 +260,47 @@ class SubmapFold:
         if final and not self.config.localise:
             fold = marginals.widen_covariances(fold, widening(self.diagnosis))
             biases = marginals.bias_estimates(fold)
-        store = self.store
-        fused = team_map(
-            fold,
-            tail,
-            shown.ids,
+        joint = final and len(shown.ids) <= JOINT_LANDMARKS and bool(fold.contributions)
+        ids, means, covariance = encoded_landmarks(fold, shown.ids, joint=joint)
+        store, left_out = self.store, [x for each in withdrawn.values() for x in each]
+        last_of = {x.stream: x.sequence for x in left_out}
+        fused = m.FusedMap(
+            stamp_ns=fold.contributions[-1].end_ns if fold.contributions else 0,
+            rule="join",
             digest=digest,
-            members=members,
-            withdrawn=ticks.withdrawn,
+            frame="" if fold.frame is None else translate.frame_name(*fold.frame),
+            final=final,
+            provisional=tail == "provisional",
+            exchange=0,
+            members=tuple(version_entry(*each) for each in members.items()),
             missing=store.missing() if recorded is None else recorded.missing,
-            arrived=store.arrived if recorded is None else recorded.arrived,
-            cost=(0.0, 0.0) if agreement is None else (agreement.chi2, agreement.dof),
-            covariance_scale=self.finding.figures.get("covariance_scale", 0.0),
-            biases=biases,
+            joint=joint,
+            ids=ids,
+            means=means,
+            covariance=covariance,
+            chi2=0.0 if agreement is None else agreement.chi2,
+            dof=0 if agreement is None else round(agreement.dof),
             reasons=self._warnings if final else self.reasons,
             diagnosis=self.diagnosis,
-            left_out={x.stream: x.sequence for each in withdrawn.values() for x in each},
+            left_out=tuple(version_entry(*each) for each in last_of.items()),
+            biases=tuple(
+                m.BiasEstimate(
+                    robot=b.stream[0],
+                    incarnation=whole_of(b.stream)[1],
+                    bias=b.bias,
+                    value=b.value,
+                    sigma=b.sigma,
+                )
+                for b in biases
+                if b.stream == fold.latest_part(whole_of(b.stream))
+            ),
+            joined=tuple(fold.joined[k] for k in sorted(fold.joined)),
+            withdrawn=ticks.withdrawn,
+            covariance_scale=figures.get("covariance_scale", 0.0),
+            heard=store.arrived if recorded is None else recorded.arrived,
+            memberships=memberships_of(fold.landmarks, final) if fold.has_unnamed else (),
+            decisions=decisions_of(fold.landmarks) if fold.has_unnamed else (),
+            verdicts=tuple(map(judgement_of, fold.landmarks.verdicts)),
             changes=landmark_changes(fold, shown.ids) if final else (),
         )
         if self.config.localise and (saved := min(store.maps.items(), default=None)) is not None:
