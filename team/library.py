@@ -13,6 +13,7 @@ from typing import cast
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from teamslam.team import core, translate
 from teamslam.team.config import BIASES, BiasSigmas, FrontEnd, MotionModel, MotionNoise, Sensor
@@ -71,10 +72,14 @@ __all__ = [
     "submap_in",
     "submap_of",
     "submaps_in",
+    "word_likelihoods",
 ]
 
 _INCARNATION = 1
 """Incarnation of every stream here."""
+MOST_WORDS = 64
+UNEXPLAINED = 1e-4
+"""Share of descriptors that no word explains."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,6 +268,32 @@ def batch_map(
     """
     solve = load("teamslam.sim.studies.batch_reference.growing:solved_map", "batch_map")
     return cast("BatchMap", solve(keyframes, sensors, initial_poses, robust_c))
+
+
+def word_likelihoods(
+    descriptors: ArrayLike, words: ArrayLike, sigma: float
+) -> Float[np.ndarray, "n C"]:
+    """Compute p(descriptor | word), n × C, up to a factor by row: classes for `Driver.detect`.
+
+    exp(−|d − w|² / 2σ²), divided by the row's largest and at least 10⁻⁴, the share of descriptors
+    that no word explains. descriptors: n × D. words: vocabulary, C × D with C from 2 to 64, such as
+    cluster centres of a training set, the same for the whole team. sigma: standard deviation of a
+    component about the nearest word, from the same training set. Raises ValueError for other
+    shapes or a sigma that is not above 0.
+
+    Sivic and Zisserman 2003, Video Google.
+    """
+    d, w = np.asarray(descriptors, np.float64), np.asarray(words, np.float64)
+    if d.ndim != 2 or w.ndim != 2 or d.shape[1] != w.shape[1] or not 2 <= len(w) <= MOST_WORDS:
+        raise ValueError(
+            f"descriptors have the shape {d.shape} and words {w.shape}: give n × D and C × D, with "
+            f"2 to {MOST_WORDS} words"
+        )
+    if not sigma > 0.0:
+        raise ValueError(f"sigma is {sigma}: give a standard deviation above 0")
+    squared = ((d[:, np.newaxis] - w) ** 2).sum(axis=2) / sigma**2
+    nearest = squared.min(axis=1, keepdims=True)
+    return np.asarray(np.maximum(np.exp(0.5 * (nearest - squared)), UNEXPLAINED))
 
 
 def submap_in(payload: bytes) -> tuple[str, int, LocalMap]:

@@ -10,6 +10,7 @@ import pytest
 
 import teamslam
 from teamslam.team import library
+from teamslam.team.estimation.association.classes import CONTRADICTED, compare_classes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.zenoh.bus import ZenohBus
@@ -183,3 +184,36 @@ def test_examples_use_nothing_of_ours_but_the_library():
             if isinstance(node, ast.ImportFrom)
         }
         assert not {name for name in names if name and name.startswith("teamslam.")}
+
+
+def test_descriptors_of_one_landmark_match_and_of_two_do_not():
+    rng = np.random.default_rng(3)
+    words = rng.normal(0.0, 1.0, (32, 8))
+    landmarks = rng.normal(0.0, 1.0, (200, 8))
+    views = landmarks + rng.normal(0.0, 0.3, (4, 200, 8))
+    apart = views[0, :, np.newaxis] - words
+    nearest = (apart**2).sum(axis=2).argmin(axis=1)
+    sigma = apart[np.arange(200), nearest].std()
+    first, second = (
+        sum(np.log(library.word_likelihoods(view, words, sigma)) for view in pair)
+        for pair in (views[:2], views[2:])
+    )
+    same = compare_classes(first, second)
+    other = compare_classes(first, np.roll(second, 1, axis=0))
+    assert (same > -CONTRADICTED).mean() > 0.99
+    assert (other < -CONTRADICTED).mean() > 0.5
+    assert same.mean() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("descriptors", "words", "sigma"),
+    [
+        (np.zeros(3), np.zeros((2, 3)), 1.0),
+        (np.zeros((1, 3)), np.zeros((1, 3)), 1.0),
+        (np.zeros((1, 3)), np.zeros((2, 4)), 1.0),
+        (np.zeros((1, 3)), np.zeros((2, 3)), 0.0),
+    ],
+)
+def test_descriptors_of_other_shapes_are_refused(descriptors, words, sigma):
+    with pytest.raises(ValueError, match=r"give"):
+        library.word_likelihoods(descriptors, words, sigma)
