@@ -41,18 +41,6 @@ def final(found):
     return of(found.publish_final(END_NS), ch.FINAL_MAP)[0]
 
 
-def test_submaps_wait_for_the_start_of_their_stream():
-    found = rule(starts=("r2",))
-    for submap in SUBMAPS["r1"]:
-        found.store.add_submap(submap)
-    assert found.store.processed(("r1", 1)) == 0
-    found.store.add_start(STARTS["r1"])
-    assert found.store.processed(("r1", 1)) == len(SUBMAPS["r1"])
-    for submap in SUBMAPS["r2"]:
-        found.store.add_submap(submap)
-    assert encoded(final(found)) == encoded(final(whole()))
-
-
 def test_broadcasts_lie_so_far_apart_and_name_their_set():
     found, maps, priors = rule(), [], []
     for k in range(5):
@@ -149,17 +137,6 @@ def _completed(found):
     for submap in SUBMAPS["r2"]:
         found.store.add_submap(submap)
     return found
-
-
-def test_a_refused_submap_changes_no_bit_and_says_why():
-    found = rule()
-    for submap in SUBMAPS.every():
-        found.store.add_submap(submap)
-        other = msgspec.structs.replace(submap, mean=submap.mean[:-8] + bytes(8))
-        assert "differs" in found.store.add_submap(other)
-        assert found.store.acknowledged((submap.robot, 1)) == submap.sequence + 1
-    assert found.store.refused == 10
-    assert encoded(final(found)) == encoded(final(whole()))
 
 
 def sequences(found, robot):

@@ -84,24 +84,6 @@ def test_a_tick_closes_when_every_live_robot_has_passed_it():
     )
 
 
-def test_a_robot_that_is_lost_is_not_waited_for():
-    centre = joined()
-    centre.hears(SUBMAPS["r1"][0], progress("r1", 3, 1))
-    centre.hears(alive("r2", here=False))
-    assert centre.maps[0].members == build.version(r1=0)
-    centre.hears(alive("r2"), SUBMAPS["r1"][1], progress("r1", 6, 2))
-    assert len(centre.maps) == 1, "come back, it is waited for again"
-
-
-def test_submaps_that_are_announced_but_not_here_hold_the_watermark():
-    centre = joined(robots=("r1",))
-    centre.hears(STARTS["r2"], alive("r2"), alive("r2", here=False))
-    centre.hears(progress("r1", 9, 3), SUBMAPS["r1"][0], SUBMAPS["r1"][2])
-    assert centre.maps == []
-    centre.hears(SUBMAPS["r1"][1])
-    assert centre.maps[0].members == build.version(r1=2)
-
-
 def test_a_set_that_is_handed_in_again_gives_the_same_final_map_and_closes_nothing_before():
     members = [*STARTS.values(), *SUBMAPS.every(), done("r1"), done("r2")]
     centre = joined()
@@ -123,19 +105,6 @@ def test_a_submap_is_acknowledged_after_the_map_that_it_gave():
     assert out[-1].message.submaps == 1
     (again,) = centre.hears(SUBMAPS["r1"][0])
     assert again.message.submaps == 1
-
-
-def test_behind_the_watermark_no_later_map_takes_anything_back():
-    centre = joined()
-    for k in range(4):
-        for name in ("r1", "r2"):
-            centre.hears(SUBMAPS[name][k], progress(name, 3 * (k + 1), k + 1))
-    before = {}
-    for fused in centre.maps:
-        now = {(x.robot, x.incarnation): x.sequence for x in fused.members}
-        assert all(now[stream] >= last for stream, last in before.items())
-        before = now
-    assert len(centre.maps) == 4
 
 
 def everything():
@@ -340,35 +309,3 @@ def test_watermark_and_end_are_those_of_a_look_at_every_robot():
             assert concluded == whole
             ended += whole
     assert ended
-
-
-FEEDBACK = CentralConfig(fusion="kalman-per-axis")
-
-
-def estimate(robot, number):
-    return build.map_estimate(
-        stamp_ns=number, robot=robot, sequence=number, exchange=number, joint=False, means=b""
-    )
-
-
-def exchanges(centre):
-    return [fused.exchange for fused in centre.maps]
-
-
-def test_under_feedback_a_round_waits_for_every_live_robot():
-    centre = joined(config=FEEDBACK)
-    centre.hears(estimate("r1", 1))
-    assert exchanges(centre) == []
-    centre.hears(estimate("r2", 1))
-    assert exchanges(centre) == [1]
-
-
-@pytest.mark.parametrize("news", [given_up("r2"), done("r2", 0)])
-def test_under_feedback_a_robot_that_is_given_up_or_ends_early_is_waited_for_no_longer(news):
-    centre = joined(config=FEEDBACK)
-    centre.hears(estimate("r1", 1))
-    centre.hears(news)
-    assert exchanges(centre) == [1]
-    centre.hears(estimate("r1", 2), END, done("r1", 0))
-    assert exchanges(centre) == [1, 2]
-    assert centre.final.exchange == 2

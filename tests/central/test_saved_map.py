@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from teamslam.central import saved_maps
-from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.central.saved_maps import NothingToSaveError, save_map
@@ -22,7 +21,7 @@ from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.core import unpacked
 from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.saved_map import SavedMapError, map_figures, read_map, submap_of, write_map
+from teamslam.team.saved_map import SavedMapError, map_figures, read_map, write_map
 from teamslam.team.store import SubmapStore
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -306,13 +305,6 @@ def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
     assert without.withdrawn == ("map-site",)
 
 
-def test_the_saved_map_of_a_log_is_the_centres():
-    samples, centre, _ = second_day()
-    recorded = Recorded()
-    recorded.take_all(samples)
-    assert recorded_map(recorded, "both") == centre.maps.fold.save_map("both")
-
-
 def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
     figures, sizes = [], []
     for seed in (1, 2):
@@ -450,12 +442,6 @@ def test_a_landmark_without_identity_that_has_moved_is_found_and_nothing_else(nu
     (found,) = changed(final_map(samples)).values()
     assert found.state == "moved"
     assert (np.abs([found.dx - by[0], found.dy - by[1]]) < 4.0 * found.sigma).all()
-
-
-def test_the_submap_of_a_map_has_landmarks_and_no_motion():
-    submap = decoded(encoded(msgspec.structs.replace(submap_of(first_day()[1]), robot="r1")))
-    assert isinstance(submap, m.Submap)
-    assert not floats(submap.mean, "mean")[:3].any()
 
 
 def test_the_commands_save_show_and_load_a_map(tmp_path):

@@ -68,10 +68,6 @@ def test_a_clock_beyond_the_linear_range_is_named_as_late(tmp_path):
     assert found.errors.nees_per_dof < 6.0
 
 
-def test_a_team_that_is_as_configured_is_not_named(tmp_path):
-    assert not shared_errors_of(mapped(StressWorld(seed=1), tmp_path))
-
-
 def test_a_robot_with_one_landmark_keeps_its_configuration(tmp_path):
     """Its biases are determined by their prior alone."""
     found = mapped(StressWorld(seed=2, landmarks=1, robots=1, seconds=120.0), tmp_path)

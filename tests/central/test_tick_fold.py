@@ -4,8 +4,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import TickFold
@@ -48,19 +46,6 @@ def expected():
     return bits(straight().fold)
 
 
-@settings(deadline=None, max_examples=12)
-@given(st.deferred(lambda: st.permutations(range(len(SUBMAPS.every())))), st.data())
-def test_any_order_of_arrival_with_watermarks_between_gives_the_same_bits(order, data):
-    ticks = fresh()
-    waiting = {name: list(submaps) for name, submaps in SUBMAPS.items()}
-    for i in order:
-        add(ticks, waiting[SUBMAPS.every()[i].robot].pop(0))
-        if data.draw(st.booleans()):
-            ticks.fold_until(data.draw(st.sampled_from([0.0, 4e9, 8e9, 13e9, float("inf")])))
-    ticks.fold_until(float("inf"))
-    assert bits(ticks.fold) == expected()
-
-
 def test_a_late_submap_rolls_back_to_before_its_tick_and_no_further():
     ticks = fresh()
     for each in SUBMAPS["r1"]:
@@ -101,40 +86,6 @@ def test_a_submap_that_ends_where_a_tick_ends_is_in_it(tick_s):
     assert len(ticks.fold.contributions) == 1
 
 
-def test_the_provisional_fold_holds_everything_and_leaves_the_final_one_alone():
-    ticks = fresh()
-    for each in SUBMAPS.every():
-        add(ticks, each)
-    ticks.fold_until(4e9)
-    before = bits(ticks.fold)
-    assert bits(ticks.fold_ahead()) == expected()
-    assert bits(ticks.fold) == before
-
-
-@pytest.mark.parametrize("until_ns", [0.0, 8e9, float("inf")])
-def test_a_withdrawal_takes_the_ticks_again_that_were_taken_and_no_more(until_ns):
-    ticks, without = fresh(), fresh()
-    for each in SUBMAPS.every():
-        add(ticks, each)
-    for each in SUBMAPS["r1"]:
-        add(without, each)
-    taken = ticks.fold_until(until_ns)
-    assert without.fold_until(until_ns) == taken == (until_ns > 0.0)
-    ticks.withdraw_robot("r2")
-    assert ticks.withdrawn == ("r2",)
-    assert [c.key for c in ticks.fold.contributions] == [c.key for c in without.fold.contributions]
-    if taken:
-        assert bits(ticks.fold) == bits(without.fold)
-    kept = ticks.fold
-    add(ticks, SUBMAPS["r2"][0])
-    assert ticks.fold is kept, "what it says later changes nothing"
-    ticks.withdraw_robot("r2")
-    assert ticks.fold is kept, "once is enough"
-    ticks.fold_until(float("inf"))
-    without.fold_until(float("inf"))
-    assert bits(ticks.fold) == bits(without.fold)
-
-
 def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
     fold_by_hand = EMPTY_FOLD
     contributions = sorted(
@@ -168,9 +119,3 @@ def test_the_digest_changes_with_any_member_any_start_and_what_else_is_named():
     digests.add(vague.digest(vague.fold, b"x"))
     assert len(digests) == 6
     assert straight().digest(straight().fold, b"x") in digests
-
-
-def test_the_version_vector_names_the_last_sequence_of_each_stream():
-    ticks = straight()
-    last = {(name, 1): submaps[-1].sequence for name, submaps in SUBMAPS.items()}
-    assert ticks.members(ticks.fold) == last

@@ -16,7 +16,7 @@ from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.node import CentralNode
 from teamslam.central.submap_fold import SubmapFold
 from teamslam.central.tick_fold import TickFold
-from teamslam.central.withdrawal import disagreement, hold_trial
+from teamslam.central.withdrawal import disagreement
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.sim.world.config import OutlierKind, SimulatedWorld
@@ -348,10 +348,6 @@ def agreement(**ratios: float) -> Agreement:
     ]
     streams = tuple((robot, 0) for robot in ratios for _ in range(10))
     return Agreement(0.0, 1.0, {}, SubmapCosts(streams, np.array(rows).T))
-
-
-def verdict(without: dict[frozenset[str], Agreement], **ratios: float) -> str | None:
-    return hold_trial(agreement(**ratios), 4.0, lambda robots: without.get(frozenset(robots))).robot
 
 
 def test_a_robot_with_few_submaps_is_judged_by_three_of_its_newest_four():

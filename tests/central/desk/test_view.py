@@ -23,7 +23,6 @@ from teamslam.team import translate
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire import views
@@ -131,11 +130,6 @@ def test_a_view_comes_once_a_second_and_has_every_robot_where_it_was(read, sampl
 
 def test_views_of_the_same_log_are_the_same_bytes(samples):
     assert list(with_views(samples)) == list(with_views(samples))
-
-
-@pytest.mark.parametrize("node", [RobotNode])
-def test_no_robot_hears_a_view(node):
-    assert ch.VIEW not in node.listens
 
 
 # Drawings.
