@@ -55,7 +55,6 @@ def measured(name: str, path: Path) -> None:
 
 
 def digests(path: Path) -> dict[str, str]:
-    """Hash the messages of each channel in a run on these measurements."""
     scenario, streams = pickle.loads(path.read_bytes())
     found: dict[str, hashlib._Hash] = {}
     for sample in bits.run_team(scenario, streams):
@@ -93,7 +92,6 @@ def _elsewhere(path: Path, extra: Mapping[str, str]) -> dict[str, str]:
 
 
 def main() -> int:
-    """Return 1 where the bits of two classes differ."""
     parser = argparse.ArgumentParser(description="The bits of a run on other processors.")
     parser.add_argument("--only", default="", metavar="NAME", help="the cases that begin so")
     parser.add_argument("--classes", type=int, default=len(CLASSES), help="how many of them")

@@ -129,7 +129,6 @@ def differences(names: list[str]) -> Iterator[tuple[str, Row, str]]:
 
 
 def main() -> int:
-    """Return 1 where an estimate differs from the table."""
     parser = argparse.ArgumentParser(description="The bits of final maps against the table.")
     parser.add_argument("--only", default="", metavar="NAME", help="the cases that begin so")
     parser.add_argument("--rewrite", action="store_true", help="write what was computed")

@@ -72,7 +72,6 @@ requested = partial(_built, m.Requested)
 
 
 def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
-    """The end of the run, with the number of measurements of each stream."""
     streams = (
         m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
         for robot, count in measurements.items()

@@ -72,8 +72,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the tests of FIRST before the others."""
-
     def rank(item: pytest.Item) -> tuple[int, str]:
         first = (k for k, at in enumerate(FIRST) if item.nodeid.startswith(at))
         return next(first, len(FIRST)), item.nodeid.partition("::")[0]
@@ -107,6 +105,5 @@ class Shares(LoadScopeScheduling):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Shares:
-    """Distribute files in the order of the tests."""
     config.option.loadscopereorder = False
     return Shares(config, log)

@@ -16,7 +16,6 @@ S = 1_000_000_000
 
 
 def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[Sample]:
-    """Poses and truth at 5 Hz, and a growing map every 5 s."""
     rng = np.random.default_rng(seed)
     size_m = 6.0 * np.sqrt(landmarks)
     places = rng.uniform(0.0, size_m, (landmarks, 2))

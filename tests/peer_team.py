@@ -167,7 +167,6 @@ class PeerTeam:
                     self._say(robot, seat.boundary.take(seat.node, sample))
 
     def _catch_up(self, robot: str, seat: _Seat) -> None:
-        """Deliver the world's last messages to a new node."""
         for channel, sample in self._latest.values():
             if channel.name in seat.listens:
                 self._say(robot, seat.boundary.take(seat.node, sample))
@@ -177,7 +176,6 @@ class PeerTeam:
         self._world_boundary.take(self._world, sample)
 
     def _say(self, robot: str, outgoing: Sequence[Outgoing]) -> None:
-        """Deliver a robot's messages to the world and to the nodes in reach."""
         for out in outgoing:
             if out.channel is ch.MEMBERS:
                 request = Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
@@ -246,7 +244,6 @@ class PeerTeam:
 
 
 def peer_world(scenario: Scenario, streams: WorldStreams, late: Collection[str] = ()) -> WorldNode:
-    """The world of a team that does not wait for robots that join late."""
     names = [each.id for each in scenario.robots if each.id not in late]
     announced = announce_configuration("world", 0, 0, scenario)
     return WorldNode(

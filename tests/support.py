@@ -129,7 +129,6 @@ def spd(n: int) -> np.ndarray:
 
 
 def packed(matrix: np.ndarray) -> bytes:
-    """Upper triangle, row by row."""
     return from_floats(matrix[np.triu_indices(len(matrix))])
 
 
@@ -162,7 +161,6 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
 
 
 def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
-    """The message with the node that publishes on this key."""
     publisher = channel.publisher(name)
     says = m.Configuration | m.Progress | m.Status | m.Liveliness | m.Fault | m.SetSummary
     return (

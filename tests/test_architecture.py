@@ -48,7 +48,6 @@ def _defined(node: ast.stmt) -> list[str]:
 
 
 def wrong(text: str) -> list[str]:
-    """Paths and `file: name` in a page that do not exist."""
     found = [
         f"{path}: {name}"
         for path, name in NAMED.findall(text)
@@ -66,7 +65,6 @@ LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
 
 
 def dangling(page: Path) -> list[str]:
-    """Links to missing files or headings, generated pages excepted."""
     found = []
     for target, anchor in LINK.findall(page.read_text()):
         file = page.parent / target if target else page

@@ -1,5 +1,3 @@
-"""Bits of final maps equal the table: the cheap part of `python -m tests.bits`."""
-
 import pytest
 
 from tests.bits import CASES, ESTIMATES, computed, is_here, machine, table

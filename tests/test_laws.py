@@ -49,7 +49,6 @@ def team_of(streams, rng, **options):
 
 @pytest.fixture
 def scarce(monkeypatch):
-    """Little credit and small portions, so that nodes wait for each other."""
     monkeypatch.setattr(teamslam.sim.publisher.node, "CREDIT_MEASUREMENTS", 16)
     monkeypatch.setattr(teamslam.sim.publisher.node, "BATCH", 5)
     monkeypatch.setattr(teamslam.team.robot.node, "PROGRESS_MEASUREMENTS", 4)

@@ -24,7 +24,6 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def closure(*roots: str) -> set[str]:
-    """Names of all distributions that the requirements need, recursively."""
     found: set[str] = set()
     pending = [Requirement(root) for root in roots]
     seen = set()

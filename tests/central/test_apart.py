@@ -24,7 +24,6 @@ from tests.trials.stress_world import StressWorld, write
 
 @cache
 def mirrored_run(robot: str) -> tuple[Sample, ...]:
-    """A team of three with known initial poses, one robot's bearings with the wrong sign."""
     with TemporaryDirectory() as place:
         world = StressWorld(seed=3, seconds=60.0, mirrored=(robot,) if robot else ())
         of = scenario_in(write(world, Path(place) / "world"))

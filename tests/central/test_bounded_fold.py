@@ -1,5 +1,3 @@
-"""The running fold of a long run: bounded, and a pure function of the set."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

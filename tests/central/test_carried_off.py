@@ -1,5 +1,3 @@
-"""A robot that was carried off stays, with time and motion reported; a wrong one is withdrawn."""
-
 import math
 from itertools import compress
 
@@ -30,7 +28,6 @@ def chain() -> list[m.Submap]:
 
 
 def carried() -> list[m.Submap]:
-    """Submaps of r3, as if carried past those left out."""
     own = [each for each in chain() if not FIRST <= each.sequence <= LAST]
     gone = LAST + 1 - FIRST
     return [
@@ -43,7 +40,6 @@ def renumbered(submap: m.Submap, sequence: int) -> m.Submap:
 
 
 def mirrored() -> list[m.Submap]:
-    """Submaps of r3, as if its camera and gyro had the wrong sign."""
     found = []
     for each in chain():
         poses = 1 + len(stamps(each.nodes, "nodes"))

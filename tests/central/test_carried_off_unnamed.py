@@ -1,5 +1,3 @@
-"""A robot without landmark identities that is carried off: cut, kept, joined again by shape."""
-
 import math
 from functools import cache
 from pathlib import Path

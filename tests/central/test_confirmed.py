@@ -1,5 +1,3 @@
-"""A landmark that a single submap observed stays out of the map where it may be an outlier."""
-
 import msgspec
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ END_NS = 15_000_000_000
 
 
 def misread(submap: m.Submap) -> m.Submap:
-    """The submap with its last landmark read as one that no other submap has."""
     seen = ids(submap.ids, "ids")
     return msgspec.structs.replace(submap, ids=from_ids(np.array([*seen[:-1], FALSE], np.uint32)))
 

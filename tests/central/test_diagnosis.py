@@ -1,5 +1,3 @@
-"""The final map names the cause and the size of its misfit, and none without a fault."""
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -35,7 +33,6 @@ def scenario(world: StressWorld, place: Path) -> Scenario:
 
 @cache
 def noisy(noise: float) -> list[Sample]:
-    """Log of a team whose noise is so many times the stated one."""
     with TemporaryDirectory() as place:
         of = scenario(replace(TEAM, noise=noise), Path(place))
         return list(run_team(of, streams_of(of)))
@@ -180,7 +177,6 @@ def test_points_in_the_axes_of_the_world_fail_the_run_and_name_their_frame(tmp_p
 
 
 def test_noise_that_is_stated_far_too_large_is_answered_by_sigmas_and_units():
-    """As by the scenario `recorded` for good wheels: nothing is wrong with the data."""
     (found,) = final_map(noisy(0.2)).diagnosis
     assert found.cause == "noise_overestimated"
     assert f"by {math.sqrt(found.value[0]):.2g}, or" in found.remedy

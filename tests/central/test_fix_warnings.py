@@ -1,5 +1,3 @@
-"""Fixes that contradict the map are reported with the delay or antenna that explains them."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""A robot with false submaps is detected, whichever robot fixes the frame, and moves no other."""
-
 import math
 from collections.abc import Collection, Iterator
 from functools import cache
@@ -63,8 +61,6 @@ def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:
 
 
 class Liar(RobotNode):
-    """A robot's node with false submaps after the first ones."""
-
     kind = ""
     _base: m.Submap | None = None
 
@@ -155,7 +151,6 @@ def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
 
 @pytest.mark.parametrize("kind", ["micrometre", "swap"])
 def test_a_robust_loss_does_not_hide_a_liar_with_few_submaps(kind):
-    """Most of its newest submaps contradict the map, despite their small weight."""
     samples = run_with("r1", kind)
     ticks = of_set(samples, central=scenario().central)
     ticks.fold_until(30e9)

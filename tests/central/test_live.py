@@ -1,5 +1,3 @@
-"""A live team at centre and robot: drivers end their streams, an operator ends the team."""
-
 import pytest
 
 from teamslam.central.config import CentralConfig

@@ -1,5 +1,3 @@
-"""Robots without a start are placed in a saved map; `localise` leaves the map unchanged."""
-
 import dataclasses
 import json
 from functools import cache
@@ -148,7 +146,6 @@ def test_the_command_localises_a_log_again(tmp_path):
 
 
 def without(world, robot, until_ns):
-    """The world without a robot's measurements of landmarks until a time."""
     streams = []
     for each in world.streams:
         seen = each.landmark_detections
@@ -172,7 +169,6 @@ def test_a_robot_is_placed_by_the_saved_map_while_another_has_seen_nothing():
 
 
 def of_first_landmarks(world, count):
-    """The world with each robot's measurements of its first `count` landmarks alone."""
     streams = []
     for each in world.streams:
         seen = each.landmark_detections

@@ -1,5 +1,3 @@
-"""The consistency monitor: quiet where covariances are right; it names the overconfident robot."""
-
 from dataclasses import replace
 
 import numpy as np

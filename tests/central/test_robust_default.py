@@ -1,5 +1,3 @@
-"""With default settings a team survives outliers and a robot that is carried off."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""A saved map carries the robots' biases, tied to those of the same robots on a later day."""
-
 import dataclasses
 
 import msgspec

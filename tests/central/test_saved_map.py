@@ -1,5 +1,3 @@
-"""A saved map joins that of a later day, shows moved landmarks, and may be wrong."""
-
 import dataclasses
 import json
 from functools import cache
@@ -204,7 +202,6 @@ def test_a_running_centre_saves_the_map_of_its_present_set():
 
 
 def test_two_saves_of_a_day_count_once_though_an_earlier_robot_came_between():
-    """Each save names its streams; the second contains those of the first."""
     samples, centre, _ = second_day(loaded=False)
     fold = type(centre.maps.fold)(centre.config, centre.config_digest)
     saves = []
@@ -472,7 +469,6 @@ def test_the_commands_save_show_and_load_a_map(tmp_path):
 
 
 def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> WorldStreams:
-    """Measurements of an interval of time; `begins`: with the known starts."""
     streams = []
     for each in world.streams:
         of = each.intervals

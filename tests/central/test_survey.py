@@ -37,7 +37,6 @@ def drive(seed, unknown=("*",)):
 
 
 def surveyed_landmarks(seed, numbers, wrong=None, origin=(0.0, 0.0)):
-    """Survey landmarks with an error of SIGMA_M; wrong: displacements [m] by number."""
     _, streams, _ = drive(seed)
     noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (len(numbers), 2))
     at = np.searchsorted(streams.landmark_ids, numbers)

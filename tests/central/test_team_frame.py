@@ -1,5 +1,3 @@
-"""Frame of the robots' poses, for any order of arrival of their submaps."""
-
 from collections import deque
 
 import msgspec
@@ -29,7 +27,6 @@ _STREAMS: dict[tuple[str, bool, bool], list[m.Measurement]] = {}
 
 
 def measured(robot: str, *, started: bool, apart: bool) -> list[m.Measurement]:
-    """Measurements of the robot; apart: of landmarks that no other robot has."""
     key = (robot, started, apart)
     if key not in _STREAMS:
         found = published(stream(robot, STEPS, known=started, y=PATH_Y[robot]))
@@ -104,7 +101,6 @@ class Team:
         self.to_centre(order)
 
     def check(self) -> None:
-        """Check that poses state the newest map's frame or none, and are right in it."""
         for name, pose in self.poses.items():
             if not pose.in_team_frame:
                 assert pose.frame == f"{name}/1", "its own"
@@ -123,7 +119,6 @@ ROBOTS = sorted(PATH_Y)
 
 @st.composite
 def teams(draw):
-    """Robots, and the order of measurements and deliveries."""
     names = ROBOTS[: draw(st.integers(2, 3))]
     kinds = {name: (draw(st.booleans()), draw(st.booleans())) for name in names}
     action = st.tuples(st.sampled_from(["measure", "measure", "deliver"]), st.sampled_from(names))

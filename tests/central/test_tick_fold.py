@@ -1,5 +1,3 @@
-"""The fold by ticks: independent of the order of arrival, final behind the watermark."""
-
 from functools import cache
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Law 2 without identities: the map is a function of the set of submaps and verdicts."""
-
 from functools import cache
 from itertools import permutations
 

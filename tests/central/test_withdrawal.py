@@ -1,5 +1,3 @@
-"""After a withdrawal the map equals, bit for bit, that of a team without the robot."""
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -58,7 +56,6 @@ def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
 
 
 def run(of: Scenario, wrong: str = "") -> list[Sample]:
-    """r3 has wheels a third too large, a bent camera, or one that reads too far."""
     motion, sensor = MOTION, SENSOR
     if wrong == "bearing":
         sensor = msgspec.structs.replace(SENSOR, bearing_offset=0.3)
@@ -243,7 +240,6 @@ UNTIL_S = 40
 
 
 def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[MapPublisher, bytes]:
-    """Feed a rule messages in an order, with a watermark [s] after some of them, to its end."""
     rule = MapPublisher(SubmapFold(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
     for start in one_closes_windows_often():
         if isinstance(start, m.InitialPose):

@@ -1,5 +1,3 @@
-"""NEES and joint cost of joined maps, each with a mutant that fails."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Submaps and innovations of the front end, each with a mutant that fails."""
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

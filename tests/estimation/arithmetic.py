@@ -16,7 +16,6 @@ SIZES = (3, 40, 130)
 
 
 def digests() -> dict[str, str]:
-    """A digest of each function's results for the same arguments."""
     x = np.concatenate([0.08 * np.arange(-500.0, 500.0), np.ldexp(1.37, np.arange(-1000, 1000))])
     found = {
         "sin": core.sin(x),

@@ -25,7 +25,6 @@ def world(name, seed):
 
 
 def keyframes_of(config, stream):
-    """One keyframe per odometry interval, each of which ends with one message of landmarks."""
     told, seen = stream.intervals, stream.landmark_detections
     np.testing.assert_array_equal(told.end_ns, seen.stamps_ns)
     keyframes = []

@@ -39,8 +39,6 @@ FRONT = FrontEnd(particles=400, window_s=WINDOW_S)
 
 
 class Case(NamedTuple):
-    """A world, its robot, and each mutant's change of robot or streams."""
-
     world: SimulatedWorld
     robot: RobotConfig
     mutants: Mapping[str, Callable[[RobotConfig, WorldStreams], tuple[RobotConfig, RobotStream]]]

@@ -13,8 +13,6 @@ from tests.estimation.submap_world import correlated, drawn, local_truth, seen_f
 
 @dataclass
 class Met:
-    """True landmarks and exact starts; submaps and sightings in canonical order."""
-
     landmarks: np.ndarray
     starts: list
     submaps: list

@@ -50,7 +50,6 @@ def correlated(sigmas, rng):
 
 
 def drawn(truth, covariance, rng):
-    """A submap whose mean is drawn about the truth."""
     mean = truth + np.linalg.cholesky(covariance) @ rng.normal(size=len(truth))
     mean[2] = wrap(mean[2])
     return mean

@@ -1,5 +1,3 @@
-"""All forms of odometry: parts compose to the whole, noise equals numerical derivatives."""
-
 from itertools import pairwise
 
 import numpy as np

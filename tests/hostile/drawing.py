@@ -151,7 +151,6 @@ class Team:
         )
 
     def grow(self) -> None:
-        """Add one submap of one robot, with the sightings from its nodes."""
         rng = self._rng
         robot = str(rng.choice(ROBOTS))
         made = self.submap(robot)
@@ -208,7 +207,6 @@ def progress(robot: str, submaps: int) -> m.Progress:
 
 
 def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
-    """Last messages of the world and of robots with so many submaps each."""
     out: list[m.Message] = []
     for robot, count in submaps.items():
         said = progress(robot, count)
@@ -242,7 +240,6 @@ def centre_session(
 def _interval(
     rng: np.random.Generator, robot: str, number: int, start_ns: int, end_ns: int
 ) -> m.Measurement:
-    """One odometry interval in any of its three forms."""
     speed = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 1.0
     turn = float(numbers(rng, 1)[0]) if rng.random() < 0.2 else 0.1
     name = {"stamp_ns": end_ns, "robot": robot, "incarnation": 1, "number": number}
@@ -281,7 +278,6 @@ def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m
 
 
 def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator[m.Message]:
-    """Measurements of one robot from a broken driver, and the messages to it."""
     yield Team(rng).start(robot)
     now_ns = 0
     counter = 0
@@ -374,7 +370,6 @@ def payloads(rng: Random) -> Iterator[tuple[ch.Channel, str, bytes]]:
 
 
 def mutated(rng: Random, payload: bytes) -> bytes:
-    """Flip, cut, double or insert bytes."""
     data = bytearray(payload)
     for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
         if not data:

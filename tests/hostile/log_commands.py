@@ -58,7 +58,6 @@ def main(folder: str, *logs: str) -> None:
 
 
 def _run(command: list[str], log: str, folder: str) -> tuple[int, str]:
-    """Exit status and last line; a `teamslam` error as its text."""
     Path(folder).mkdir(exist_ok=True)
     given = [each.replace("LOG", log).replace("OUT", folder) for each in command]
     done = CliRunner().invoke(app, given)

@@ -59,7 +59,6 @@ def records_of(told: Sequence[tuple[ch.Channel, str, bytes]]) -> bytes:
 
 
 def expands(path: Path) -> Path:
-    """Half a gigabyte of zeros."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start()
@@ -81,13 +80,11 @@ def many_small(path: Path) -> Path:
 
 
 def few_large(path: Path) -> Path:
-    """Messages of the maximum number of zeros."""
     large = records_of([(ch.OWN_MAP, "alpha", bytes(58_000_000))])
     return log_of(path, large, large)
 
 
 def far_counters(path: Path) -> Path:
-    """Valid messages whose counters name 10¹⁸ measurements."""
     far = 2**60
     joint = from_floats([0.0] * 5)
     submap = build.submap(

@@ -1,5 +1,3 @@
-"""A message whose handling raises is set aside and reported; the team completes its map."""
-
 import re
 import threading
 
@@ -37,7 +35,6 @@ BROKEN_NS = 17_000_000_000
 
 @pytest.fixture
 def brittle(monkeypatch):
-    """An estimator that raises at one odometry, in the middle of its changes."""
     whole = HybridSlam.drive
 
     def drive(self, interval, **how):

@@ -69,7 +69,6 @@ def drawn(kind: type[m.Message], count: int) -> list[Sample]:
 
 
 def beginning() -> list[Sample]:
-    """A stream of each robot, so that extreme messages meet an open window."""
     out = []
     for robot in ROBOTS:
         start = build.initial_pose(robot=robot)

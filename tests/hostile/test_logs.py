@@ -1,5 +1,3 @@
-"""An untrusted log: every command that opens it, its memory and its last line."""
-
 import json
 import subprocess
 import sys

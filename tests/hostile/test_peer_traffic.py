@@ -1,5 +1,3 @@
-"""Messages of a hostile or broken peer neither fill a robot nor keep it busy."""
-
 import msgspec
 import pytest
 

@@ -79,7 +79,6 @@ def sighting(by, of, stamp_ns, spread):
 
 
 def concluded(messages, config=None):
-    """The final map of these messages, after all last messages."""
     count = dict.fromkeys(ROBOTS, 0)
     for each in messages:
         if isinstance(each, m.Submap):

@@ -1,5 +1,3 @@
-"""Certificates of a team, and a stranger's."""
-
 from dataclasses import dataclass
 from pathlib import Path
 

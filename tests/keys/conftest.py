@@ -1,5 +1,3 @@
-"""One set of certificates for all tests here."""
-
 from datetime import UTC, datetime, timedelta
 
 import pytest

@@ -69,7 +69,6 @@ ATTACKS = {
 
 
 def on_every_row() -> Iterator[Outgoing]:
-    """A message on each row of the table, on a key of r1 or of another node."""
     said = {type(each): each for each in examples()}
     names = {"robot": "r1", "node": "robot/r1"}
     for channel in ch.CHANNELS:

@@ -1,5 +1,3 @@
-"""A reader that stops reading, and stays connected, delays the others only briefly."""
-
 import os
 import signal
 import subprocess
@@ -59,7 +57,6 @@ with client(sys.argv[2], 60.0, own) as session:
 
 @contextmanager
 def running(program: str, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process of its own, and its first line of output."""
     with subprocess.Popen(
         [sys.executable, "-c", program, *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as process:

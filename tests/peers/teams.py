@@ -126,7 +126,6 @@ class Storm:
             self.disk[name].append(each)
 
     def kill(self, name: str) -> None:
-        """Restart it from its disk, the end of which may be torn."""
         kept = self.disk[name]
         own = [each for each in kept if about(each.message) == name]
         rest = [each for each in kept if about(each.message) != name]

@@ -1,5 +1,3 @@
-"""A peer's final map is a function of its set, in any order and portions."""
-
 import random
 
 import pytest

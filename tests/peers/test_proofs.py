@@ -32,7 +32,6 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def nodes(folder):
-    """Peers with keys; r2 has members of r1."""
     found = {}
     for robot in ROBOTS:
         signer = Signer(credentials_of(folder, f"robot-{robot}", "t"))
@@ -134,7 +133,6 @@ class Renewed:
         return Proofs("r1", Signer(credentials_of(self.folder, "robot-r1", "t")))
 
     def say(self, proofs: Proofs, *members: Member) -> None:
-        """r1 publishes its certificate and members; r2 receives both and the signatures."""
         self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
         for each in members:
             self.r2.take(each, "robot/r1")

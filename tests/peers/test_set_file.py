@@ -1,5 +1,3 @@
-"""A set on disk: what a restarted robot finds, however its file was torn."""
-
 import errno
 import os
 import random
@@ -58,7 +56,6 @@ def touched(first: int, last: int) -> set[int]:
 
 
 def check_recovered(path: Path, content: bytes, lost: set[int]) -> SetFile:
-    """Check that all intact records are found, with one report, and the file continues."""
     path.write_bytes(content)
     store = SetFile(path)
     assert store.members == [each for k, each in enumerate(MEMBERS) if k not in lost]

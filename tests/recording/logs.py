@@ -1,5 +1,3 @@
-"""Logs of samples for the tests of recorder, reader and tools."""
-
 from pathlib import Path
 
 from teamslam.team.recording.reader import Log, open_log

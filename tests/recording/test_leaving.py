@@ -32,7 +32,6 @@ def trajectory(robot: str) -> m.Trajectory:
 
 @contextmanager
 def leaving(bus: ZenohBus) -> Iterator[threading.Thread]:
-    """A centre that has published its last messages and waits for the recorder."""
     bus.watch_alive("recorder")
     node = Shell(bus, Waiting(), "central", threading.Event())
     bus.declare_alive("central")

@@ -169,7 +169,6 @@ def chunks_of(path: Path) -> list[tuple[int, int]]:
 
 @pytest.fixture(scope="module")
 def noise():
-    """Incompressible samples, which fill several chunks of a megabyte."""
     return [
         Sample("view/noise", hashlib.shake_128(b"%d" % i).digest(40_000), i + 1, 0, i)
         for i in range(100)

@@ -1,5 +1,3 @@
-"""A log as Parquet: every field reads back, typed, in row groups that bound the memory."""
-
 import json
 import sys
 

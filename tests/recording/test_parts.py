@@ -109,7 +109,6 @@ def test_a_log_that_is_not_of_this_run_is_not_continued(wrong, path, monkeypatch
 
 
 def final_part(path: Path, part: int, samples: list[Sample]) -> Recorder:
-    """The next part of a log, with these samples and the final map, completed."""
     recorder, _ = next_part(path, "t", {"scenario": "s"})
     with recorder:
         recorder.write([*samples, Sample("central/final", encoded(FINAL), 0, 0, 0)])
@@ -360,7 +359,6 @@ RATE = 40
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """The bytes of a log of 20 s, written much faster, and its samples."""
     path = tmp_path_factory.mktemp("flips") / "log.mcap"
     samples = [
         Sample(c.ODOMETRY.key("alpha"), encoded(odometry(i)), i, 10**18 + i * SECOND // RATE, i)

@@ -168,7 +168,6 @@ class Team:
         return [encoded(each) for each in self.published[wanted.first : wanted.last + 1]]
 
     def says(self, count: int) -> None:
-        """Publish so many measurements, with a submap and a pose for ten of them."""
         for _ in range(count):
             i = len(self.published)
             self.published.append(odometry(i))
@@ -179,7 +178,6 @@ class Team:
                 self.bus.publish(Outgoing(c.OWN_POSE, "alpha", POSE))
 
     def ends(self, until: Callable[[], bool]) -> None:
-        """End a run; the rest is requested while the source is there."""
         end = build.end(incarnation=0, alpha=len(self.published))
         self.bus.publish(Outgoing(c.END, "", end))
         self.bus.publish(Outgoing(c.FINAL_MAP, "", FINAL))
@@ -226,8 +224,6 @@ def test_the_recorder_names_the_run_by_its_log_also_after_a_restart(tmp_path):
 
 
 def flows(source: ZenohBus, path: Path) -> None:
-    """Return when publications of `source` reach the log at `path`."""
-
     def heard() -> bool:
         source.publish(Outgoing(c.SIGHTINGS, "probe", PROBE))
         return any(sample.key == "source/probe/sightings" for sample in open_log(path).samples())

@@ -1,5 +1,3 @@
-"""Check, cut, merge and CSV: errors are named, and merged parts are the whole."""
-
 import contextlib
 import csv
 import json

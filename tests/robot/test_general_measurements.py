@@ -1,5 +1,3 @@
-"""Teams with every form of measurement: every rule maps them, the log reproduces the run."""
-
 from functools import cache
 
 import msgspec

@@ -62,7 +62,6 @@ class Source:
 def lived(
     network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None], waits_s: float = 0.0
 ) -> RobotShell:
-    """A robot's process that receives the results of `act`, and is told to stop."""
     stop = threading.Event()
     shell = RobotShell(bus, config("r1"), stop, patience_s=0.0)
     shell.shell.begin = act  # when it has subscribed

@@ -332,7 +332,6 @@ def test_its_nis_is_that_of_its_windows_and_of_the_open_one():
 
 
 def outliers(measurements, share):
-    """Replace some of the ranges and bearings by random ones."""
     rng, spoilt = np.random.default_rng(7), []
     for measurement in measurements:
         if isinstance(measurement, m.Observations):

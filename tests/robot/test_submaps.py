@@ -1,5 +1,3 @@
-"""The robot's submaps: stored once, and decoded to the bits of the closed window."""
-
 import gc
 
 import msgspec

@@ -1,5 +1,3 @@
-"""The network of a ROS 2 robot: a foreign Zenoh router."""
-
 import socket
 
 import pytest

@@ -242,7 +242,6 @@ def test_a_late_subscriber_receives_the_newest_path_and_map(network):
 
 
 def plain(value):
-    """A message of rosbags as dictionaries and lists, without its constants."""
     if hasattr(value, "__msgtype__"):
         return {
             f.name: plain(getattr(value, f.name))

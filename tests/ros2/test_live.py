@@ -32,8 +32,6 @@ TOPICS = RobotTopics(
 
 
 class Robot(Driver):
-    """A driver that stores its calls and refuses decreasing time."""
-
     sensor_mount: tuple[float, float, float] | None = None
     antenna: tuple[float, float] | None = None
 

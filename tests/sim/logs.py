@@ -82,7 +82,6 @@ def final_map(
 
 
 def trajectory(robot: str, stamps: Sequence[int], poses: np.ndarray, sigma: float) -> Outgoing:
-    """A smoothed trajectory with one sigma for all coordinates."""
     covariances = np.tile(sigma**2 * np.eye(3), (len(stamps), 1, 1))
     message = translate.trajectory_message((robot, 1), bytes(8), stamps, poses, covariances)
     return Outgoing(ch.TRAJECTORY, robot, message)

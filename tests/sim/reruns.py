@@ -59,7 +59,6 @@ def messages(samples: Iterable[Sample], channel: ch.Channel, name: str = "") -> 
 
 
 def said(team: Team) -> list[Sample]:
-    """All messages of a test's team, key by key."""
     return [
         Sample(key, encoded(message), message.stamp_ns, 0, counter)
         for key, sent in team.sent.items()

@@ -1,5 +1,3 @@
-"""The last online poses are consistent with their covariances, and not with smaller ones."""
-
 import msgspec
 import numpy as np
 
@@ -37,7 +35,6 @@ def halved(scenario):
 
 
 def nees(robot, believed=lambda scenario: scenario):
-    """NEES per degree of freedom of the robot's last poses over all runs."""
     found = [bounds_of(seed, believed)[robot] for seed in SEEDS]
     errors = np.array([each.errors[-1] for each in found])
     covariances = np.array([each.covariances[-1] for each in found])

@@ -1,5 +1,3 @@
-"""The batch with the profile's noise: factors of the stated density, persistent errors."""
-
 import msgspec
 import pytest
 from scipy.stats import chi2

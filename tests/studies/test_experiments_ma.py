@@ -1,5 +1,3 @@
-"""Ma & Ma's figures on a small set in the UTIAS format, from a simulated world."""
-
 import numpy as np
 import pytest
 

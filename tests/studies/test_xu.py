@@ -28,7 +28,6 @@ def short(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def runs():
-    """By panel and method, of figures 4.4 and 5.2."""
     panels = [("4.4", panel) for panel in FIGURE_4_4.panels]
     panels += [("5.2", panel) for panel in FIGURE_5_2.panels]
     return {

@@ -1,5 +1,3 @@
-"""Fixtures of the system tests: processes, short scenarios, one finished launch."""
-
 import json
 import signal
 import threading
@@ -21,8 +19,6 @@ if threading.current_thread() is threading.main_thread():
 
 @dataclass(frozen=True)
 class Launched:
-    """A launch that has ended: scenario, JSON, log, output."""
-
     scenario: Path
     exit: int
     result: dict[str, Any]
@@ -32,7 +28,6 @@ class Launched:
 
 @pytest_asyncio.fixture
 async def team(tmp_path: Path) -> AsyncIterator[Processes]:
-    """The processes of a test, which end with it."""
     processes = Processes(tmp_path)
     try:
         yield processes
@@ -42,7 +37,6 @@ async def team(tmp_path: Path) -> AsyncIterator[Processes]:
 
 @pytest_asyncio.fixture(scope="session", loop_scope="session")
 async def launched(tmp_path_factory: pytest.TempPathFactory) -> Launched:
-    """One short world, launched at full speed, with a report."""
     folder = tmp_path_factory.mktemp("launched")
     processes = Processes(folder)
     scenario = short(folder)

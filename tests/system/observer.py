@@ -1,5 +1,3 @@
-"""Observer of a running team's bus."""
-
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,7 +30,6 @@ class Observer:
         self._bus.close()
 
     def count(self, channel: Channel, name: str = "") -> int:
-        """Number of messages of the channel's key so far."""
         for sample in self._bus.receive():
             self._counts[sample.key] = self._counts.get(sample.key, 0) + 1
         return self._counts.get(channel.key(name), 0)

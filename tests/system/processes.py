@@ -42,7 +42,6 @@ class Process:
 
     @property
     def exit(self) -> int | None:
-        """Its status, negative for a signal; None while it runs."""
         return self._process.returncode
 
     def said(self) -> str:

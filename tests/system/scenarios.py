@@ -1,5 +1,3 @@
-"""Short worlds for the system tests, and their results in memory."""
-
 import hashlib
 from functools import cache
 from pathlib import Path

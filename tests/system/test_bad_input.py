@@ -23,7 +23,6 @@ def told(process: Process) -> str:
 
 
 async def refused(team: Processes, *arguments: str | Path) -> str:
-    """Run a command that must fail; return its message."""
     process = await team.start(*arguments)
     await process.ended()
     await team.none_left(0.0)

@@ -1,5 +1,3 @@
-"""A system large enough for BLAS has the same bits in every process."""
-
 import os
 import subprocess
 import sys

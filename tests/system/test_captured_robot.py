@@ -38,7 +38,6 @@ Attack = Callable[[ZenohBus], None]
 
 
 def forge_final_map(bus: ZenohBus) -> None:
-    """Publish a final map of the whole team on the robot's own key."""
     bus.publish(Outgoing(ch.TEAM_FINAL, "r2", example(m.FusedMap)))
 
 
@@ -50,7 +49,6 @@ def flood_unknown_keys(bus: ZenohBus) -> None:
 
 
 def flood_garbage(bus: ZenohBus) -> None:
-    """Publish invalid payloads on a key of the robot."""
     for count in range(FLOOD):
         bus.publish_raw(Sample("robot/r2/status", b"x", 0, time.time_ns(), count))
 
@@ -103,6 +101,5 @@ async def test_a_captured_robot_changes_no_bit_of_the_map(team: Processes, *, ce
 
 
 def make_keys_of_team(folder: Path) -> Path:
-    """Make the certificates of the short scenario's team; return their folder."""
     make_keys(folder / "keys", "short", nodes_of(["r1", "r2"]))
     return folder / "keys"

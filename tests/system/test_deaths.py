@@ -1,5 +1,3 @@
-"""Processes that die are reported, the rest continues or ends, and none is left."""
-
 import json
 import os
 import signal
@@ -135,7 +133,6 @@ async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that
 
 
 async def test_an_interrupt_ends_every_process_and_completes_the_log(team):
-    """SIGTERM is treated as Ctrl-C."""
     launch, folder = await launched(team)
     launch.signal(signal.SIGTERM)
     assert await launch.ended() == 1

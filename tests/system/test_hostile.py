@@ -15,7 +15,6 @@ MESSAGES = 500
 
 
 async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team):
-    """A tenth of it is mutated. Afterwards the centre and a robot still report their status."""
     scenario = short(team.folder)
     endpoint = await team.router()
     there = ["--connect", endpoint]

@@ -28,7 +28,6 @@ async def done(team: Processes, name: str, command: Sequence[object]) -> str:
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A copy of the sources."""
     source = tmp_path_factory.mktemp("source")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
@@ -55,7 +54,6 @@ def build_wheel(source: Path, levels: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def wheel(source):
-    """The wheel without the core, as already built."""
     ended = build_wheel(source, levels="")
     assert ended.returncode == 0, ended.stderr
     (built,) = (source / "dist").glob("*.whl")

@@ -1,5 +1,3 @@
-"""`teamslam launch` starts a team of processes that maps a place and ends by itself."""
-
 import json
 import re
 import sys
@@ -161,7 +159,6 @@ def test_a_second_launch_at_another_pace_beside_a_users_own_team_ends_with_the_s
 
 
 def keep_another_runs_set(launched: Launched, file: Path) -> None:
-    """Write the set of another run: submaps of the same names with other numbers."""
     file.parent.mkdir()
     kept = StoredSet(file)
     for sample in open_log(launched.log).samples((ch.SUBMAP,)):

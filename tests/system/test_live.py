@@ -1,5 +1,3 @@
-"""A live team: two robots on the page's example, through deaths and a cut link."""
-
 import asyncio
 import json
 import os
@@ -26,7 +24,6 @@ PAUSE = "0.05"
 
 
 def recorded(folder: Path) -> bytes:
-    """Two robots' tables in `data`; bytes of the final map of a run on them as a data set."""
     simulated = with_options(load(short(folder)), robots=2)
     write_folder(streams_of(simulated), folder / "data")
     for tables in (folder / "data").glob("r*"):

@@ -49,7 +49,6 @@ def url(tmp_path_factory):
 
 
 def open_page(browser, url):
-    """Open the page on a desktop, without earlier errors."""
     browser.errors.clear()
     browser.size(1280, 800)
     browser.open(url)
@@ -58,7 +57,6 @@ def open_page(browser, url):
 
 @pytest.fixture
 def page(browser, url):
-    """The page on a recorded log, fully read, on a desktop."""
     open_page(browser, url)
     # The badge is written with all tables, after the last message.
     browser.wait("document.querySelector('#badge').textContent === 'LOG'")

@@ -1,5 +1,3 @@
-"""Processes without a centre: every robot ends with the map of a central run."""
-
 import json
 import subprocess
 

@@ -53,7 +53,6 @@ def send(bus: Bus, *messages: tuple[c.Channel, str, m.Message]) -> None:
 
 
 def until_heard(source: Bus, sink: Bus) -> None:
-    """Return when the subscriptions of `sink` have reached `source`: odometry flows."""
     sink.subscribe(c.ODOMETRY, "probe")
 
     def heard() -> bool:

@@ -1,5 +1,3 @@
-"""The table of channels, and the door that compares a message with its key."""
-
 import pytest
 
 from teamslam.team.wire import channels as c

@@ -1,5 +1,3 @@
-"""Payloads: golden bytes, structure, values, attachments."""
-
 import contextlib
 import json
 import struct
@@ -132,7 +130,6 @@ def with_two_nodes(stamps: list[int]) -> bytes:
 
 
 def longer(message: m.Message, field: bytes) -> bytes:
-    """The payload with one more field, which no class has."""
     fields = msgpack.packb(fields_of(message))
     assert fields[0] == 0xDC, "an array of more than fifteen"
     count = int.from_bytes(fields[1:3], "big") + 1

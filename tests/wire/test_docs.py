@@ -92,7 +92,6 @@ def _is_part(cls: type) -> bool:
 
 
 def _fields(cls: type[msgspec.Struct]) -> str:
-    """Fields of a message without the stamp, with which all begin."""
     usual, fields = usual_types(), _types(cls)
     if issubclass(cls, m.Message):
         assert fields[0] == ("stamp_ns", "StampNs")

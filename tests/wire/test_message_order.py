@@ -1,5 +1,3 @@
-"""The newer of two messages by their contents, in any order of arrival."""
-
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st

@@ -43,7 +43,6 @@ def endpoint():
 
 
 def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
-    """Subscribe and return when publications of `source` reach `sink`."""
     for channel in (*channels, c.SIGHTINGS):
         sink.subscribe(channel)
     probe = Sample("source/probe/sightings", b"", 0, 0, 0)
@@ -217,7 +216,6 @@ def test_a_publication_without_its_attachment_is_dropped_and_logged(endpoint, ca
 
 
 def put_beside(bus: ZenohBus, key: str, beside: bytes) -> None:
-    """Publish a submap on a key with another attachment than the bus's."""
     bus._publishers[key].put(encoded(submap(1)), attachment=beside)
 
 

@@ -1,5 +1,3 @@
-"""Scores of the data association, and of a map as a point set."""
-
 from typing import Any
 
 import numpy as np

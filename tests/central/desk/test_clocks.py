@@ -33,7 +33,6 @@ LATE_S = 0.1
 
 
 def published(world: StressWorld, place: Path) -> list[Sample]:
-    """Log of a data set's measurements without truth, with a final map."""
     of = scenario_in(write(world, place))
     node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
@@ -50,7 +49,6 @@ def timed_of(log: list[Sample], robot: str) -> Timed:
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory):
-    """A log with detections of r2 that are 0.1 s late."""
     world = StressWorld(robots=2, late={"r2": LATE_S})
     return published(world, tmp_path_factory.mktemp("late"))
 

@@ -104,7 +104,6 @@ def test_the_command_ends_with_1_and_names_the_offender(samples, tmp_path):
 
 
 def with_far_landmarks(samples: list[Sample]) -> tuple[list[Sample], m.Observations]:
-    """The log with a scan of r1 whose ranges are beyond the bounds."""
     scan = messages(samples, ch.OBSERVATIONS, "r1")[5]
     far = msgspec.structs.replace(
         scan,

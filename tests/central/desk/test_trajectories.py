@@ -45,7 +45,6 @@ def paths() -> tuple[Path, Path]:
 
 
 def asked(program: str, relation: str, options: tuple[str, ...], folder: FilePath) -> float:
-    """RMSE by evo on the files that the report writes."""
     estimate, true = paths()
     write_tum(estimate, folder / "estimate.tum")
     write_tum(true, folder / "true.tum")

@@ -260,7 +260,6 @@ TRUE = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 5.0]])
 
 
 def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Channel, m.Message]]:
-    """A map in the frame of a robot whose start may be known, and the truth."""
     heading = np.zeros((3, 1))
     true_path = np.hstack((TRUE + 1.0, heading))
     path = np.hstack((transform_points(MAP_FROM_TRUTH, TRUE + 1.0), heading + MAP_FROM_TRUTH[2]))

@@ -61,7 +61,6 @@ def window(seed, *, clutter=0.0, missed=0.0, spacing=2.0, steps=25, slip=None):
 
 
 def pairs(found: np.ndarray, labels: np.ndarray) -> tuple[float, float]:
-    """Pairwise (precision, recall) of the detections of landmarks."""
     real = labels != UNASSIGNED
     found, labels = found[real], labels[real]
     same = labels[:, None] == labels[None]

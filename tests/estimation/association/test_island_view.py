@@ -109,7 +109,6 @@ LOCAL_SD, SHIFT_SD = 0.01, 0.06
 
 
 def view_of_a_group_shifted_by(shift: float) -> IslandView:
-    """A map of three landmarks and a group of two, whose place has a common error."""
     places = np.concatenate([KNOWN, KNOWN[:2] + AWAY])
     count = len(places)
     local = LocalMap(

@@ -1,5 +1,3 @@
-"""Maps without names that show the same few landmarks: no others exclude a like place."""
-
 from dataclasses import replace
 
 import msgspec
@@ -47,7 +45,6 @@ def drive_around(
 
 
 def saved_map(world: np.ndarray) -> Contribution:
-    """The landmarks in a frame of their own."""
     n = len(world)
     moved = [transformed(np.array([3.0, 1.0, 0.8]), point) for point in world]
     mean = np.concatenate([np.zeros(3), np.ravel(moved)])
@@ -63,7 +60,6 @@ def folded(
     settings: JoinSettings = SETTINGS,
     fold: Fold = EMPTY_FOLD,
 ) -> Fold:
-    """Fold a submap a tick; the verdicts are with the last."""
     ordered = sorted(submaps, key=lambda each: each.key)
     for each in ordered:
         judged = verdicts if each is ordered[-1] else ()

@@ -10,7 +10,6 @@ NO_MAP = np.empty(0, np.uint32), np.empty((1, 0, 2)), np.empty((1, 0, 3))
 
 
 def placed(pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray]:
-    """Place a landmark at first sight: its mean, and (xx, xy, yy)."""
     return _stepped(pose, NO_MAP, seen, sensor, own)[:2]
 
 

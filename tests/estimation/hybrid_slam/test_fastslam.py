@@ -24,7 +24,6 @@ def wrap(angle):
 
 
 def observed(state, k):
-    """(range, bearing) of landmark k of a state (x, y, theta, x₁, y₁, …)."""
     dx, dy = state[3 + 2 * k] - state[0], state[4 + 2 * k] - state[1]
     return np.array([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - state[2])])
 
@@ -83,7 +82,6 @@ def kalman(motions, keyframes):
 
 
 def simulated(seed, steps=5, covariance=MOTION.covariance):
-    """Increments and measurements of a robot that stands at its first keyframe, then moves."""
     rng = np.random.default_rng(seed)
     truth = np.concatenate((np.zeros(3), LANDMARKS.ravel()))
     motions, keyframes = [], []

@@ -20,7 +20,6 @@ OWN = {
 
 
 def noise(own: np.ndarray, distance: float) -> np.ndarray:
-    """R of (range, bearing)."""
     if len(own) and own[3] >= 0.0:
         return np.array([[own[0], own[1]], [own[1], own[2]]])
     return np.diag([SENSOR[0] + SENSOR[1] * distance**2, SENSOR[2]])
@@ -31,7 +30,6 @@ def log_density(e: np.ndarray, S: np.ndarray) -> float:
 
 
 def kalman(e: np.ndarray, H: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean, covariance and log-likelihood of one joint update of the landmark."""
     S = H @ COVARIANCE @ H.T + R
     K = COVARIANCE @ H.T @ np.linalg.inv(S)
     return MEAN + K @ e, COVARIANCE - K @ H @ COVARIANCE, log_density(e, S)

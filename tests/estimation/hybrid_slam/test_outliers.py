@@ -1,5 +1,3 @@
-"""A robot with outliers: its submaps leave them out, and it reports their share."""
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -94,7 +92,6 @@ def aligned_rmse(scenario: Scenario) -> float:
 
 @pytest.fixture(scope="module")
 def clean_rmse():
-    """RMSE of the run without the outliers' measurements."""
     return aligned_rmse(world_with("drop"))
 
 

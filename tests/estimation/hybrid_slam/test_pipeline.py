@@ -148,7 +148,6 @@ STEADY = MotionModel(
 
 
 def closed(mount=MOUNT, sensor_mount=MOUNT, biases=(), shift: float = 0.0):
-    """A window over an arc: its submap, and the true end of the base."""
     sensor = Sensor(range_sigma=0.01, bearing_sigma=0.002, mount=sensor_mount)
     front = FrontEnd(particles=400, window_s=100.0, biases=biases)
     slam = HybridSlam(RobotConfig("r1", motion=STEADY, sensor=sensor, front_end=front), 1)

@@ -1,5 +1,3 @@
-"""Pose nodes of a window, and sightings of teammates on the grid of times."""
-
 import msgspec
 import numpy as np
 import pytest
@@ -171,7 +169,6 @@ def seen():
 
 
 def driven(marks, particles=200, sensor=SENSOR, biases=()):
-    """Four keyframes; landmarks are seen at the first; `marks`: nodes."""
     random = core.Random(b"a key of 16 byte")
     window = windows.open_window(FrontEnd(particles=particles, biases=biases), sensor)
     for k in range(4):

@@ -59,7 +59,6 @@ SPREAD = np.array([0.08, 0.06, 0.05])
 
 
 def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
-    """Keyframes along an arc of half a metre a step between landmarks, and the true end."""
     random = np.random.default_rng(seed)
     pose, keyframes = np.zeros(3), []
     way = np.arange(-4.0, 28.0, 2.0)

@@ -1,5 +1,3 @@
-"""Biases that a robot's submaps share: columns, factors, and their use at the centre."""
-
 from dataclasses import replace
 
 import msgspec
@@ -104,7 +102,6 @@ def test_the_clocks_derivative_changes_as_the_curvature_states():
 
 
 def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
-    """A window of six random keyframes, with its motions' covariances and shifts."""
     rng, random = np.random.default_rng(seed), random_numbers(seed, "r1", 0, 0)
     window = core.Window(5, noise_of(sensor), mount=mount)
     motions = []

@@ -34,8 +34,6 @@ def wrap(angle):
 
 @dataclasses.dataclass
 class Drive:
-    """Commands, readings, and the truth: (end pose, all landmarks)."""
-
     motions: list
     keyframes: list
     truth: np.ndarray

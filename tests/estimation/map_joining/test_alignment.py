@@ -1,5 +1,3 @@
-"""A free stream joins the main frame once its landmarks determine its pose."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The broadcast prior times the robot's own later submaps is the full join."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -132,7 +130,6 @@ def test_after_a_bad_submap_the_landmarks_of_the_next_ones_bring_the_pose_back(s
 
 
 def misread(local, place, shift):
-    """The submap with this landmark's measurement replaced by one `shift` away."""
     mean = local.mean.copy()
     mean[3 + 2 * place : 5 + 2 * place] += shift
     return LocalMap(local.ids, mean, local.covariance)

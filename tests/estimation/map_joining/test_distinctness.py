@@ -1,5 +1,3 @@
-"""A final map leaves out possible duplicates, and landmarks that nearly all submaps miss."""
-
 import numpy as np
 import pytest
 

@@ -234,7 +234,6 @@ def test_a_graph_without_a_gauge_names_a_node_that_is_not_determined():
 
 
 def with_outlier(world, k):
-    """The k-th submap sees everything at three times its distance."""
     bad = world.submaps[k]
     mean = bad.local.mean.copy()
     mean[3:] *= 3.0

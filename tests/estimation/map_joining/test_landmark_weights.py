@@ -1,5 +1,3 @@
-"""Robust weights of landmarks, their annealing, damped steps and the landmarks' own sigma."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""Robots that are carried off among few landmarks, which only later submaps show."""
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -110,7 +108,6 @@ def test_landmarks_on_both_sides_tie_a_map():
 
 
 def sides(main: Island, first: int) -> tuple[set[int], set[int]]:
-    """List the landmarks of the submaps before `first`, and those of the others."""
     id_of = {node: id_ for id_, node in main.graph.landmarks.items()}
     seen: tuple[set[int], set[int]] = set(), set()
     for each in main.graph.submaps:
@@ -155,7 +152,6 @@ SPARSE_WORLD = StressWorld(seed=3, robots=1, hidden=True, landmarks=11, seconds=
 
 
 def run(world: StressWorld) -> tuple[m.FusedMap, np.ndarray]:
-    """Run one robot; return the final map and the true landmarks."""
     with TemporaryDirectory() as folder:
         place = write(world, Path(folder))
         scenario = final_only(scenario_in(place))

@@ -1,5 +1,3 @@
-"""A robot without a start is placed by the team's landmarks, with the covariance of its error."""
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,6 @@ def spread(rng, n, sigma):
 
 
 def drawn(seed, seen, moved=()):
-    """Landmarks of a team, and a window of a robot that sees those at the indices `seen`."""
     rng = np.random.default_rng(seed)
     n = len(PLACES)
     P = spread(rng, 2 * n, 0.05)

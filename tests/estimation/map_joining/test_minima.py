@@ -1,5 +1,3 @@
-"""Wrong minima are detected by a start without a guess, by the cost, by a second place."""
-
 from dataclasses import replace
 
 import numpy as np

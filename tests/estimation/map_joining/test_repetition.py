@@ -1,5 +1,3 @@
-"""Robots that were carried off: the repeated part of a map, and the cut of its stream."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""Resting landmarks: map, covariance and cost are those of a fold in which none rests."""
-
 from dataclasses import replace
 
 import numpy as np

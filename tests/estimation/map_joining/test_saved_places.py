@@ -1,5 +1,3 @@
-"""Moves of a saved map's landmarks that today's submaps place, with numbers and without."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -55,13 +53,11 @@ def _local(first: int, places: np.ndarray, keep: np.ndarray | None = None) -> Lo
 
 
 def final(of: Island) -> Fold:
-    """The full solution, with landmarks that have moved apart."""
     fold = Fold((), {}, {SITE: of}, {SITE: SITE, ROBOT: SITE}, EMPTY_FOLD.reasons)
     return solve_fold(fold, of.settings)
 
 
 def states(of: Island) -> dict[int, str]:
-    """States of the landmarks in the final map, by index."""
     changes = landmark_changes(final(of), sorted(of.graph.landmarks))
     return {each.landmark - min(of.graph.landmarks): each.state for each in changes}
 

@@ -1,5 +1,3 @@
-"""Standard deviation of a sum from the scatter of its possibly correlated parts."""
-
 import math
 
 import numpy as np

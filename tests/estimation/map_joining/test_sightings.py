@@ -1,5 +1,3 @@
-"""Sightings of teammates are consistent factors between pose nodes, used once; they tie frames."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""One robot's Gaussian back end: equal to least squares in the linear case; absorbed maps."""
-
 from dataclasses import replace
 
 import numpy as np

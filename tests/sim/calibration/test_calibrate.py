@@ -39,7 +39,6 @@ NOTHING = grouped(np.empty(0, np.int64), np.empty(0, np.uint32), np.empty(0), np
 
 
 def reference(name: str, **fields: Any) -> Reference:
-    """One robot's data on a known path, by default without detections."""
     nothing = {"seen": NOTHING, "sighted": NOTHING, "names": (), "teammates": {}}
     return Reference(**(nothing | {"name": name, "gap_ns": SECOND, "landmarks": SEEN} | fields))
 

@@ -1,5 +1,3 @@
-"""A clock offset of a robot's detections is found, and not taken for a mount."""
-
 from types import SimpleNamespace
 
 import msgspec
@@ -22,7 +20,6 @@ SMALL = StressWorld(robots=2, landmarks=12, half_m=12.0, seconds=240.0)
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """A data set with right clocks, and the same with late detections of r2."""
     late = StressWorld(**{**vars(SMALL), "late": {"r2": OFFSET_S}})
     root = tmp_path_factory.mktemp("sets")
     return write(SMALL, root / "right"), write(late, root / "late")

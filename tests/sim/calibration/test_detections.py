@@ -20,7 +20,6 @@ REACH_M = 12.0
 
 
 def world(seed, clutter, missed):
-    """A hidden world of two robots with these shares of clutter and missed detections."""
     scenario = load("waypoints")
     changed = msgspec.structs.replace(
         scenario.world, size_m=60.0, landmark_count=60, visible_to_m=REACH_M, steps=150,

@@ -1,5 +1,3 @@
-"""Models that do not fit the data are detected from the team's own measurements."""
-
 from dataclasses import dataclass
 
 import msgspec

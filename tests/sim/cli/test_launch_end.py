@@ -1,5 +1,3 @@
-"""The end of a launch: interruption, full disk, a router killed as the run ends."""
-
 import errno
 import os
 from io import StringIO

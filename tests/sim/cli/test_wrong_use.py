@@ -18,7 +18,6 @@ def message_in(said: str, status: object) -> str:
 
 @pytest.fixture
 def told(monkeypatch, tmp_path, capfd):
-    """Run a command in an empty folder where it must fail; return its message."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
 

@@ -1,5 +1,3 @@
-"""Data sets in folders of CSV tables: exact values, counts of dropped rows, named damage."""
-
 import dataclasses
 from pathlib import Path
 

@@ -106,7 +106,6 @@ def test_pyfg_has_robots_times_priors_and_the_truth(tmp_path):
 
 
 def drive(poses: int = 60, landmarks: int = 12, noise: float = 1.0) -> str:
-    """A graph of a circle with odometry noise, in isam's format."""
     rng = np.random.default_rng(3)
     places = rng.uniform(-12.0, 12.0, (landmarks, 2))
     step, pose, lines = np.array([1.0, 0.0, 0.15]), np.zeros(3), []

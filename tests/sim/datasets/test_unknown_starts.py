@@ -14,7 +14,6 @@ SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 
 
 def slice_of_set_6() -> Scenario:
-    """Its first 100 s, with a pose per window."""
     scenario = with_options(load("utias"), dataset=SET_6)
     world = msgspec.structs.replace(scenario.world, duration_s=100.0)
     robots = tuple(msgspec.structs.replace(robot, pose_s=60.0) for robot in scenario.robots)

@@ -167,7 +167,6 @@ def test_what_is_wrong_with_a_table_is_named(steps, table, text, why):
 
 
 def launched(*words):
-    """The error with which `teamslam launch` ends before any process starts."""
     result = CliRunner().invoke(app, ["launch", *map(str, words)])
     assert isinstance(result.exception, DatasetError), result.output
     return str(result.exception)

@@ -1,5 +1,3 @@
-"""UTIAS data sets: written sets read back equal, repairs are counted, damage is named."""
-
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -376,7 +374,6 @@ def real(number: int, **options: bool) -> WorldStreams:
 
 
 def range_errors(world: WorldStreams, landmark: int) -> np.ndarray:
-    """Range less true range of every sighting of one landmark."""
     errors = []
     at = world.landmarks[world.landmark_ids == landmark][0]
     for stream in world.streams:

@@ -1,5 +1,3 @@
-"""Bags of other labs: a robot's topics, its sensors' mounts, a clock that is set."""
-
 from typing import Any
 
 import numpy as np

@@ -101,7 +101,6 @@ TAGS = "t,id,range,bearing_deg\n1,7,2,90\n"
 
 
 def team_files(folder: Path, layout: str) -> Path:
-    """Files of ann and bob, whose columns differ: by prefix, by suffix, or in folders."""
     for robot, files in {
         "ann": {"odom": TRACK, "tags": TAGS},
         "bob": {"wheels": SPEEDS, "markers": MARKERS},

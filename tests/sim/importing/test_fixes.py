@@ -1,5 +1,3 @@
-"""NavSatFix of a bag becomes fixes.csv in the tangent plane of a datum."""
-
 from pathlib import Path
 
 import numpy as np

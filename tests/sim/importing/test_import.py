@@ -1,5 +1,3 @@
-"""`teamslam import`: bags, CSV files of other layouts and logs become the same tables."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Without a centre every peer ends with the central run's map, byte for byte."""
-
 import msgspec
 import pytest
 

@@ -32,8 +32,6 @@ class Service(Supervised):
 
 
 class Team:
-    """Running processes, a manual clock, and the notes on them."""
-
     def __init__(self, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
         self.now = 1000.0
         monkeypatch.setattr(time, "monotonic", lambda: self.now)

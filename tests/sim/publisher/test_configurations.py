@@ -17,7 +17,6 @@ STREAMS = world_of(stream("r1", 12), stream("r2", 9))
 
 
 def world() -> WorldNode:
-    """A world that waits for two robots and a centre, all alive."""
     expected = expected_nodes(["r1", "r2"], recorder=False)
     configurations = Configurations(expected_configurations(SCENARIO))
     announced = build.configuration(node="world", incarnation=0)
@@ -28,7 +27,6 @@ def world() -> WorldNode:
 
 
 def announced(node: WorldNode, *others: str) -> None:
-    """Announce the world's scenario, or another one by `others`."""
     here, there = expected_configurations(SCENARIO), expected_configurations(OTHER)
     for name in here:
         node.handle((there if name in others else here)[name])

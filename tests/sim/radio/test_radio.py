@@ -1,5 +1,3 @@
-"""The radio: pairs of robots in range, and a bus that drops messages from out of range."""
-
 import msgspec
 import numpy as np
 

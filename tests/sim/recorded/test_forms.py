@@ -1,5 +1,3 @@
-"""A stream of mixed measurement forms, from a log to tables and back, message for message."""
-
 from collections.abc import Sequence
 from typing import Any
 

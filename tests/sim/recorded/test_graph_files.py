@@ -35,7 +35,6 @@ def whitened(residual, upper):
 
 
 def solved(text):
-    """Every vertex of the file at the optimum of its edges."""
     vertices, edges, fixed = {}, [], set()
     for line in text.splitlines():
         kind, *words = line.split()

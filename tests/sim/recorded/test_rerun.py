@@ -1,5 +1,3 @@
-"""A log is recomputed to the last bit, and a change in it is named."""
-
 import os
 import random
 import signal
@@ -60,7 +58,6 @@ def with_one_bit(message: m.Message) -> m.Message:
 
 
 def flipped(samples: list[Sample]) -> list[Sample]:
-    """Flip one bit of one odometry measurement of r2."""
     counter = messages(samples, ch.ODOMETRY, "r2")[ODOMETRY_OF_SUBMAP_3].number
 
     def change(message: m.Message) -> m.Message:

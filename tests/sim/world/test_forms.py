@@ -84,7 +84,6 @@ def test_forms_that_do_not_fit_are_named():
 
 
 def streams(form: str, identities: str):
-    """Waypoints whose sensors claim the covariance of each measurement, in a form."""
     scenario = load("waypoints")
     world = msgspec.structs.replace(
         scenario.world,

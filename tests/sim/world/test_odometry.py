@@ -85,7 +85,6 @@ def test_a_filter_with_another_model_is_found_out(name, wrong):
 
 
 def mixed_team(**of_first: object) -> Scenario:
-    """Three robots of three kinds, and a short world with enough landmarks."""
     sensors = (Sensor(), Sensor(range_sigma=0.3), Sensor(range_sigma_per_m=0.02))
     kinds = ("alphas", "turn-then-drive", "wheels")
     robots = tuple(
@@ -148,7 +147,6 @@ def cost_per_dof(of: m.FusedMap) -> float:
 
 
 def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
-    """Stamp, motion and ranges of each keyframe of the first robot at the centre."""
     keyframes = TeamKeyframes([robot.id])
     keyframes.configure(robot.id, robot)
     measurements = published(world.streams[0])

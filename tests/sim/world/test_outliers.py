@@ -1,5 +1,3 @@
-"""Simulated outliers: as many as asked, of the given kind, and nothing else changes."""
-
 import msgspec
 import numpy as np
 import pytest

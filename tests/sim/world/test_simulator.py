@@ -33,7 +33,6 @@ def content(stream: RobotStream) -> list[bytes]:
 
 
 def true_detections(stream: RobotStream, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """True range and bearing of every observation of a stream with a message per step."""
     seen = stream.landmark_detections
     step = np.repeat(np.arange(1, len(seen.offsets)), np.diff(seen.offsets))
     across = landmarks[seen.ids.astype(int) - 1] - stream.truth[step, :2]

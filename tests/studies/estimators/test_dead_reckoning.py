@@ -30,7 +30,6 @@ def reckoned(steps, start=START, measurements=()):
 
 
 def drive(seed, steps=20):
-    """Measured increments of a robot, and its true path."""
     rng = np.random.default_rng(seed)
     told = [increment_of(MOTION, 1.0, 0.98, rng.uniform(-0.15, 0.15)) for _ in range(steps)]
     truth = START

@@ -1,5 +1,3 @@
-"""The innovation of a keyframe: its definition, and its power to reject wrong models."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Joint FastSLAM of a team: equal to FastSLAM for one robot and for robots that share nothing."""
-
 import numpy as np
 import pytest
 

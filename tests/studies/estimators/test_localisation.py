@@ -1,5 +1,3 @@
-"""Monte Carlo localisation against a grid, a Kalman filter, FastSLAM on known landmarks, truth."""
-
 import dataclasses
 import functools
 

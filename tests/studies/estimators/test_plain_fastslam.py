@@ -67,7 +67,6 @@ def test_the_map_is_the_mixture_of_the_particles_maps_by_id():
 
 
 def short_run(seed, repeat):
-    """NEES and dof of the map; each measurement counts `repeat` times."""
     told = drive(seed, ACCURATE, steps=8)
     start = plain_fastslam.initial_state(np.zeros(3), 500, "fastslam2", 0.5)
     state = filtered(told, ACCURATE, start, np.random.default_rng(seed), repeat)

@@ -162,7 +162,6 @@ def test_an_exchange_is_consistent_for_spherical_errors_and_not_if_landmarks_cou
 
 
 def full_maps(seed, common=4, sigma=0.05):
-    """The maps of `two_maps` with joint covariances of every kind, and errors drawn from them."""
     (a, b), a_from_b, points = two_maps(seed, sigma=0.0, common=common)
     rng = np.random.default_rng([seed, 1])
     maps = []

@@ -1,5 +1,3 @@
-"""The rule `batch`: equal to GTSAM on the same measurements; it reports what it neglects."""
-
 import msgspec
 import numpy as np
 import pytest

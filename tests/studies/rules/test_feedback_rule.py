@@ -1,5 +1,3 @@
-"""Rules with feedback: rounds in lockstep, with robots that end early or are lost."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,5 +1,3 @@
-"""Rules on raw measurements are functions of the streams, for any order of arrival."""
-
 from functools import cache
 
 import numpy as np

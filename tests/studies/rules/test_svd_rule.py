@@ -1,5 +1,3 @@
-"""Downs' joining at the centre: a function of the set of submaps and one start pose."""
-
 from functools import cache
 
 import numpy as np
