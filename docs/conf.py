@@ -6,7 +6,6 @@ reStructuredText.
 """
 
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -114,22 +113,22 @@ def _write(writer: object, node: object, display: str) -> None:
 
 
 def _write_commands(app: object) -> None:
-    """Write the page of all commands with their options, by Typer."""
+    """Write the page of all commands with their options."""
+    import click
+
+    from teamslam.sim.cli.main import load_all
+
+    lines = ["# Commands"]
+
+    def add_help(command: click.Command, context: click.Context) -> None:
+        lines.append(f"\n## `{context.command_path}`\n\n```text\n{command.get_help(context)}\n```")
+        for name, inner in getattr(command, "commands", {}).items():
+            add_help(inner, click.Context(inner, context, name))
+
+    team = load_all()
+    add_help(team, click.Context(team, info_name="teamslam", terminal_width=100))
     GENERATED.mkdir(exist_ok=True)
-    page = GENERATED / "commands.md"
-    command = [
-        sys.executable,
-        "-m",
-        "typer",
-        "teamslam.sim.cli.main",
-        "utils",
-        "docs",
-        "--name",
-        "teamslam",
-    ]
-    subprocess.run(  # noqa: S603 - our own command line, no shell
-        [*command, "--title", "Commands", "--output", str(page)], check=True, cwd=HERE.parent
-    )
+    (GENERATED / "commands.md").write_text("\n".join(lines) + "\n", "utf-8")
 
 
 def setup(app: object) -> None:

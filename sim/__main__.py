@@ -9,7 +9,7 @@ INTERRUPTED = 130
 def main() -> None:
     """Run a command."""
     try:
-        from teamslam.sim.cli.entry import main as run
+        from teamslam.sim.cli.main import main as run
 
         run()
     except KeyboardInterrupt:  # while modules are imported; later a command reports it

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
-from teamslam.sim.cli.main import app
+from teamslam.sim.cli.main import load_all
 from tests.support import ROOT
 
 PAGES = sorted(
@@ -107,7 +106,7 @@ def test_the_laws_are_named_with_what_enforces_and_what_proves_them():
 
 COMMAND = re.compile(r"^\s*(?:\$ )?teamslam ([a-z][^\n#]*)", re.MULTILINE)
 SPOKEN = re.compile(r"`teamslam ([a-z][^`]*)`")
-CLI = typer.main.get_command(app)
+CLI = load_all()
 
 
 def unknown(line: str) -> str | None:

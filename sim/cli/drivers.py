@@ -7,9 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from teamslam.sim.cli.help import Command, network, rare
+from teamslam.sim.cli.commands import Group, argument, network, option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -25,7 +23,7 @@ from teamslam.sim.cli.options import (
 if TYPE_CHECKING:
     from teamslam.team.ros2_driver import Ros2Driver
 
-app = typer.Typer()
+app = Group()
 
 
 class Back(StrEnum):
@@ -44,44 +42,34 @@ AT_ONCE = 500
 """Measurements processed between checks for new messages."""
 
 
-@app.command(
-    cls=Command,
-    epilog="teamslam driver r1 --team lab --ros2 topics.toml --start 0,0,1.57",
-)
+@app.declare("teamslam driver r1 --team lab --ros2 topics.toml --start 0,0,1.57")
 def driver(
-    robot: Annotated[str, typer.Argument(help="The robot's name, as r1.")],
-    ros2: Annotated[Path, typer.Option(help="TOML file that assigns topics.", metavar="FILE")],
-    team: Annotated[str, typer.Option(help="The team's name: its scenario's.", metavar="NAME")],
+    robot: Annotated[str, argument("The robot's name, as r1.")],
+    ros2: Annotated[Path, option("TOML file that assigns topics.", "FILE")],
+    team: Annotated[str, option("The team's name: its scenario's.", "NAME")],
     connect: Connect = LOOPBACK,
     ros2_connect: Annotated[
         str | None,
         network(
-            help="Where ROS 2 is on Zenoh (rmw_zenoh's router, or a bridge); default: --connect.",
-            metavar="ENDPOINT",
+            "Where ROS 2 is on Zenoh (rmw_zenoh's router, or a bridge); default: --connect.",
+            "ENDPOINT",
         ),
     ] = None,
     keys: Keys = None,
     file: Annotated[
-        Path | None,
-        rare(help="Where all measurements are kept; default: ROBOT.stream here.", metavar="FILE"),
+        Path | None, rare("Where all measurements are kept; default: ROBOT.stream here.", "FILE")
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option(
-            help="Where it starts, and how well that is known (m, rad).",
-            metavar="x,y,theta[,sigma,sigma]",
-        ),
+        option("Where it starts, and how well that is known (m, rad).", "x,y,theta[,sigma,sigma]"),
     ] = None,
     latency: Annotated[
-        float,
-        rare(
-            help="Seconds by which landmarks may arrive later than odometry.", min=0.0, metavar="S"
-        ),
+        float, rare("Seconds by which landmarks may arrive later than odometry.", "S", least=0.0)
     ] = 0.2,
     answers: Annotated[
         Back,
-        typer.Option(
-            help="What is published back to ROS 2: everything, all but the transform map → odom "
+        option(
+            "What is published back to ROS 2: everything, all but the transform map → odom "
             "(another node publishes it), or nothing."
         ),
     ] = Back.ALL,

@@ -8,9 +8,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
+from click.exceptions import Exit
 
-from teamslam.sim.cli.help import Command, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -24,43 +25,35 @@ from teamslam.sim.cli.options import (
 )
 from teamslam.team.extras import install_command
 
-app = typer.Typer()
+app = Group()
 
 
-@app.command(
-    name="import",
-    cls=Command,
-    epilog="teamslam import odom.csv tags.csv --robot r1 --columns columns.toml -o my_set",
+@app.declare(
+    "teamslam import odom.csv tags.csv --robot r1 --columns columns.toml -o my_set", name="import"
 )
 def import_(
     source: Annotated[
         list[Path],
-        typer.Argument(
-            help="CSV files of one robot, ROS 2 bags (.mcap, .db3, folders), a team's log, or a "
+        argument(
+            "CSV files of one robot, ROS 2 bags (.mcap, .db3, folders), a team's log, or a "
             "UTIAS set."
         ),
     ],
     output: Annotated[Path | None, output_option("Folder for the data set.")] = None,
     robot: Annotated[
-        str | None,
-        typer.Option(help="The robot's name, if it is one; it may be added to a data set."),
+        str | None, option("The robot's name, if it is one; it may be added to a data set.")
     ] = None,
     start: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Where it started, and how well that is known (m, rad); repeatable.",
-            metavar="[ROBOT:]x,y,theta[,sigma,sigma]",
+        option(
+            "Where it started, and how well that is known (m, rad); repeatable.",
+            "[ROBOT:]x,y,theta[,sigma,sigma]",
         ),
     ] = None,
-    columns: Annotated[
-        Path | None, typer.Option(help="TOML file that maps columns.", metavar="FILE")
-    ] = None,
-    ros2: Annotated[
-        Path | None, typer.Option(help="TOML file that assigns topics.", metavar="FILE")
-    ] = None,
+    columns: Annotated[Path | None, option("TOML file that maps columns.", "FILE")] = None,
+    ros2: Annotated[Path | None, option("TOML file that assigns topics.", "FILE")] = None,
     truth: Annotated[
-        Path | None,
-        typer.Option(help="The robot's true path: CSV, or TUM's format.", metavar="FILE"),
+        Path | None, option("The robot's true path: CSV, or TUM's format.", "FILE")
     ] = None,
 ) -> None:
     """Convert logs to a data set for launch, calibrate, rerun and batch-reference."""
@@ -80,7 +73,7 @@ def import_(
 
     if output is None:
         if text := proposal(source[0]):
-            typer.echo(text)
+            click.echo(text)
             return
         fail("give the folder for the data set: -o FOLDER", WRONG_USE)
     if robot is not None and not re.fullmatch(ROBOT_NAME, robot):
@@ -112,17 +105,17 @@ def import_(
         notes = dict.fromkeys([*report.notes, *read])  # each once
     except ProposalWrittenError as proposed:
         shutil.rmtree(output / robot if adds and robot else output, ignore_errors=True)
-        typer.echo(str(proposed))
-        raise typer.Exit(WRONG_USE) from None
+        click.echo(str(proposed))
+        raise Exit(WRONG_USE) from None
     except BaseException:  # remove a partial data set, whose folder the next attempt may use
         shutil.rmtree(output / robot if adds and robot else output, ignore_errors=True)
         raise
     for note in notes:
-        typer.echo(note)
+        click.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s
-        typer.echo(f"{count_noun(report.messages, 'message')}, {rate:,.0f} a second")
-    typer.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
+        click.echo(f"{count_noun(report.messages, 'message')}, {rate:,.0f} a second")
+    click.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
 
 
 def import_into(path: Path, folder: Path) -> Path:
@@ -132,8 +125,8 @@ def import_into(path: Path, folder: Path) -> Path:
     if folder.exists() and any(folder.iterdir()):
         fail(f"{folder} is not empty: give another --output", WRONG_USE)
     for note in import_data(Request(sources=[path]), folder).notes:
-        typer.echo(note, err=True)
-    typer.echo(f"imported {path} into {folder}", err=True)
+        click.echo(note, err=True)
+    click.echo(f"imported {path} into {folder}", err=True)
     return folder
 
 
@@ -153,7 +146,7 @@ def readable(path: Path) -> Iterator[Path]:
     with TemporaryDirectory() as place:
         folder = Path(place) / path.stem
         for note in import_data(Request(sources=[path]), folder).notes:
-            typer.echo(note, err=True)
+            click.echo(note, err=True)
         yield folder
 
 
@@ -184,20 +177,20 @@ def _as_read(folder: Path) -> list[str]:
     return lines
 
 
-@app.command(cls=Command, epilog="teamslam calibrate my_set -o my_set/scenario.toml")
+@app.declare("teamslam calibrate my_set -o my_set/scenario.toml")
 def calibrate(
     source: Annotated[
         list[Path],
-        typer.Argument(
-            help="Data sets (folders, UTIAS zips), logs (.mcap), ROS 2 bags; learnt from together."
+        argument(
+            "Data sets (folders, UTIAS zips), logs (.mcap), ROS 2 bags; learnt from together."
         ),
     ],
     output: Annotated[
         Path | None, output_option("Write a scenario with the learnt figures.")
     ] = None,
-    truth: Annotated[bool, typer.Option(help="Use the ground truth where it is there.")] = True,
+    truth: Annotated[bool, option("Use the ground truth where it is there.")] = True,
     scenario: Annotated[
-        str | None, typer.Option(help="The scenario to begin with; default: the source's own.")
+        str | None, option("The scenario to begin with; default: the source's own.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -230,7 +223,7 @@ def calibrate(
     read: list[tuple[str, WorldStreams, Scenario]] = []
     own = scenario
     for path in source:
-        typer.echo(f"reading {path}", err=True)
+        click.echo(f"reading {path}", err=True)
         with readable(path) as found_at:
             if found_at.suffix == ".mcap":
                 warn_of_holes(open_log(found_at))
@@ -243,7 +236,7 @@ def calibrate(
     start = read[0][2] if scenario is None else scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
     with failing(FAILED, CalibrationError):
-        found = calibrate_models(worlds, start, lambda text: typer.echo(text, err=True))
+        found = calibrate_models(worlds, start, lambda text: click.echo(text, err=True))
     table = Table("part", "figure", "value", "± (1 σ)", "unit")
     parts = (
         ("motion", found.motion),
@@ -259,7 +252,7 @@ def calibrate(
             table.add_row(part, figure.name, *numbers, figure.unit)
     Console().print(table)
     for note in found.notes:
-        typer.echo(note)
+        click.echo(note)
     write_json(json_file, asdict(found))
     if output is not None:
         names = [name for name, _, _ in read]
@@ -267,4 +260,4 @@ def calibrate(
         if output.exists():
             set_aside(output)
         output.write_text(text, "utf-8")
-        typer.echo(f"wrote {output}: `teamslam launch {output} --dataset …` uses it")
+        click.echo(f"wrote {output}: `teamslam launch {output} --dataset …` uses it")

@@ -8,14 +8,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+import click
 
 from teamslam.central.desk.names import data_set_name
-from teamslam.sim.cli.help import Command, network, output_option, rare
+from teamslam.sim.cli.commands import Group, argument, network, option, output_option, rare
 from teamslam.sim.cli.importing import import_into
 from teamslam.sim.cli.options import (
     ANY_PORT,
     FAILED,
+    INTERRUPTED,
     LOOPBACK,
     WRONG_USE,
     Dataset,
@@ -61,44 +62,33 @@ if TYPE_CHECKING:
     from teamslam.sim.launch.launch import Outcome, Plan
     from teamslam.sim.world.streams import WorldStreams
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the shell's convention."""
-app = typer.Typer()
+app = Group()
 
 
-@app.command(
-    cls=Command,
-    epilog=("teamslam launch waypoints --view\nteamslam launch --dataset my_set -o runs/first"),
-)
+@app.declare("teamslam launch waypoints --view\nteamslam launch --dataset my_set -o runs/first")
 def launch(
     scenario: Annotated[
         str | None,
-        typer.Argument(
-            help="A built-in scenario or a .toml file; default: thesis, or the data set's own."
-        ),
+        argument("A built-in scenario or a .toml file; default: thesis, or the data set's own."),
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
     seed: Seed = None,
     speed: SpeedText = "max",
-    view: Annotated[
-        bool, typer.Option("--view", help="Show the run on a page, until Ctrl-C.")
-    ] = False,
+    view: Annotated[bool, option("Show the run on a page, until Ctrl-C.", "--view")] = False,
     output: Annotated[
-        Path | None,
-        output_option("The run's folder; default: a new one below runs/.", metavar="DIR"),
+        Path | None, output_option("The run's folder; default: a new one below runs/.", "DIR")
     ] = None,
     identities: IdentitiesOption = None,
     without_centre: Annotated[
-        bool, typer.Option("--without-centre", help="No central computer: robots are peers.")
+        bool, option("No central computer: robots are peers.", "--without-centre")
     ] = False,
-    report: Annotated[bool, typer.Option(help="Draw the pictures and write the report.")] = True,
+    report: Annotated[bool, option("Draw the pictures and write the report.")] = True,
     browser: Open = None,
     map_: MapFiles = None,
     localise: Localise = False,
     record: Annotated[
-        Path | None,
-        rare(help="The log to write; default: log.mcap in the run's folder.", metavar="FILE"),
+        Path | None, rare("The log to write; default: log.mcap in the run's folder.", "FILE")
     ] = None,
     json_file: JsonFile = None,
     pieces: Pieces = None,
@@ -108,32 +98,30 @@ def launch(
     comm_range: Annotated[
         float | None,
         rare(
+            "Peers reach each other within this true distance in metres.",
             "--comm-range",
-            help="Peers reach each other within this true distance in metres.",
-            metavar="M",
-            min=0.001,
+            "M",
+            least=0.001,
         ),
     ] = None,
-    views: Annotated[
-        bool, rare(help="Record what Foxglove, Lichtblick and Rerun draw, too.")
-    ] = True,
+    views: Annotated[bool, rare("Record what Foxglove, Lichtblick and Rerun draw, too.")] = True,
     end_silent: Annotated[
         float | None,
         rare(
-            help="End a process that is silent for this many seconds, so that it is started "
+            "End a process that is silent for this many seconds, so that it is started "
             "again; default: only name it.",
-            min=10.0,
-            metavar="S",
+            "S",
+            least=10.0,
         ),
     ] = None,
     port: Port = 0,
     foxglove_port: FoxglovePort = None,
     listen: Annotated[
-        str, network(help="Where the router listens; port 0: any free one.", metavar="ENDPOINT")
+        str, network("Where the router listens; port 0: any free one.", "ENDPOINT")
     ] = ANY_PORT,
     keys: Keys = None,
     insecure: Annotated[
-        bool, network(help="Without keys, admit everyone who reaches the router.")
+        bool, network("Without keys, admit everyone who reaches the router.")
     ] = False,
 ) -> None:
     """Launch a whole team, watch it, and end with a report and a log.
@@ -170,7 +158,7 @@ def launch(
         check_pieces(resolved)
     resolved, missing, streams = _checked_world(resolved)
     if name == ASSUMED_NAME and dataset is not None and streams is not None:
-        typer.echo(_how_to_learn(dataset, streams), err=True)
+        click.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == ANY_PORT:
         listen = LOOPBACK  # must be reachable by drivers
     warnings = [
@@ -179,7 +167,7 @@ def launch(
         *_time_warnings(streams),
     ]
     for text in warnings:
-        typer.echo(f"warning: {text}", err=True)
+        click.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
     folder = output or _new_folder(_name_of(resolved) or f"{resolved.name}-{resolved.seed}")
@@ -246,7 +234,7 @@ def _keep_showing(url: str, log: Path) -> None:
     from teamslam.team.shell import process
 
     with process("launch", endless=True) as stop:  # Ctrl-C may follow the line at once
-        typer.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
+        click.echo(f"page  {url} until Ctrl-C; later: teamslam view {log}")
         stop.wait()
 
 
@@ -358,7 +346,7 @@ def _conclude(
 
     console = Console()
     join_parts(outcome.log)  # joined here, where it may take long
-    typer.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
+    click.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
     steps.begin("scoring the run")
     extra: dict[str, Any] = {
@@ -385,7 +373,7 @@ def _conclude(
         print_evaluation(evaluation, console)
         if report:
             run = read_run(log, evaluation, steps, proves_ledger=False)
-            typer.echo("drawing the pictures and writing the report", err=True)
+            click.echo("drawing the pictures and writing the report", err=True)
             print_nis(run, console)
             _write_report(run, outcome, {**figures, **run_figures(run)}, console)
         if evaluation.map is None:

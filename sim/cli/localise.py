@@ -3,39 +3,30 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from teamslam.sim.cli.help import Command, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.launch import launch
 from teamslam.sim.cli.options import Dataset, JsonFile, Robots, Seed, SpeedText
 from teamslam.sim.cli.rerun import rerun
 
-app = typer.Typer()
+app = Group()
 
 
-@app.command(
-    cls=Command,
-    epilog=(
-        "teamslam localise --map site.map --dataset my_set\n"
-        "teamslam localise --map site.map runs/day2"
-    ),
+@app.declare(
+    "teamslam localise --map site.map --dataset my_set\nteamslam localise --map site.map runs/day2"
 )
 def localise(
-    map_: Annotated[
-        Path, typer.Option("--map", help="The saved map, which stays as it is.", metavar="FILE")
-    ],
+    map_: Annotated[Path, option("The saved map, which stays as it is.", "--map", "FILE")],
     source: Annotated[
         str | None,
-        typer.Argument(
-            help="A scenario, or a log or the folder of a run; default: as of launch.",
-            metavar="[SCENARIO|LOG]",
+        argument(
+            "A scenario, or a log or the folder of a run; default: as of launch.", "[SCENARIO|LOG]"
         ),
     ] = None,
     dataset: Dataset = None,
     robots: Robots = None,
     seed: Seed = None,
     speed: SpeedText = "max",
-    output: Annotated[Path | None, output_option("The run's folder.", metavar="DIR")] = None,
+    output: Annotated[Path | None, output_option("The run's folder.", "DIR")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Localise robots in a saved map, without mapping.

@@ -6,9 +6,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
+from click.exceptions import Exit
 
-from teamslam.sim.cli.help import Command, Group, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -31,20 +32,16 @@ if TYPE_CHECKING:
     from teamslam.team.recording.summary import KeySummary
     from teamslam.team.wire.channels import Channel
 
-NewLog = Annotated[Path, output_option("The new log.", metavar="FILE")]
-ChannelNames = Annotated[
-    str | None, typer.Option(help="Channels, as odometry,submap; all without.", metavar="NAMES")
-]
+NewLog = Annotated[Path, output_option("The new log.", "FILE")]
+ChannelNames = Annotated[str | None, option("Channels, as odometry,submap; all without.", "NAMES")]
 
 NOT_FINISHED = "not finished by its recorder"
-app = typer.Typer(
-    name="log",
-    cls=Group,
+app = Group(
+    "log",
     help="Inspect, check, repair, cut, merge or export a log.",
     epilog="teamslam log info runs/first\nteamslam log export runs/first -o bag --format rosbag2",
-    no_args_is_help=True,
 )
-app.command(cls=Command, epilog="teamslam log repair team.mcap -o whole.mcap")(repair)
+app.declare("teamslam log repair team.mcap -o whole.mcap")(repair)
 
 
 class Format(StrEnum):
@@ -60,10 +57,10 @@ class Format(StrEnum):
     PYFG = "pyfg"
 
 
-@app.command(cls=Command, epilog="teamslam log info runs/first")
+@app.declare("teamslam log info runs/first")
 def info(
     log: LogArgument,
-    keys: Annotated[bool, typer.Option("--keys", help="A row per key, not per channel.")] = False,
+    keys: Annotated[bool, option("A row per key, not per channel.", "--keys")] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Show the contents of a log: channels, messages, bytes, rates, span in team time, metadata."""
@@ -83,13 +80,13 @@ def info(
     console = Console()
     messages, size = (sum(getattr(k, name) for k in summary.keys) for name in ("messages", "bytes"))
     state = "complete" if not lacks else "not whole" if opened.complete else NOT_FINISHED
-    typer.echo(
+    click.echo(
         f"{log}\nteam {one_line(opened.team)}, {state}: {messages:,} messages, "
         f"{size:,} payload bytes"
     )
     if span is not None:
         first, last = (ns * 1e-9 for ns in span)
-        typer.echo(
+        click.echo(
             f"measurements over {last - first:.3f} s of team time, {first:.3f} to {last:.3f} s"
         )
         console.print(_key_table(summary.keys, span[0], by_key=keys))
@@ -109,7 +106,7 @@ def info(
     write_json(json_file, figures)
 
 
-@app.command(cls=Command, epilog="teamslam log check runs/first")
+@app.declare("teamslam log check runs/first")
 def check(log: LogArgument) -> None:
     """Check that a log is whole and valid: checksums, schemas, counters, order, every message.
 
@@ -120,21 +117,21 @@ def check(log: LogArgument) -> None:
 
     findings = check_log(open_log(log))
     for finding in findings:
-        typer.echo(one_line(str(finding)))
+        click.echo(one_line(str(finding)))
     if findings:
-        raise typer.Exit(FAILED)
-    typer.echo(f"{log}: nothing wrong")
+        raise Exit(FAILED)
+    click.echo(f"{log}: nothing wrong")
 
 
-@app.command(cls=Command, epilog="teamslam log cut runs/first --from 60 --to 120 -o minute.mcap")
+@app.declare("teamslam log cut runs/first --from 60 --to 120 -o minute.mcap")
 def cut(
     log: LogArgument,
     output: NewLog,
     from_s: Annotated[
-        float | None, typer.Option("--from", help="Seconds after the first measurement.")
+        float | None, option("Seconds after the first measurement.", "--from")
     ] = None,
     to_s: Annotated[
-        float | None, typer.Option("--to", help="Seconds after the first measurement, excluded.")
+        float | None, option("Seconds after the first measurement, excluded.", "--to")
     ] = None,
     channels: ChannelNames = None,
 ) -> None:
@@ -155,12 +152,12 @@ def cut(
     refuse_existing(output)
     opened = open_log(log)
     warn_of_holes(opened)
-    typer.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
+    click.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
 
 
-@app.command(cls=Command, epilog="teamslam log merge r1.mcap r2.mcap -o team.mcap")
+@app.declare("teamslam log merge r1.mcap r2.mcap -o team.mcap")
 def merge(
-    logs: Annotated[list[Path], typer.Argument(help="Logs of one team: of robots, or parts.")],
+    logs: Annotated[list[Path], argument("Logs of one team: of robots, or parts.")],
     output: NewLog,
 ) -> None:
     """Merge logs by team time; messages that several logs have are written once."""
@@ -169,20 +166,20 @@ def merge(
 
     refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
-    typer.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
+    click.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
     warn_of_holes(open_log(output))
 
 
-@app.command(cls=Command, epilog="teamslam log export runs/first -o paths --format tum")
+@app.declare("teamslam log export runs/first -o paths --format tum")
 def export(
     log: LogArgument,
     output: Annotated[Path, output_option("A new folder.")],
     form: Annotated[
         Format,
-        typer.Option(
-            "--format",
-            help="A table per channel (csv, parquet), the robots' paths (tum), a data set (utias), "
+        option(
+            "A table per channel (csv, parquet), the robots' paths (tum), a data set (utias), "
             "a ROS 2 bag of poses, paths and maps (rosbag2), a landmark graph (g2o, isam, pyfg).",
+            "--format",
         ),
     ] = Format.CSV,
     channels: ChannelNames = None,
@@ -206,14 +203,14 @@ def export(
             for path in (
                 export_tum(opened, output) if is_tum else export_graph(opened, output, form)
             ):
-                typer.echo(path)
+                click.echo(path)
             return
         if form is Format.ROSBAG2:
             for topic, count in sorted(export_rosbag2(opened, output).items()):
-                typer.echo(f"{output}: {topic}: {count_noun(count, 'message')}")
+                click.echo(f"{output}: {topic}: {count_noun(count, 'message')}")
             return
         for number, robot in enumerate(export_utias(opened, output), 1):
-            typer.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
+            click.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
         return
     from teamslam.team.recording.tables import CsvTable, ParquetTable, export_tables
 
@@ -222,9 +219,9 @@ def export(
     table = ParquetTable if form is Format.PARQUET else CsvTable
     exported = export_tables(opened, output, chosen, table)
     for path, rows in exported.rows.items():
-        typer.echo(f"{path}: {count_noun(rows, 'row')}")
+        click.echo(f"{path}: {count_noun(rows, 'row')}")
     if exported.unsound:
-        typer.echo(f"left out: {exported.unsound} unsound messages", err=True)
+        click.echo(f"left out: {exported.unsound} unsound messages", err=True)
 
 
 def _channels(names: str | None) -> "list[Channel] | None":

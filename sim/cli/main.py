@@ -1,77 +1,155 @@
-"""All commands of `teamslam`. Every command imports its modules when it runs."""
+"""All commands of `teamslam`, and its entry: errors become exit statuses without a traceback."""
 
+import os
+import sys
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 
-import typer
+# Before NumPy: one BLAS thread per process, for equal bits everywhere and no contention.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
 
-from teamslam.sim.cli.drivers import app as driver_commands
-from teamslam.sim.cli.help import WIDE, Group
-from teamslam.sim.cli.importing import app as import_commands
-from teamslam.sim.cli.launch import app as launch_commands
-from teamslam.sim.cli.localise import app as localise_commands
-from teamslam.sim.cli.log import app as log_tools
-from teamslam.sim.cli.maps import app as map_tools
-from teamslam.sim.cli.nodes import app as node_commands
-from teamslam.sim.cli.options import WRONG_USE, fail
-from teamslam.sim.cli.orders import app as order_commands
-from teamslam.sim.cli.recorded import app as recorded_commands
-from teamslam.sim.cli.rerun import app as rerun_commands
-from teamslam.sim.cli.scenarios import app as scenario_commands
-from teamslam.sim.cli.view import app as view_commands
+import click  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
+
+from teamslam.sim.cli.commands import Group  # noqa: E402
+from teamslam.sim.cli.options import FAILED, INTERRUPTED, WRONG_USE, fail, print_error  # noqa: E402
 
 STUDIES = "teamslam.sim.studies"
-COMMANDS = ("experiment", "batch-reference")
+SECTIONS: Mapping[str, Mapping[str, str]] = {
+    "Run a team": {
+        "launch": "launch",
+        "localise": "localise",
+        "scenarios": "scenarios",
+        "simulate": "scenarios",
+    },
+    "Look at a run": {
+        "view": "view",
+        "report": "recorded",
+        "compare": "recorded",
+        "rerun": "rerun",
+        "map": "maps",
+        "log": "log",
+        "verify-ledger": "rerun",
+        "repair": "recorded",
+    },
+    "Use your data": {
+        "import": "importing",
+        "calibrate": "importing",
+        "batch-reference": f"{STUDIES}.commands",
+        "experiment": f"{STUDIES}.experiment_command",
+    },
+    "Run one process": {
+        "router": "nodes",
+        "record": "nodes",
+        "central": "nodes",
+        "robot": "nodes",
+        "driver": "drivers",
+        "world": "nodes",
+        "viewer": "view",
+        "replay": "recorded",
+    },
+    "Operate a running team": dict.fromkeys(
+        ("status", "end", "withdraw", "verdict", "keys"), "orders"
+    ),
+}
+"""Commands by task, the most frequent first, and their modules."""
+MODULES = {name: module for names in SECTIONS.values() for name, module in names.items()}
 
 
-def add_studies(app: typer.Typer) -> None:
-    """Register the studies' commands; if missing, each reports it and exits with 2."""
+class _Team(Group):
+    """The program; a command is imported when it is used."""
+
+    @property
+    def by_section(self) -> Mapping[str, Iterable[str]]:
+        """Commands by task."""
+        return SECTIONS
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of all commands."""
+        return list(MODULES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command; all of them for an unknown name, so that the closest is found."""
+        for name in [cmd_name] if cmd_name in MODULES else MODULES:
+            if name not in self.commands:
+                self.add_command(_imported(name), name)
+        return self.commands.get(cmd_name)
+
+
+def _imported(name: str) -> click.Command:
+    module = MODULES[name]
+    is_study = module.startswith(STUDIES)
     try:
-        studies = import_module(f"{STUDIES}.commands")
+        group: Group = import_module(module if is_study else f"teamslam.sim.cli.{module}").app
     except ModuleNotFoundError as error:
-        if error.name not in (STUDIES, f"{STUDIES}.commands"):
+        if not is_study or error.name not in (STUDIES, module):
             raise
-        for name in COMMANDS:
-            _add_missing(app, name)
-    else:
-        studies.register(app)
+        return _missing(name)
+    return group if group.name == name else group.commands[name]
 
 
-def _add_missing(app: typer.Typer, name: str) -> None:
-    context = {"allow_extra_args": True, "ignore_unknown_options": True}
-
-    @app.command(name=name, hidden=True, context_settings=context, add_help_option=False)
-    def missing() -> None:
+def _missing(name: str) -> click.Command:
+    def refuse() -> None:
         fail(
             f"`teamslam {name}` is a study, and this installation is without the folder "
             "sim/studies: install teamslam with it",
             WRONG_USE,
         )
 
+    context = {"allow_extra_args": True, "ignore_unknown_options": True}
+    return click.Command(name, context, refuse, hidden=True, add_help_option=False)
 
-app = typer.Typer(
-    cls=Group,
+
+app = _Team(
+    "teamslam",
     help="Multi-robot SLAM as real processes over Zenoh.",
     epilog="teamslam launch waypoints --view\nteamslam COMMAND --help",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings=WIDE,
+    context_settings={"max_content_width": 100},
 )
-for _part in (
-    launch_commands, localise_commands, scenario_commands, node_commands, order_commands,
-    recorded_commands, rerun_commands, view_commands, import_commands, driver_commands,
-):  # fmt: skip
-    app.add_typer(_part)
-app.add_typer(log_tools)
-app.add_typer(map_tools)
-add_studies(app)
+click.version_option(
+    package_name="teamslam", message="teamslam %(version)s", help="Print the version."
+)(app)
 
 
-@app.callback(invoke_without_command=True)
-def _version(version: bool = typer.Option(False, "--version", help="Print the version.")) -> None:
-    if version:
-        from importlib.metadata import version as installed
+def load_all() -> Group:
+    """All commands, imported."""
+    app.get_command(click.Context(app), "")
+    return app
 
-        typer.echo(f"teamslam {installed('teamslam')}")
-        raise typer.Exit
+
+def main() -> None:
+    """Run a command; wrong use exits with 2, a failed run with 1, Ctrl-C with 130."""
+    try:
+        sys.exit(app.main(prog_name="teamslam", standalone_mode=False))
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.Abort:
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        advice = _advice(error)
+        if advice is None:
+            raise
+        status, text = advice
+        print_error(text)
+        sys.exit(status)
+
+
+def _advice(error: Exception) -> tuple[int, str] | None:
+    from teamslam.sim.datasets.tables import DatasetError
+    from teamslam.sim.scenarios.checks import ScenarioError
+    from teamslam.team.keys.roster import KeysError
+    from teamslam.team.recording.reader import LogError
+    from teamslam.team.recording.recorder import RecorderError
+    from teamslam.team.shell import FaultyRunError
+    from teamslam.team.wire.bus import BusError
+
+    if isinstance(error, ScenarioError | DatasetError | LogError | BusError | KeysError):
+        return WRONG_USE, str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError | IsADirectoryError):
+        return WRONG_USE, f"{error.filename}: {error.strerror}; give another path"
+    if isinstance(error, RecorderError | FaultyRunError):
+        return FAILED, str(error)
+    if isinstance(error, OSError):
+        return FAILED, f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    return None

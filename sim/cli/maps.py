@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import click
 import msgspec
-import typer
 
-from teamslam.sim.cli.help import Command, Group, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -26,36 +26,29 @@ from teamslam.team.wire.arrays import ids
 if TYPE_CHECKING:
     from teamslam.team.wire.messages import SavedMap
 
-app = typer.Typer(
-    name="map",
-    cls=Group,
+app = Group(
+    "map",
     help="Save the final map of a run, show a saved map, or request a peer's.",
     epilog="teamslam map save runs/first -o site.map\nteamslam launch waypoints --map site.map",
-    no_args_is_help=True,
 )
 
 
-@app.command(cls=Command, epilog="teamslam map save runs/first -o site.map")
+@app.declare("teamslam map save runs/first -o site.map")
 def save(
     log: Annotated[
-        Path | None,
-        typer.Argument(help="A log, or the folder of its run; without --team.", show_default=False),
+        Path | None, argument("A log, or the folder of its run; without --team.")
     ] = None,
     *,
-    output: Annotated[Path, output_option("The file to write.", metavar="FILE")],
+    output: Annotated[Path, output_option("The file to write.", "FILE")],
     name: Annotated[
-        str | None,
-        typer.Option(help="Name of the map, as site; default: that of the file.", metavar="NAME"),
+        str | None, option("Name of the map, as site; default: that of the file.", "NAME")
     ] = None,
     team: Annotated[
-        str | None,
-        typer.Option(help="A running team, whose centre is asked for its map.", metavar="NAME"),
+        str | None, option("A running team, whose centre is asked for its map.", "NAME")
     ] = None,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the running centre.", min=0.1)
-    ] = 60.0,
+    patience: Annotated[float, option("Seconds to wait for the running centre.", least=0.1)] = 60.0,
 ) -> None:
     """Save the final map of a run as one Gaussian, for the teams of later days.
 
@@ -74,7 +67,7 @@ def save(
         write_map(output, saved)
     count, days = len(ids(saved.ids, "ids")), len(saved.sets)
     size = output.stat().st_size / 1e3
-    typer.echo(
+    click.echo(
         f"wrote {output}: the map {saved.name} of {count} landmarks, {days} set"
         f"{'' if days == 1 else 's'}, {size:,.0f} kB"
     )
@@ -103,10 +96,8 @@ def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: fl
     return decoded(replies[-1], SavedMap)
 
 
-@app.command(cls=Command, epilog="teamslam map show site.map")
-def show(
-    file: Annotated[Path, typer.Argument(help="A saved map.")], json_file: JsonFile = None
-) -> None:
+@app.declare("teamslam map show site.map")
+def show(file: Annotated[Path, argument("A saved map.")], json_file: JsonFile = None) -> None:
     """Show a saved map: where it comes from, and its landmarks as CSV."""
     from teamslam.team.saved_map import map_figures
 
@@ -117,29 +108,27 @@ def show(
     for key, value in figures.items():
         if value or not isinstance(value, list | tuple):
             is_list = isinstance(value, list | tuple)
-            typer.echo(f"# {key}: {', '.join(map(str, value)) if is_list else value}")
+            click.echo(f"# {key}: {', '.join(map(str, value)) if is_list else value}")
     for each in own:
         value, sigma = (f"{each[key]:.4g}" for key in ("value", "sigma"))
-        typer.echo(f"# {each['bias']} of {each['robot']}: {value} ± {sigma}")
+        click.echo(f"# {each['bias']} of {each['robot']}: {value} ± {sigma}")
     placed = "latitude_deg" in landmarks[0]
-    typer.echo("landmark,x,y,sigma_x,sigma_y,submaps" + ",latitude,longitude" * placed)
+    click.echo("landmark,x,y,sigma_x,sigma_y,submaps" + ",latitude,longitude" * placed)
     for each in landmarks:
         place = f",{each['latitude_deg']:.9f},{each['longitude_deg']:.9f}" if placed else ""
-        typer.echo(
+        click.echo(
             f"{each['landmark']},{each['x_m']:.4f},{each['y_m']:.4f},"
             f"{each['sigma_x_m']:.4f},{each['sigma_y_m']:.4f},{each['submaps']}{place}"
         )
 
 
-@app.command(cls=Command, epilog="teamslam map peer r3 --team waypoints")
+@app.declare("teamslam map peer r3 --team waypoints")
 def peer(
-    robot: Annotated[str, typer.Argument(help="The peer that is to fold, as r3.")],
+    robot: Annotated[str, argument("The peer that is to fold, as r3.")],
     team: TeamOption,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the answer.", min=0.1)
-    ] = 60.0,
+    patience: Annotated[float, option("Seconds to wait for the answer.", least=0.1)] = 60.0,
 ) -> None:
     """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
     from teamslam.team.wire.arrays import floats
@@ -153,7 +142,7 @@ def peer(
     if not replies:
         fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
     fused = decoded(replies[-1], FusedMap)
-    typer.echo("landmark,x,y")
+    click.echo("landmark,x,y")
     means = floats(fused.means, "means").reshape(-1, 2)
     for landmark, (x, y) in zip(ids(fused.ids, "ids").tolist(), means, strict=True):
-        typer.echo(f"{landmark},{x:.4f},{y:.4f}")
+        click.echo(f"{landmark},{x:.4f},{y:.4f}")

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command, output_option, rare
+from teamslam.sim.cli.commands import Group, argument, option, output_option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -55,24 +55,19 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("teamslam")
 
-app = typer.Typer()
+app = Group()
 
 
 def _connected(scenario: Scenario, connect: str) -> None:
     _LOG.info("connected to team %s at %s", scenario.team, connect)
 
 
-@app.command(cls=Command, epilog="teamslam router --listen tcp/192.168.1.5:7447 --keys keys")
+@app.declare("teamslam router --listen tcp/192.168.1.5:7447 --keys keys")
 def router(
-    listen: Annotated[
-        str, typer.Option(help="Where to listen; port 0: any free one.", metavar="ENDPOINT")
-    ] = LOOPBACK,
+    listen: Annotated[str, option("Where to listen; port 0: any free one.", "ENDPOINT")] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool,
-        typer.Option(
-            help="Without keys, admit every process that reaches it, also from other machines."
-        ),
+        bool, option("Without keys, admit every process that reaches it, also from other machines.")
     ] = False,
 ) -> None:
     """Run the team's Zenoh router, of which every other process is a client, until it is
@@ -91,7 +86,7 @@ def router(
     with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
         if own is not None and own[1].revoked:
             _LOG.info("revoked and refused: %s", ", ".join(sorted(own[1].revoked)))
-        typer.echo(f"listening at {endpoint}")
+        click.echo(f"listening at {endpoint}")
         while not stop.wait(1.0):
             if own is not None and time.time() > own[0].ends.timestamp():
                 fail(
@@ -102,22 +97,16 @@ def router(
                 )
 
 
-@app.command(cls=Command, epilog="teamslam world waypoints --speed max")
+@app.declare("teamslam world waypoints --speed max")
 def world(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     speed: SpeedText = "1",
-    recorder: Annotated[
-        bool, rare(help="Wait for a recorder before the first measurement.")
-    ] = True,
+    recorder: Annotated[bool, rare("Wait for a recorder before the first measurement.")] = True,
     cache: Annotated[
         int | None,
-        rare(
-            help="Measurements per robot that can be asked for again; default: all.",
-            min=0,
-            metavar="N",
-        ),
+        rare("Measurements per robot that can be asked for again; default: all.", "N", least=0),
     ] = None,
     robots: Robots = None,
     seed: Seed = None,
@@ -138,10 +127,10 @@ def world(
         run_world(bus, resolved, streams, stop, speed=pace, recorder=recorder, cache=cache)
 
 
-@app.command(cls=Command, epilog="teamslam robot waypoints r1 --connect tcp/192.168.1.5:7447")
+@app.declare("teamslam robot waypoints r1 --connect tcp/192.168.1.5:7447")
 def robot(
     scenario: ScenarioArgument,
-    name: Annotated[str, typer.Argument(help="The robot's name in the scenario, as r1.")],
+    name: Annotated[str, argument("The robot's name in the scenario, as r1.")],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     robots: Robots = None,
@@ -150,26 +139,23 @@ def robot(
     fusion: FusionOption = None,
     log: Annotated[
         Path | None,
-        typer.Option(
-            help="Its own log: what it sends and receives; `teamslam log merge` joins such logs.",
-            metavar="FILE",
+        option(
+            "Its own log: what it sends and receives; `teamslam log merge` joins such logs.", "FILE"
         ),
     ] = None,
     peers: Peers = False,
     store: Annotated[
         Path | None,
         rare(
-            "--set",
-            help="With --peers: the file that stores the team's set, of one run only.",
-            metavar="FILE",
+            "With --peers: the file that stores the team's set, of one run only.", "--set", "FILE"
         ),
     ] = None,
     fold: Annotated[
         str,
         rare(
-            help="With --peers: fold the set always, on request (`teamslam map peer`) and at the "
+            "With --peers: fold the set always, on request (`teamslam map peer`) and at the "
             "end, or at the end only.",
-            metavar="always|request|end",
+            "always|request|end",
         ),
     ] = "always",
     map_: MapFiles = None,
@@ -254,18 +240,18 @@ def _peer_shell(
         )
 
 
-@app.command(cls=Command, epilog="teamslam central waypoints")
+@app.declare("teamslam central waypoints")
 def central(
     scenario: ScenarioArgument,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     patience: Annotated[
         float | None,
-        typer.Option(
-            help="Give up a robot that has been lost for this many seconds; default: wait for "
+        option(
+            "Give up a robot that has been lost for this many seconds; default: wait for "
             "it. A final map without it is provisional.",
-            min=0.0,
-            metavar="S",
+            "S",
+            least=0.0,
         ),
     ] = None,
     robots: Robots = None,
@@ -275,11 +261,11 @@ def central(
     peers: Peers = False,
     store: Annotated[
         Path | None,
-        typer.Option(
-            "--set",
-            help="The file that stores the team's set, of one run only; a centre that is started "
+        option(
+            "The file that stores the team's set, of one run only; a centre that is started "
             "again continues from it.",
-            metavar="FILE",
+            "--set",
+            "FILE",
         ),
     ] = None,
     map_: MapFiles = None,
@@ -338,22 +324,22 @@ def _central_shell(
     return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer, maps=maps)
 
 
-@app.command(cls=Command, epilog="teamslam record waypoints -o team.mcap")
+@app.declare("teamslam record waypoints -o team.mcap")
 def record(
     scenario: ScenarioArgument,
-    output: Annotated[Path, output_option("The MCAP file to write.", metavar="FILE")],
+    output: Annotated[Path, output_option("The MCAP file to write.", "FILE")],
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume",
-            help="An existing log is of this run, however old: continue it; if it is finished, end "
+        option(
+            "An existing log is of this run, however old: continue it; if it is finished, end "
             "with 0.",
+            "--resume",
         ),
     ] = False,
     join_parts: Annotated[
-        bool, rare("--join/--no-join", help="Join the parts of the log at the end.")
+        bool, rare("Join the parts of the log at the end.", "--join/--no-join")
     ] = True,
 ) -> None:
     """Record every message of the team to one MCAP file, until the team has left.
@@ -388,7 +374,7 @@ def record(
             output, resolved.team, metadata, same_run=resume, ends=ends
         )
     if is_over:
-        typer.echo(f"{output} was finished by an earlier recorder", err=True)
+        click.echo(f"{output} was finished by an earlier recorder", err=True)
         _fail_if_provisional(_join_parts(output) if join_parts else parts_of(output), ends)
         return
     expected = [robot_node(r.id) for r in resolved.robots]

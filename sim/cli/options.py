@@ -14,9 +14,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
 
-import typer
+import click
+from click.exceptions import Exit
 
-from teamslam.sim.cli.help import network, rare
+from teamslam.sim.cli.commands import argument, network, option, rare
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
@@ -35,6 +36,8 @@ MOST_HOLES = 5
 """Most log gaps that a command prints; `teamslam log check` prints all."""
 WRONG_USE = 2
 FAILED = 1
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, by the shell's convention."""
 
 
 def check_folder(path: Path) -> None:
@@ -53,34 +56,23 @@ def _either(names: object) -> str:
 
 
 ScenarioArgument = Annotated[
-    str, typer.Argument(help="A built-in scenario, a .toml file, or a resolved .json.")
+    str, argument("A built-in scenario, a .toml file, or a resolved .json.")
 ]
-LogArgument = Annotated[
-    Path, typer.Argument(help="An MCAP log of a team, or the folder of its run.")
-]
+LogArgument = Annotated[Path, argument("An MCAP log of a team, or the folder of its run.")]
 MapFiles = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--map",
-        help="A saved map of an earlier day, which the team's map joins; repeatable.",
-        metavar="FILE",
+    option(
+        "A saved map of an earlier day, which the team's map joins; repeatable.", "--map", "FILE"
     ),
 ]
 Localise = Annotated[
-    bool, rare("--localise", help="Localise robots in the map of --map, which stays as it is.")
+    bool, rare("Localise robots in the map of --map, which stays as it is.", "--localise")
 ]
-JsonFile = Annotated[
-    Path | None, rare("--json", help="Write the figures as JSON, too.", metavar="FILE")
-]
-Connect = Annotated[
-    str, network(help="The router's endpoint, as tcp/HOST:PORT.", metavar="ENDPOINT")
-]
+JsonFile = Annotated[Path | None, rare("Write the figures as JSON, too.", "--json", "FILE")]
+Connect = Annotated[str, network("The router's endpoint, as tcp/HOST:PORT.", "ENDPOINT")]
 Keys = Annotated[
     Path | None,
-    network(
-        help="Folder with the certificate of this process, as `teamslam keys` makes them.",
-        metavar="DIR",
-    ),
+    network("Folder with the certificate of this process, as `teamslam keys` makes them.", "DIR"),
 ]
 ASSUMED = (
     "the built-in one `recorded` is taken. It assumes odometry that is off by 5 cm and 2° after a "
@@ -88,48 +80,37 @@ ASSUMED = (
 )
 LOOPBACK = "tcp/127.0.0.1:7447"
 ANY_PORT = "tcp/127.0.0.1:0"
-TeamOption = Annotated[
-    str, typer.Option(help="The team's name; a scenario's own if not set there.", metavar="NAME")
-]
-Seed = Annotated[
-    int | None, typer.Option(help="Seed of the world and of every estimator.", min=0, metavar="N")
-]
-Robots = Annotated[int | None, typer.Option(help="How many robots, 1 to 1000.", metavar="N")]
-Peers = Annotated[
-    bool, rare("--peers", help="Each robot keeps the team's set and folds it by itself.")
-]
+TeamOption = Annotated[str, option("The team's name; a scenario's own if not set there.", "NAME")]
+Seed = Annotated[int | None, option("Seed of the world and of every estimator.", "N", least=0)]
+Robots = Annotated[int | None, option("How many robots, 1 to 1000.", "N")]
+Peers = Annotated[bool, rare("Each robot keeps the team's set and folds it by itself.", "--peers")]
 Pieces = Annotated[
     int | None,
     rare(
-        help="Cut the log of a data set of one robot into this many robots with unknown "
-        "initial poses.",
-        min=1,
-        max=100,
-        metavar="N",
+        "Cut the log of a data set of one robot into this many robots with unknown initial poses.",
+        "N",
+        least=1,
+        most=100,
     ),
 ]
 IdentitiesOption = Annotated[
     str | None,
-    typer.Option(
-        help="hidden: run any world or data set as if its landmarks had no names; or known.",
-        metavar="WHICH",
+    option(
+        "hidden: run any world or data set as if its landmarks had no names; or known.", "WHICH"
     ),
 ]
-EstimatorOption = Annotated[str | None, rare(help=_either(Estimator), metavar="NAME")]
-FusionOption = Annotated[str | None, rare(help=_either(FusionRule), metavar="RULE")]
+EstimatorOption = Annotated[str | None, rare(_either(Estimator), "NAME")]
+FusionOption = Annotated[str | None, rare(_either(FusionRule), "RULE")]
 Dataset = Annotated[
     Path | None,
-    typer.Option(
-        help="A data set: a folder of CSV tables, a ROS 2 bag, a UTIAS set, or a graph (isam, "
+    option(
+        "A data set: a folder of CSV tables, a ROS 2 bag, a UTIAS set, or a graph (isam, "
         "g2o, pyfg).",
-        metavar="SET",
+        "SET",
     ),
 ]
 SpeedText = Annotated[
-    str,
-    typer.Option(
-        help="Multiple of real time, or max: as fast as the measurements are taken.", metavar="X"
-    ),
+    str, option("Multiple of real time, or max: as fast as the measurements are taken.", "X")
 ]
 
 
@@ -201,8 +182,13 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
 
 def fail(message: str, status: int) -> NoReturn:
     """Print an error and exit with this status."""
-    typer.secho(f"error: {printable_lines(message)}", fg="red", err=True)
-    raise typer.Exit(status)
+    print_error(message)
+    raise Exit(status)
+
+
+def print_error(message: str) -> None:
+    """Print an error on stderr."""
+    click.secho(f"error: {printable_lines(message)}", fg="red", err=True)
 
 
 @contextmanager
@@ -241,10 +227,10 @@ def warn_of_holes(log: "Log") -> None:
 def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
     """Warn on stderr of these findings in a log."""
     for finding in found[:MOST_HOLES]:
-        typer.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
+        click.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
         more = count_noun(len(found) - MOST_HOLES, "more finding")
-        typer.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
+        click.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
 
 
 def set_aside(file: Path) -> Path:
@@ -253,7 +239,7 @@ def set_aside(file: Path) -> Path:
     while (aside := file.with_name(f"{file.name}.{number}")).exists():
         number += 1
     file.rename(aside)
-    typer.echo(f"{file} was there already: it is now {aside}", err=True)
+    click.echo(f"{file} was there already: it is now {aside}", err=True)
     return aside
 
 
@@ -295,9 +281,9 @@ def scenario_for(dataset: Path) -> str:
 
     name = scenario_beside(dataset)
     if name == ASSUMED_NAME:
-        typer.echo(f"no scenario given, and no scenario.toml in {dataset}: {ASSUMED}", err=True)
+        click.echo(f"no scenario given, and no scenario.toml in {dataset}: {ASSUMED}", err=True)
     elif name != "utias":
-        typer.echo(f"scenario: {name}", err=True)
+        click.echo(f"scenario: {name}", err=True)
     return name
 
 

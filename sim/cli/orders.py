@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+import click
 
 from teamslam.central.desk.names import in_order
-from teamslam.sim.cli.help import Command, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -27,21 +27,19 @@ from teamslam.sim.cli.options import (
 from teamslam.sim.scenarios.scenario import with_options
 from teamslam.team.wire.arrays import ids
 
-Reason = Annotated[str, typer.Option(help="Why, for the log.")]
+Reason = Annotated[str, option("Why, for the log.")]
 
-app = typer.Typer()
+app = Group()
 
 
-@app.command(cls=Command, epilog="teamslam withdraw r3 --team waypoints --reason 'wheel is loose'")
+@app.declare("teamslam withdraw r3 --team waypoints --reason 'wheel is loose'")
 def withdraw(
-    robot: Annotated[str, typer.Argument(help="The robot's name, as r3.")],
+    robot: Annotated[str, argument("The robot's name, as r3.")],
     team: TeamOption,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     reason: Reason = "ordered",
-    patience: Annotated[
-        float, typer.Option(help="Seconds to wait for a map without it.", min=0.0)
-    ] = 60.0,
+    patience: Annotated[float, option("Seconds to wait for a map without it.", least=0.0)] = 60.0,
 ) -> None:
     """Withdraw a robot from a running team: the map becomes that of a team without it.
 
@@ -54,23 +52,21 @@ def withdraw(
     with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, WithdrawError):
         fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
     landmarks = len(ids(fused.ids, "ids"))
-    typer.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
+    click.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
 
 
-@app.command(cls=Command, epilog="teamslam verdict same r1/1/12/7 r2/1/4/3 --team waypoints")
+@app.declare("teamslam verdict same r1/1/12/7 r2/1/4/3 --team waypoints")
 def verdict(
-    word: Annotated[str, typer.Argument(help="same: they are one landmark; different: two.")],
-    first: Annotated[str, typer.Argument(help="robot/incarnation/submap/landmark, as r1/1/12/7.")],
-    second: Annotated[str, typer.Argument(help="The other one, likewise.")],
+    word: Annotated[str, argument("same: they are one landmark; different: two.")],
+    first: Annotated[str, argument("robot/incarnation/submap/landmark, as r1/1/12/7.")],
+    second: Annotated[str, argument("The other one, likewise.")],
     team: TeamOption,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     reason: Reason = "seen by an operator",
-    withdraw: Annotated[
-        bool, typer.Option("--withdraw", help="Withdraw this verdict, for good.")
-    ] = False,
+    withdraw: Annotated[bool, option("Withdraw this verdict, for good.", "--withdraw")] = False,
     patience: Annotated[
-        float, typer.Option(help="Seconds to wait for a map that takes it into account.", min=0.0)
+        float, option("Seconds to wait for a map that takes it into account.", least=0.0)
     ] = 60.0,
 ) -> None:
     """Give a running team the verdict that two unnamed landmarks are one, or two.
@@ -114,26 +110,23 @@ def verdict(
         contradiction = f"{first} and {second} have an earlier verdict, {opposite}"
         if word == "same":
             fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
-        typer.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
+        click.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
     are = "no longer have the verdict that they are" if withdraw else "are"
-    typer.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
+    click.echo(f"{first} and {second} {are} {word}; the map of {landmarks} landmarks rests on it")
 
 
-@app.command(
-    cls=Command,
-    epilog=("teamslam end --team waypoints\nteamslam end --team waypoints --without r3"),
-)
+@app.declare("teamslam end --team waypoints\nteamslam end --team waypoints --without r3")
 def end(
     team: TeamOption,
     without: Annotated[
-        str | None, typer.Option(help="A lost robot, for which the team no longer waits.")
+        str | None, option("A lost robot, for which the team no longer waits.")
     ] = None,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
     reason: Reason = "ordered",
     patience: Annotated[
-        float, typer.Option(help="Seconds to wait for the centre to follow.", min=0.0)
+        float, option("Seconds to wait for the centre to follow.", least=0.0)
     ] = 60.0,
 ) -> None:
     """End a live team: every driver ends its stream, and the centre publishes the final map.
@@ -151,17 +144,15 @@ def end(
             end_team(bus, reason, patience)
         else:
             give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
-    typer.echo(f"the team no longer waits for {without}" if without else "the team ends")
+    click.echo(f"the team no longer waits for {without}" if without else "the team ends")
 
 
-@app.command(cls=Command, epilog="teamslam status --team waypoints")
+@app.declare("teamslam status --team waypoints")
 def status(
     team: TeamOption,
     connect: Connect = LOOPBACK,
     keys: Keys = None,
-    seconds: Annotated[
-        float, typer.Option(help="Seconds for which the team is observed.", min=0.5)
-    ] = 3.0,
+    seconds: Annotated[float, option("Seconds for which the team is observed.", least=0.5)] = 3.0,
     json_file: JsonFile = None,
 ) -> None:
     """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
@@ -219,35 +210,25 @@ def _cell(value: object) -> str:
     return f"{value:,.1f}".removesuffix(".0") if isinstance(value, float) else str(value)
 
 
-@app.command(
-    cls=Command,
-    epilog="teamslam keys waypoints -o keys --scenario waypoints --router 192.168.1.5",
-)
+@app.declare("teamslam keys waypoints -o keys --scenario waypoints --router 192.168.1.5")
 def keys(
-    team: Annotated[str, typer.Argument(help="The team's name, as its scenario has it.")],
+    team: Annotated[str, argument("The team's name, as its scenario has it.")],
     output: Annotated[Path, output_option("The folder; it holds the authority, too.")],
-    scenario: Annotated[
-        str | None, typer.Option(help="For every robot of a scenario.", metavar="SCENARIO")
-    ] = None,
+    scenario: Annotated[str | None, option("For every robot of a scenario.", "SCENARIO")] = None,
     robots: Robots = None,
     robot: Annotated[
-        list[str] | None, typer.Option(help="For a robot by name, too; again and again.")
+        list[str] | None, option("For a robot by name, too; again and again.", "NAME")
     ] = None,
     router: Annotated[
-        list[str] | None,
-        typer.Option(help="Name or address by which robots reach the router.", metavar="HOST"),
+        list[str] | None, option("Name or address by which robots reach the router.", "HOST")
     ] = None,
-    days: Annotated[float, typer.Option(help="How long new certificates are good.")] = 90.0,
+    days: Annotated[float, option("How long new certificates are good.")] = 90.0,
     renew: Annotated[
-        list[str] | None,
-        typer.Option(help="A new certificate for a node, as robot-r1, or all.", metavar="NODE"),
+        list[str] | None, option("A new certificate for a node, as robot-r1, or all.", "NODE")
     ] = None,
-    revoke: Annotated[
-        list[str] | None, typer.Option(help="Revoke this node's certificate.", metavar="NODE")
-    ] = None,
+    revoke: Annotated[list[str] | None, option("Revoke this node's certificate.", "NODE")] = None,
     replay: Annotated[
-        bool,
-        typer.Option("--replay", help="One for `teamslam replay`, which may publish on all keys."),
+        bool, option("One for `teamslam replay`, which may publish on all keys.", "--replay")
     ] = False,
 ) -> None:
     """Make a team's certificates: an authority, and one for each process and robot.
@@ -267,7 +248,7 @@ def keys(
         resolved = with_options(scenario_of(scenario), robots=robots)
         names += [each.id for each in resolved.robots]
         if resolved.team != team:
-            typer.echo(
+            click.echo(
                 f"warning: {scenario} is of the team {resolved.team!r}, these keys of {team!r}",
                 err=True,
             )
@@ -285,10 +266,10 @@ def keys(
     )
     for what, nodes in (("made", made.made), ("kept", made.unchanged), ("revoked", made.revoked)):
         if nodes:
-            typer.echo(f"{what:8} {', '.join(nodes)}")
+            click.echo(f"{what:8} {', '.join(nodes)}")
     if made.made:
-        typer.echo(f"good until {made.ends:%Y-%m-%d %H:%M} UTC")
-        typer.echo("copy to each computer ca.pem and NODE.pem, NODE.key of its processes;")
-        typer.echo("to the router's, roster.json too; ca.key stays here")
+        click.echo(f"good until {made.ends:%Y-%m-%d %H:%M} UTC")
+        click.echo("copy to each computer ca.pem and NODE.pem, NODE.key of its processes;")
+        click.echo("to the router's, roster.json too; ca.key stays here")
     if made.revoked or made.made:
-        typer.echo("a router that runs takes the roster when it is started again")
+        click.echo("a router that runs takes the roster when it is started again")

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
 from teamslam.central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
-from teamslam.sim.cli.help import Command, network, output_option, rare
+from teamslam.sim.cli.commands import Group, argument, network, option, output_option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -32,26 +32,25 @@ if TYPE_CHECKING:
     from teamslam.team.recording.reader import Log
 
 PICTURES = "Pictures for a paper or a talk"
-app = typer.Typer()
+app = Group()
 
 
-@app.command(cls=Command, epilog="teamslam replay runs/first --speed 20")
+@app.declare("teamslam replay runs/first --speed 20")
 def replay(
     log: LogArgument,
     speed: SpeedText = "1",
     connect: Annotated[
-        str | None,
-        network(help="The router to publish at; default: one of our own.", metavar="ENDPOINT"),
+        str | None, network("The router to publish at; default: one of our own.", "ENDPOINT")
     ] = None,
     listen: Annotated[
-        str, network(help="Where our own router listens; port 0: any free one.", metavar="ENDPOINT")
+        str, network("Where our own router listens; port 0: any free one.", "ENDPOINT")
     ] = LOOPBACK,
     keys: Keys = None,
     insecure: Annotated[
-        bool, network(help="Without keys, admit every process that reaches our own router.")
+        bool, network("Without keys, admit every process that reaches our own router.")
     ] = False,
     wait: Annotated[
-        float, rare(help="Seconds between the router's start and the first message.", metavar="S")
+        float, rare("Seconds between the router's start and the first message.", "S")
     ] = 1.0,
 ) -> None:
     """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
@@ -76,55 +75,45 @@ def replay(
         connect_bus(opened.team, endpoint, keys, "replay", stop) as bus,
     ):
         if connect is None:
-            typer.echo(f"listening at {endpoint}", err=True)
+            click.echo(f"listening at {endpoint}", err=True)
             stop.wait(wait)
         count = replay_samples(bus, opened.samples(), pace, stop)
-    typer.echo(f"replayed {count} messages of {log}")
+    click.echo(f"replayed {count} messages of {log}")
     _hint_if_cut(opened)
 
 
-@app.command(
-    cls=Command,
-    epilog=(
-        "teamslam report runs/first\n"
-        "teamslam report runs/first --picture map --style paper --format pdf"
-    ),
+@app.declare(
+    "teamslam report runs/first\n"
+    "teamslam report runs/first --picture map --style paper --format pdf"
 )
 def report(
     log: LogArgument,
     output: Annotated[
         Path | None,
         output_option(
-            "Folder for the report; default: the run's, or one named like the log beside it.",
-            metavar="DIR",
+            "Folder for the report; default: the run's, or one named like the log beside it.", "DIR"
         ),
     ] = None,
     ledger: Annotated[
-        bool,
-        typer.Option(help="Prove the ledger: the robots consume the recorded measurements again."),
+        bool, option("Prove the ledger: the robots consume the recorded measurements again.")
     ] = True,
     picture: Annotated[
-        Picture | None,
-        typer.Option(help="This picture alone, and no page.", rich_help_panel=PICTURES),
+        Picture | None, option("This picture alone, and no page.", section=PICTURES)
     ] = None,
     look: Annotated[
         Look | None,
-        typer.Option(
-            "--style", help="Pictures in this style, beside the page's.", rich_help_panel=PICTURES
-        ),
+        option("Pictures in this style, beside the page's.", "--style", section=PICTURES),
     ] = None,
     form: Annotated[
         Form | None,
-        typer.Option(
-            "--format", help="Pictures in this format, beside the page's.", rich_help_panel=PICTURES
-        ),
+        option("Pictures in this format, beside the page's.", "--format", section=PICTURES),
     ] = None,
     width: Annotated[
         str | None,
-        typer.Option(
-            help="Width of pictures for a paper, as 89mm; default: 3.5in, of panels 7.16in.",
-            metavar="WIDTH",
-            rich_help_panel=PICTURES,
+        option(
+            "Width of pictures for a paper, as 89mm; default: 3.5in, of panels 7.16in.",
+            "WIDTH",
+            section=PICTURES,
         ),
     ] = None,
     json_file: JsonFile = None,
@@ -202,10 +191,10 @@ def _width(text: str | None, look: Look | None) -> float | None:
         fail(f"--width {error}", WRONG_USE)
 
 
-@app.command(cls=Command, epilog="teamslam repair team.mcap -o whole.mcap")
+@app.declare("teamslam repair team.mcap -o whole.mcap")
 def repair(
     log: LogArgument,
-    output: Annotated[Path, output_option("The new, complete log.", metavar="FILE")],
+    output: Annotated[Path, output_option("The new, complete log.", "FILE")],
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from teamslam.sim.importing.source import is_own_log
@@ -216,29 +205,29 @@ def repair(
     log = log_file(log)
     if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
         bag = repair_bag(log, output)
-        typer.echo(f"{output}: {count_noun(bag.messages, 'message')}")
+        click.echo(f"{output}: {count_noun(bag.messages, 'message')}")
         for damage in bag.damaged:
-            typer.echo(f"lost: {damage}", err=True)
+            click.echo(f"lost: {damage}", err=True)
         return
     result = repair_log(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
-    typer.echo(f"{output}: {result.messages} messages{until}")
+    click.echo(f"{output}: {result.messages} messages{until}")
     for damage in result.damaged:
-        typer.echo(f"lost: {damage}", err=True)
+        click.echo(f"lost: {damage}", err=True)
 
 
 def _hint_if_cut(log: "Log") -> None:
     if not log.complete:
         remedy = f"`teamslam repair {log.path} -o FIXED.mcap` completes it"
-        typer.echo(f"{log.path} is cut: {remedy}", err=True)
+        click.echo(f"{log.path} is cut: {remedy}", err=True)
 
 
 FEWEST = 2
 
 
-@app.command(cls=Command, epilog="teamslam compare runs/first runs/second -o both.png")
+@app.declare("teamslam compare runs/first runs/second -o both.png")
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Runs' folders, or their logs; two or more.")],
+    runs: Annotated[list[Path], argument("Runs' folders, or their logs; two or more.")],
     output: Annotated[Path | None, output_option("Write the picture here (png, svg, pdf).")] = None,
     json_file: JsonFile = None,
 ) -> None:
@@ -272,7 +261,7 @@ def compare(
         table.add_row(Text(figure), *(Text(cell) for cell in cells))
     Console().print(table)
     if output is not None and compare_picture(evaluated, output):
-        typer.echo(f"wrote {output}")
+        click.echo(f"wrote {output}")
     write_json(json_file, compare_figures(evaluated))
 
 

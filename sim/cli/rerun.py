@@ -8,9 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command, output_option
+from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.options import (
     FAILED,
     WRONG_USE,
@@ -40,79 +40,60 @@ if TYPE_CHECKING:
     from teamslam.sim.recorded.changed_run import Changes
     from teamslam.team.wire.bus import Sample
 
-app = typer.Typer()
+app = Group()
 
 NETWORK_CHANGES = "Another network"
 OFFENDERS = 20
 """Most printed violations; the JSON file has all."""
 
 
-@app.command(
-    cls=Command,
-    epilog=("teamslam rerun runs/first --verify\nteamslam rerun runs/first --without r3"),
-)
+@app.declare("teamslam rerun runs/first --verify\nteamslam rerun runs/first --without r3")
 def rerun(
-    log: Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")],
+    log: Annotated[Path, argument("An MCAP log of a team, a data set or a ROS 2 bag.")],
     verify: Annotated[
-        bool, typer.Option("--verify", help="Compute every recomputable message again; compare.")
+        bool, option("Compute every recomputable message again; compare.", "--verify")
     ] = False,
     without: Annotated[
-        list[str] | None, typer.Option(help="A robot to leave out; repeatable.", metavar="ROBOT")
+        list[str] | None, option("A robot to leave out; repeatable.", "ROBOT")
     ] = None,
     output: Annotated[
-        Path | None,
-        output_option("Folder for log and report of the computed run.", metavar="DIR"),
+        Path | None, output_option("Folder for log and report of the computed run.", "DIR")
     ] = None,
-    particles: Annotated[
-        int | None, typer.Option(help="Particles of each robot.", min=4, metavar="N")
-    ] = None,
-    window: Annotated[
-        float | None, typer.Option(help="Seconds of a submap's window.", metavar="S")
-    ] = None,
+    particles: Annotated[int | None, option("Particles of each robot.", "N", least=4)] = None,
+    window: Annotated[float | None, option("Seconds of a submap's window.", "S")] = None,
     seed: Annotated[
-        int | None,
-        typer.Option(help="Seed of the estimators and of the losses.", min=0, metavar="N"),
+        int | None, option("Seed of the estimators and of the losses.", "N", least=0)
     ] = None,
     map_: MapFiles = None,
     localise: Localise = False,
     noise: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Robots assume another noise: odometry=2, range=0.5, bearing=3; repeatable.",
-            metavar="KIND=FACTOR",
+        option(
+            "Robots assume another noise: odometry=2, range=0.5, bearing=3; repeatable.",
+            "KIND=FACTOR",
         ),
     ] = None,
     loss: Annotated[
         float,
-        typer.Option(
-            help="Probability that a submap is lost on its way; it is sent again.",
-            metavar="P",
-            rich_help_panel=NETWORK_CHANGES,
+        option(
+            "Probability that a submap is lost on its way; it is sent again.",
+            "P",
+            section=NETWORK_CHANGES,
         ),
     ] = 0.0,
     delay: Annotated[
         float,
-        typer.Option(
-            help="Seconds that submaps need to the centre.",
-            min=0.0,
-            metavar="S",
-            rich_help_panel=NETWORK_CHANGES,
-        ),
+        option("Seconds that submaps need to the centre.", "S", least=0.0, section=NETWORK_CHANGES),
     ] = 0.0,
     no_centre: Annotated[
-        str | None,
-        typer.Option(
-            help="Seconds without a centre, as 60-120.",
-            metavar="SPAN",
-            rich_help_panel=NETWORK_CHANGES,
-        ),
+        str | None, option("Seconds without a centre, as 60-120.", "SPAN", section=NETWORK_CHANGES)
     ] = None,
     partition: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Robots cut off from the centre, and when, as r1,r2:100-200.",
-            metavar="ROBOTS:SPAN",
-            rich_help_panel=NETWORK_CHANGES,
+        option(
+            "Robots cut off from the centre, and when, as r1,r2:100-200.",
+            "ROBOTS:SPAN",
+            section=NETWORK_CHANGES,
         ),
     ] = None,
     fusion: FusionOption = None,
@@ -326,7 +307,7 @@ def _verify(path: Path, json_file: Path | None) -> None:
     figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
     write_json(json_file, figures)
     if not log.complete:
-        typer.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
+        click.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
     if not result.messages:
         fail(f"{path} has no message that can be computed again: nothing is verified", FAILED)
     if result.first is not None:
@@ -379,12 +360,11 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     )
 
 
-@app.command(name="verify-ledger", cls=Command, epilog="teamslam verify-ledger runs/first --list")
+@app.declare("teamslam verify-ledger runs/first --list", name="verify-ledger")
 def verify_ledger(
     log: LogArgument,
     lists: Annotated[
-        bool,
-        typer.Option("--list", help="List each rejected measurement with its reason."),
+        bool, option("List each rejected measurement with its reason.", "--list")
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
@@ -419,10 +399,10 @@ def verify_ledger(
     elif found.rejected or found.outliers:
         console.print("--list shows each rejected measurement with its reason", highlight=False)
     if not opened.complete:
-        typer.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
+        click.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
     write_json(json_file, found.to_json())
     for offender in found.offenders[:OFFENDERS]:
-        typer.secho(offender, fg="red", err=True)
+        click.secho(offender, fg="red", err=True)
     if found.offenders:
         fail(f"{len(found.offenders)} violations of the ledger", FAILED)
     console.print(found.statement(), highlight=False, soft_wrap=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
+import click
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -45,7 +45,7 @@ class Steps:
         now = time.monotonic()
         if now >= self._due:
             self._due = now + PATIENCE_S
-            typer.echo(f"{self._what}{words}", err=True)
+            click.echo(f"{self._what}{words}", err=True)
 
 
 def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":

@@ -7,9 +7,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command, output_option
+from teamslam.sim.cli.commands import Group, option, output_option
 from teamslam.sim.cli.options import (
     WRONG_USE,
     IdentitiesOption,
@@ -23,29 +23,27 @@ from teamslam.sim.cli.options import (
 from teamslam.sim.scenarios.document import builtin_text
 from teamslam.sim.scenarios.scenario import builtin_names, load, with_options
 
-app = typer.Typer()
+app = Group()
 _PARENTHESES = re.compile(r"\s*\([^()]*\)")
 _CLAUSE_END = re.compile(r"[:;]|(?<!\b[A-Z])\.(?=\s|$)")
 
 
-@app.command(cls=Command, epilog="teamslam scenarios --show waypoints > mine.toml")
+@app.declare("teamslam scenarios --show waypoints > mine.toml")
 def scenarios(
-    show: Annotated[
-        str | None, typer.Option(help="Print this one as TOML, to read or to begin with.")
-    ] = None,
+    show: Annotated[str | None, option("Print this one as TOML, to read or to begin with.")] = None,
 ) -> None:
     """List the built-in scenarios, or show one."""
     if show is not None:
         if show not in builtin_names():
             known = ", ".join(builtin_names())
             fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
-        typer.echo(builtin_text(show), nl=False)
+        click.echo(builtin_text(show), nl=False)
         return
     width = shutil.get_terminal_size().columns
     for name in builtin_names():
         team = count_noun(len(load(name).robots), "robot")
         start = f"{name:14} {team:10} "
-        typer.echo(start + textwrap.shorten(_summary(name), width - len(start), placeholder=" …"))
+        click.echo(start + textwrap.shorten(_summary(name), width - len(start), placeholder=" …"))
 
 
 def _summary(name: str) -> str:
@@ -57,7 +55,7 @@ def _summary(name: str) -> str:
     return _CLAUSE_END.split(comment)[0]
 
 
-@app.command(cls=Command, epilog="teamslam simulate waypoints -o my_world")
+@app.declare("teamslam simulate waypoints -o my_world")
 def simulate(
     scenario: ScenarioArgument,
     output: Annotated[Path, output_option("Folder for the data set.")],
@@ -85,4 +83,4 @@ def simulate(
     scenario_file = output / "scenario.toml"
     text = folder_scenario(resolved) if tables else data_set_scenario(resolved)
     scenario_file.write_text(text, encoding="utf-8")
-    typer.echo(f"wrote {output}; `teamslam launch {scenario_file}` runs the team on it")
+    click.echo(f"wrote {output}; `teamslam launch {scenario_file}` runs the team on it")

@@ -10,9 +10,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command, rare
+from teamslam.sim.cli.commands import Group, option, rare
 from teamslam.sim.cli.options import (
     FAILED,
     LOOPBACK,
@@ -36,26 +36,23 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger("teamslam")
 FOXGLOVE_PORT = 8765
-Port = Annotated[
-    int, rare(help="Where the page is served; 0: any free port.", min=0, metavar="PORT")
-]
+Port = Annotated[int, rare("Where the page is served; 0: any free port.", "PORT", least=0)]
 FoxglovePort = Annotated[
     int | None,
     rare(
-        help="Where Foxglove can connect; 0: any free port; default: 8765, or a free one if that "
+        "Where Foxglove can connect; 0: any free port; default: 8765, or a free one if that "
         "is taken, if foxglove-sdk is installed.",
-        min=0,
-        metavar="PORT",
+        "PORT",
+        least=0,
     ),
 ]
 Open = Annotated[
-    bool | None,
-    typer.Option("--open/--no-browser", help="Open the page; default: where there is a display."),
+    bool | None, option("Open the page; default: where there is a display.", "--open/--no-browser")
 ]
-app = typer.Typer()
+app = Group()
 
 
-@app.command(cls=Command, epilog="teamslam viewer waypoints")
+@app.declare("teamslam viewer waypoints")
 def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
     """Publish views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
@@ -74,38 +71,27 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
         _LOG.info("published %d views", run_viewer(bus, stop, peers))
 
 
-@app.command(cls=Command, epilog="teamslam view runs/first")
+@app.declare("teamslam view runs/first")
 def view(
     log: LogArgument,
     port: Port = 0,
     foxglove_port: FoxglovePort = None,
     host: Annotated[
-        str,
-        rare(
-            help="The address to serve at; others than 127.0.0.1 show it to others.",
-            metavar="ADDRESS",
-        ),
+        str, rare("The address to serve at; others than 127.0.0.1 show it to others.", "ADDRESS")
     ] = "127.0.0.1",
     browser: Open = None,
     follow: Annotated[
-        bool, typer.Option(help="The log is being recorded, or will be: show it as it grows.")
+        bool, option("The log is being recorded, or will be: show it as it grows.")
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option(
-            help="Write the log with what other tools draw to this new file, and end.",
-            metavar="FILE",
-        ),
+        option("Write the log with what other tools draw to this new file, and end.", "FILE"),
     ] = None,
     export_video: Annotated[
-        Path | None,
-        typer.Option(
-            "--export-video", help="Write the run as an animated GIF, and end.", metavar="FILE"
-        ),
+        Path | None, option("Write the run as an animated GIF, and end.", "--export-video", "FILE")
     ] = None,
     layout: Annotated[
-        Path | None,
-        typer.Option(help="Write a Foxglove layout for this team's log, and end.", metavar="FILE"),
+        Path | None, option("Write a Foxglove layout for this team's log, and end.", "FILE")
     ] = None,
 ) -> None:
     """Show a log, or a running team by its log, on a page in a browser.
@@ -162,9 +148,9 @@ def show_on_page(
         if not foxglove_port:
             note = f"   ({FOXGLOVE_PORT} is taken; --foxglove-port chooses another)"
     with session(log, host, port, foxglove_port, growing=growing) as shown:
-        typer.echo(f"page      {shown.url}")
+        click.echo(f"page      {shown.url}")
         if shown.foxglove:
-            typer.echo(f"foxglove  {shown.foxglove}{note}")
+            click.echo(f"foxglove  {shown.foxglove}{note}")
         if _has_display() if browser is None else browser:
             import webbrowser
 
@@ -197,7 +183,7 @@ def _write_video(log: Path, path: Path) -> None:
     steps.begin("drawing the film")
     if not draw_film(evaluation, drawn, path, steps.share):
         fail(f"{log} has no final map or no poses to draw", FAILED)
-    typer.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
+    click.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
@@ -209,8 +195,8 @@ def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
         if path is not None:
             refuse_existing(path)
     if export is not None:
-        typer.echo(f"{export}: {export_views(log, export)}")
+        click.echo(f"{export}: {export_views(log, export)}")
     if layout is not None:
         owners = {ROBOT_CONFIG.owner(sample.key) for sample in log.samples((ROBOT_CONFIG,))}
         layout.write_text(layout_of(log.team, [name for name in owners if name]), "utf-8")
-        typer.echo(f"wrote {layout}: import it in Foxglove or Lichtblick")
+        click.echo(f"wrote {layout}: import it in Foxglove or Lichtblick")

@@ -4,25 +4,24 @@ import json
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command
+from teamslam.sim.cli.commands import Group, argument, option
 from teamslam.sim.cli.options import FAILED, failing, warn_of_holes, write_json
-from teamslam.sim.studies.experiment_command import app as experiment_commands
 
 Noise = Annotated[
     Literal["white", "profile"],
-    typer.Option(
-        help="white: independent errors, no inter-robot measurements; profile: the scenario's "
+    option(
+        "white: independent errors, no inter-robot measurements; profile: the scenario's "
         "persistent errors, biases, and inter-robot measurements."
     ),
 ]
-Source = Annotated[Path, typer.Argument(help="An MCAP log of a team, a data set or a ROS 2 bag.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures.")]
-app = typer.Typer()
+Source = Annotated[Path, argument("An MCAP log of a team, a data set or a ROS 2 bag.")]
+JsonFile = Annotated[Path | None, option("Write the figures.", "--json")]
+app = Group()
 
 
-@app.command(name="batch-reference", cls=Command, epilog="teamslam batch-reference runs/first")
+@app.declare("teamslam batch-reference runs/first", name="batch-reference")
 def batch_reference(
     log: Source,
     noise: Noise = "white",
@@ -42,11 +41,5 @@ def batch_reference(
     with failing(FAILED, BatchReferenceError):
         result = batch_map(run.samples(), noise)
     figures = result.to_json()
-    typer.echo(json.dumps(figures, indent=2))
+    click.echo(json.dumps(figures, indent=2))
     write_json(json_file, figures)
-
-
-def register(teamslam: typer.Typer) -> None:
-    """Add `experiment` and `batch-reference`."""
-    teamslam.add_typer(experiment_commands)
-    teamslam.add_typer(app)

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+import click
 
-from teamslam.sim.cli.help import Command, Group
+from teamslam.sim.cli.commands import Group, argument, option
 from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry, Study
 from teamslam.team.extras import install_command
@@ -16,12 +16,10 @@ from teamslam.team.extras import install_command
 if TYPE_CHECKING:
     from teamslam.sim.studies.experiments.runner import Plan
 
-app = typer.Typer(
-    name="experiment",
-    cls=Group,
+app = Group(
+    "experiment",
     epilog="teamslam experiment accuracy --quick",
     help="Reproduce the sources' tables and figures, and measure the team's accuracy.",
-    no_args_is_help=True,
 )
 
 FOLDER = Path("runs") / "experiments"
@@ -29,31 +27,23 @@ FILE_WIDTH = 120
 MOST_SEEDS = 100_000
 ALL = "all"
 Seeds = Annotated[
-    int | None,
-    typer.Option(help="How many seeds; default: the experiment's own.", min=1, max=MOST_SEEDS),
+    int | None, option("How many seeds; default: the experiment's own.", least=1, most=MOST_SEEDS)
 ]
-First = Annotated[int, typer.Option(help="The first seed.", min=0)]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON, too.")]
+First = Annotated[int, option("The first seed.", least=0)]
+JsonFile = Annotated[Path | None, option("Write the figures as JSON, too.", "--json")]
 Output = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", help="Folder of results and pictures; stored results are reused."
-    ),
+    Path, option("Folder of results and pictures; stored results are reused.", "--output", "-o")
 ]
-Jobs = Annotated[int | None, typer.Option(help="Processes; default: one per core.", min=1)]
+Jobs = Annotated[int | None, option("Processes; default: one per core.", least=1)]
 Datasets = Annotated[
-    list[Path] | None,
-    typer.Option("--dataset", help="A UTIAS data set, folder or zip; repeatable."),
+    list[Path] | None, option("A UTIAS data set, folder or zip; repeatable.", "--dataset")
 ]
 ShardText = Annotated[
     str | None,
-    typer.Option(
-        help="Compute the I-th of N parts of the runs only; `experiment merge` joins them.",
-        metavar="I/N",
-    ),
+    option("Compute the I-th of N parts of the runs only; `experiment merge` joins them.", "I/N"),
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="Few seeds, and no run beyond a minute.")]
-Check = Annotated[bool, typer.Option("--check", help="Exit status 1 if a goal is missed.")]
+Quick = Annotated[bool, option("Few seeds, and no run beyond a minute.", "--quick")]
+Check = Annotated[bool, option("Exit status 1 if a goal is missed.", "--check")]
 
 
 def _command(name: str, summary: str) -> None:
@@ -74,19 +64,13 @@ def _command(name: str, summary: str) -> None:
         else:
             _run_shard(study, shard, output, jobs)
 
-    app.command(name, cls=Command, help=summary, epilog=f"teamslam experiment {name} --quick")(run)
+    app.declare(f"teamslam experiment {name} --quick", name, summary)(run)
 
 
-@app.command(
-    "merge",
-    cls=Command,
-    epilog="teamslam experiment merge shard-1 shard-2 shard-3 -o runs/accuracy",
-)
+@app.declare("teamslam experiment merge shard-1 shard-2 shard-3 -o runs/accuracy", name="merge")
 def merge(
-    shards: Annotated[list[Path], typer.Argument(help="Folders of all shards of one experiment.")],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder of results and pictures.", metavar="DIR")
-    ],
+    shards: Annotated[list[Path], argument("Folders of all shards of one experiment.")],
+    output: Annotated[Path, option("Folder of results and pictures.", "--output", "-o", "DIR")],
     dataset: Datasets = None,
     jobs: Jobs = None,
     check: Check = False,
@@ -175,7 +159,7 @@ def _run_shard(study: Study, text: str, output: Path, jobs: int | None) -> None:
         _, failed = compute_runs(part, output, jobs or cores(), show_progress)
     found = replace(study, datasets=[str(Path(path).resolve()) for path in study.datasets])
     write_shard(output, shard, found, programs_of(list(tasks.values())))
-    typer.echo(
+    click.echo(
         f"{output}: {len(part) - len(failed)} of {len(tasks)} runs; with the other shards: "
         "teamslam experiment merge FOLDER… -o DIR"
     )
@@ -221,7 +205,7 @@ def _run(
         contents = {each.entry.name: to_json(each, origin) for each in concluded}
         content = contents if name == ALL else contents[name]
         json_file.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
-    typer.echo(f"{page}: results with pictures; JSON and PNG files beside it")
+    click.echo(f"{page}: results with pictures; JSON and PNG files beside it")
     failed = sum(len(each.failed) for each in concluded)
     if failed:
         fail(f"{failed} runs failed; {output / FAILURES} has their tracebacks", FAILED)

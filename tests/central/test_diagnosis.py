@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate

@@ -5,7 +5,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central import saved_maps
 from teamslam.central.desk.verification.recorded import Recorded

@@ -6,7 +6,7 @@ from itertools import count
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam import Driver, DriverError, DriverWarning, MeasurementError
 from teamslam.sim.cli.main import app

@@ -10,7 +10,7 @@ import resource
 import sys
 from pathlib import Path
 
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.team.recording.reader import LogError

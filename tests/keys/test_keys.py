@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.options import is_loopback

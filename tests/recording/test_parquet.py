@@ -4,7 +4,7 @@ import sys
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli import log as cli_log
 from teamslam.sim.cli.main import app

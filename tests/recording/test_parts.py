@@ -7,8 +7,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from click.testing import CliRunner
 from mcap.opcode import Opcode
-from typer.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import dumps, load

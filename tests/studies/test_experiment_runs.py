@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options

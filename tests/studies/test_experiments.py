@@ -1,5 +1,5 @@
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.studies.experiments import accuracy_worlds

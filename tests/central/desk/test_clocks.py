@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.clocks import (
     BEYOND_DOUBT,

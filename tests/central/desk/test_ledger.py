@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.ledger import Ledger, Rejected, ledger
 from teamslam.central.desk.verification.recorded import index_log

@@ -3,7 +3,7 @@ from contextlib import nullcontext
 
 import msgspec
 import pytest
-from typer.testing import CliRunner, Result
+from click.testing import CliRunner, Result
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk import orders

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import msgspec
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
-from typer.testing import CliRunner
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.calibrate import Calibration, calibrate_models

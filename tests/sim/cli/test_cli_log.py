@@ -1,7 +1,7 @@
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.cli.main import app
 from teamslam.sim.cli.options import WRONG_USE

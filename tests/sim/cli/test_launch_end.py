@@ -4,9 +4,9 @@ from io import StringIO
 
 import msgspec
 import pytest
-import typer
+from click.exceptions import Exit
+from click.testing import CliRunner
 from rich.console import Console
-from typer.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.history import history
@@ -76,7 +76,7 @@ def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
         assert f"note: {death}; map and log are whole" in capsys.readouterr().out
         assert outcome.failures == []
     else:
-        with pytest.raises(typer.Exit) as ended:
+        with pytest.raises(Exit) as ended:
             launch._conclude(of, outcome, None, report=False)
         assert ended.value.exit_code == 1
         assert death in outcome.failures
@@ -90,7 +90,7 @@ def test_a_run_whose_map_has_no_landmark_fails_with_the_reason(tmp_path):
     with Recorder(log, of.team, {"scenario": dumps(of)}) as recorder:
         recorder.write(list(run_team(of, streams(of))))
     outcome = Outcome(log=log, folder=tmp_path, wall_s=1.0, processes=[])
-    with pytest.raises(typer.Exit) as ended:
+    with pytest.raises(Exit) as ended:
         launch._conclude(of, outcome, None, report=False)
     assert ended.value.exit_code == 1
     assert [each for each in outcome.failures if "the final map has no landmark" in each]

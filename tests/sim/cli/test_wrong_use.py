@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from teamslam.sim.cli.entry import main
+from teamslam.sim.cli.main import main
 from teamslam.sim.cli.options import WRONG_USE
 from tests.support import ROOT
 

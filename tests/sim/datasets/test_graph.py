@@ -2,11 +2,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.cli.entry import _advice
-from teamslam.sim.cli.main import app
+from teamslam.sim.cli.main import _advice, app
 from teamslam.sim.datasets.graph import graph_world, read_pyfg
 from teamslam.sim.datasets.graph_lines import read_graph
 from teamslam.sim.datasets.kinds import kind_of

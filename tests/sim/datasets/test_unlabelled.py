@@ -3,7 +3,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.cli.main import app

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from click.testing import CliRunner, Result
 
 from teamslam.sim.cli.importing import readable
 from teamslam.sim.cli.main import app

@@ -5,12 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from typer.main import get_command
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 from teamslam.sim.cli import launch
-from teamslam.sim.cli.main import app
+from teamslam.sim.cli.main import app, load_all
 from teamslam.sim.importing.columns import load_map
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
@@ -128,7 +127,6 @@ def test_the_commands_of_a_team_over_wifi_are_sound(tmp_path, monkeypatch):
     names = {path.name for path in (tmp_path / "keys").rglob("*")}
     for node in ("robot-r1", "source-r1", "robot-r2", "central", "recorder"):
         assert any(name.startswith(node) for name in names), node
-    commands = get_command(app)
     for name, *words in typed[1:]:
-        context = commands.commands[name].make_context(name, list(words))
+        context = load_all().commands[name].make_context(name, list(words))
         assert context.params["keys"] == Path("keys")

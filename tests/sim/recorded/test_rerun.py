@@ -6,7 +6,7 @@ from typing import get_type_hints
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.desk.verification import verification
 from teamslam.central.desk.verification.recorded import RerunError

@@ -4,7 +4,7 @@ import re
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from teamslam.central.config import CentralConfig, CommonBiasSigmas, SurveyedLandmark
 from teamslam.sim.cli.main import app
