@@ -216,9 +216,10 @@ class Peer:
             "set_agrees": float(sum(self.peer.agrees.values())),
         }
         for robot in replica.robots:
-            have = replica.have(robot)
-            figures[f"set_submaps.{robot}"] = float(have.submaps)
-            figures[f"set_newest_s.{robot}"] = have.newest_ns * 1e-9
+            shares = [share for (name, _), share in replica.streams.items() if name == robot]
+            figures[f"set_submaps.{robot}"] = float(sum(len(each.complete) for each in shares))
+            newest_ns = max((each.newest_ns for each in shares), default=0)
+            figures[f"set_newest_s.{robot}"] = newest_ns * 1e-9
         for node, over in self.peer.carried.items():
             figures[f"set_over.{node}"] = float(over.members)
             figures[f"set_over_bytes.{node}"] = float(over.bytes)

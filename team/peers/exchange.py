@@ -31,10 +31,10 @@ BATCH_BYTES = 64 * 2**10
 def make_request(
     replica: Replica, summary: m.SetSummary, not_now: Collection[tuple[Stream, int]] = ()
 ) -> m.MembersRequest | None:
-    """Request the members of the summary's node that this replica lacks; None: there are none.
+    """Request the members in a summary that this replica lacks; None: there are none.
 
-    not_now: (stream, sequence) requested recently from another peer. A stream with equal sequences
-    and another digest is requested whole: its robot has contradicted itself.
+    not_now: (stream, sequence) requested recently. A stream with equal sequences and another digest
+    is requested whole: its robot has contradicted itself.
     """
     if summary.digest == replica.digest:
         return None
@@ -67,11 +67,12 @@ def make_request(
                     last=last,
                 )
             )
+    stated = replica.announcement.statements
     statements = tuple(
         each.robot
         for each in summary.statements
         if (each.robot in replica.robots or each.robot.startswith(MAP))
-        and each.digest != getattr(replica.stated_of(each.robot), "digest", None)
+        and each.digest != getattr(stated.get(each.robot), "digest", None)
         and ((each.robot, 0), -3) not in not_now
     )
     if not found and not statements:
@@ -106,21 +107,20 @@ def list_requested(request: m.MembersRequest) -> Iterator[tuple[Stream, int]]:
 
 def _contradicts(replica: Replica, holding: m.Holding) -> bool:
     stream = holding.robot, holding.incarnation
-    mine = replica.announced_of(stream)
+    mine = replica.announcement.holdings.get(stream)
     same = mine is not None and (mine.start, mine.sequences) == (holding.start, holding.sequences)
     return same and mine is not None and mine.digest != holding.digest
 
 
-Sign = Callable[[Member], bytes]
-"""Sign a member in its author's name; empty where that is impossible."""
-
-
 def make_answer(
-    replica: Replica, request: m.MembersRequest, node: str, sign: Sign | None = None
+    replica: Replica,
+    request: m.MembersRequest,
+    node: str,
+    sign: Callable[[Member], bytes] | None = None,
 ) -> list[m.Members]:
     """Answer a request in batches, statements first.
 
-    sign: with keys; members without a signature are left out.
+    sign: its author's signature of a member; without one a member is left out. None: no keys.
     """
     batches: list[list[Member]] = [[]]
     total = size = 0
@@ -136,7 +136,17 @@ def make_answer(
             size = 0
         batches[-1].append(member)
         total, size = total + member.size, size + member.size
-    return [_message(node, request.stamp_ns, batch) for batch in batches if batch]
+    return [
+        m.Members(
+            stamp_ns=request.stamp_ns,
+            node=node,
+            keys=tuple(each.key for each in batch),
+            payloads=tuple(each.payload for each in batch),
+            signatures=tuple(each.signature for each in batch),
+        )
+        for batch in batches
+        if batch
+    ]
 
 
 def _list_members(replica: Replica, request: m.MembersRequest) -> Iterator[Member]:
@@ -152,16 +162,6 @@ def _list_members(replica: Replica, request: m.MembersRequest) -> Iterator[Membe
         for sequence in range(each.first, min(each.last, each.first + MOST_ASKED) + 1):
             if sequence in share.complete:
                 yield from share.parcel(sequence)
-
-
-def _message(node: str, stamp_ns: int, members: Sequence[Member]) -> m.Members:
-    return m.Members(
-        stamp_ns=stamp_ns,
-        node=node,
-        keys=tuple(each.key for each in members),
-        payloads=tuple(each.payload for each in members),
-        signatures=tuple(each.signature for each in members),
-    )
 
 
 def _pairs(ends: Sequence[int]) -> list[tuple[int, int]]:

@@ -4,7 +4,7 @@ The node publishes a summary when its set has changed or a node appears, request
 lacks, and answers requests.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -25,10 +25,7 @@ GIVEN_BYTES = 32 * 2**20
 
 
 class Given:
-    """Bytes sent within the current second: bounds the cost of endless requests.
-
-    Not counted by node, since the name in a request is not authenticated.
-    """
+    """Bytes sent within the current second, to all nodes: names in requests are not proven."""
 
     def __init__(self) -> None:
         self._second = 0
@@ -57,9 +54,8 @@ def feed_order(message: m.Message) -> int:
 
 
 def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
-    """Yield members of streams beyond the counts `fed`: initial poses, then submaps by end time.
-
-    Each submap follows its inter-robot measurements. A fold in the order of time undoes nothing.
+    """Yield members of streams beyond the counts `fed`: initial poses, then submaps by end time,
+    each after its inter-robot measurements. A fold in the order of time undoes nothing.
     """
     parcels: list[tuple[int, Stream, int]] = []
     for stream, share in sorted(replica.streams.items()):
@@ -120,7 +116,6 @@ class PeerNode:
         self._answer_s: float | None = None
         self._summaries: dict[str, tuple[float, m.SetSummary]] = {}
         self._asked: dict[tuple[Stream, int], tuple[float, str]] = {}
-        self._open: Counter[str] = Counter()
         self._failures: dict[str, int] = {}
         self._given = Given()
         self.known = frozenset({*map(ch.robot_node, robots), "central"})
@@ -212,11 +207,7 @@ class PeerNode:
         """Queue every stored member for a fresh fold."""
         self.rebuild = False
         self._fed.clear()
-        self._new_messages = [
-            member.message
-            for _, statements in sorted(self.replica.statements.items())
-            for _, member in sorted(statements.items())
-        ]
+        self._new_messages = [member.message for member in self.replica.stated()]
 
     # Exchange.
 
@@ -261,25 +252,16 @@ class PeerNode:
         return out
 
     def _note_arrival(self, message: m.Message) -> None:
-        match message:
-            case m.InitialPose():
-                self._close(((message.robot, message.incarnation), -1))
-            case m.Submap() | m.SightingFactor():
-                stream = message.robot, message.incarnation
-                if message.sequence in self.replica.share_of(stream).complete:
-                    self._close((stream, message.sequence))
-            case _:
-                pass
-
-    def _close(self, name: tuple[Stream, int]) -> None:
-        asked = self._asked.pop(name, None)
-        if asked is not None:
-            self._open[asked[1]] -= 1
+        if isinstance(message, m.InitialPose):
+            self._asked.pop(((message.robot, message.incarnation), -1), None)
+        elif isinstance(message, m.Submap | m.SightingFactor):
+            stream = message.robot, message.incarnation
+            if not self._lacks(stream, message.sequence):
+                self._asked.pop((stream, message.sequence), None)
 
     def _forget_questions(self) -> None:
         """Let requests expire; nodes that failed to send members are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
-        self._open.subtract(node for _, node in over.values())
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
             self._failures[node] = self._failures.get(node, 0) + 1
         self._asked = {name: of for name, of in self._asked.items() if name not in over}
@@ -293,16 +275,13 @@ class PeerNode:
         return [] if received is None else self._request_from(received[1])
 
     def _request_from(self, summary: m.SetSummary) -> list[Outgoing]:
-        if self._open[summary.node] >= MOST_OPEN:
+        if sum(node == summary.node for _, node in self._asked.values()) >= MOST_OPEN:
             return []
         request = make_request(self.replica, summary, self._asked)
         if request is None:
             return []
         until = self._now_s + PATIENCE_S, summary.node
-        for name in list_requested(request):
-            self._close(name)
-            self._asked[name] = until
-            self._open[summary.node] += 1
+        self._asked |= dict.fromkeys(list_requested(request), until)
         asked = msgspec.structs.replace(request, node=self.node)
         return [Outgoing(ch.MEMBERS, summary.node, asked)]
 

@@ -1,7 +1,7 @@
 """One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
-Of two members of one name (a robot contradicts itself) the smaller hash stays, so all peers agree.
-Bytes are limited per robot, so none can fill another's disk.
+Of two members of one name the smaller hash stays, so all peers agree. The bytes about each robot
+are limited.
 """
 
 import hashlib
@@ -48,8 +48,7 @@ class StreamShare:
     """Stored members of one incarnation.
 
     complete: sequences whose submap is stored with all its inter-robot measurements; count: how
-    many from 0 on without a gap; beyond: the others. sum: of the complete ones' hashes, modulo
-    2²⁵⁶.
+    many from 0 on without a gap. sum: of the complete ones' hashes, modulo 2²⁵⁶.
     """
 
     start: Member | None = None
@@ -57,15 +56,11 @@ class StreamShare:
     factors: dict[int, dict[TeammateAt, Member]] = field(default_factory=dict)
     complete: set[int] = field(default_factory=set)
     count: int = 0
-    beyond: set[int] = field(default_factory=set)
     sum: int = 0
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """Return a complete submap after its inter-robot measurements, in canonical order.
-
-        Surplus measurements are left out.
-        """
+        """Return a complete submap after its inter-robot measurements, without surplus ones."""
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
         looks = sorted(factors)[: submap.message.sightings]
@@ -79,11 +74,9 @@ class StreamShare:
         assert isinstance(submap.message, m.Submap)
         if len(self.factors.get(sequence, ())) >= submap.message.sightings:
             self.complete.add(sequence)
-            self.beyond.add(sequence)
             self.sum = (self.sum + _sum(self.parcel(sequence))) % _WORD
             self.newest_ns = max(self.newest_ns, submap.message.stamp_ns)
-            while self.count in self.beyond:
-                self.beyond.discard(self.count)
+            while self.count in self.complete:
                 self.count += 1
 
     def forget(self, sequence: int) -> None:
@@ -91,17 +84,7 @@ class StreamShare:
         if sequence in self.complete:
             self.complete.discard(sequence)
             self.sum = (self.sum - _sum(self.parcel(sequence))) % _WORD
-            self.beyond.discard(sequence)
-            if sequence < self.count:
-                self.beyond |= set(range(sequence + 1, self.count))
-                self.count = sequence
-
-
-class Have(NamedTuple):
-    """Stored share of a robot: number of submaps, and the end of the newest [ns of team time]."""
-
-    submaps: int
-    newest_ns: int
+            self.count = min(self.count, sequence)
 
 
 class Replica:
@@ -117,8 +100,7 @@ class Replica:
         self.streams: dict[Stream, StreamShare] = {}
         self.statements: dict[str, dict[tuple[str, int], Member]] = {r: {} for r in self.robots}
         self.replacements = 0
-        self._statements: dict[str, m.Statements] = {}
-        self._announced: _Announced | None = None
+        self._announced: Announcement | None = None
 
     def add(self, member: Member) -> Outcome:
         """Add a member; raises RefusedError for another team's or beyond a bound."""
@@ -137,7 +119,6 @@ class Replica:
             self.replacements += outcome == "replaced"
         else:
             outcome = self._add_stated(member, robot)
-            self._statements.pop(robot, None)
         if outcome != "known":
             self._bytes[robot] += member.size
             self._announced = None
@@ -211,12 +192,6 @@ class Replica:
         """Return the stored members of a stream."""
         return self.streams.get(stream) or StreamShare()
 
-    def have(self, robot: str) -> Have:
-        """Return the stored share of a robot."""
-        shares = [share for (name, _), share in self.streams.items() if name == robot]
-        newest = max((share.newest_ns for share in shares), default=0)
-        return Have(sum(len(share.complete) for share in shares), newest)
-
     @property
     def submaps(self) -> int:
         """Number of complete submaps."""
@@ -249,6 +224,10 @@ class Replica:
                 yield from (factors[look] for look in sorted(factors))
                 if sequence in share.submaps:
                     yield share.submaps[sequence]
+        yield from self.stated()
+
+    def stated(self) -> Iterator[Member]:
+        """Yield the statements by robot and name."""
         for _, statements in sorted(self.statements.items()):
             yield from (statements[name] for name in sorted(statements))
 
@@ -263,27 +242,19 @@ class Replica:
             robot=stream[0],
             incarnation=stream[1],
             start=share.start is not None,
-            sequences=intervals(share.beyond, share.count),
+            sequences=intervals((k for k in share.complete if k >= share.count), share.count),
             digest=_digest(share.sum, () if share.start is None else (share.start,)),
             newest_ns=share.newest_ns,
         )
 
-    def _statements_of(self, robot: str) -> m.Statements:
-        found = self.statements[robot]
-        if robot not in self._statements:
-            self._statements[robot] = m.Statements(
-                robot=robot, count=len(found), digest=_digest(0, found.values())
-            )
-        return self._statements[robot]
-
     @property
     def digest(self) -> bytes:
         """Digest of the summary: equal digests mean equal sets."""
-        return self._announcement.digest
+        return self.announcement.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
         """Make a summary of the set, small enough to be repeated."""
-        announced = self._announcement
+        announced = self.announcement
         return m.SetSummary(
             stamp_ns=stamp_ns,
             node=node,
@@ -293,35 +264,28 @@ class Replica:
             statements=tuple(announced.statements.values()),
         )
 
-    def announced_of(self, stream: Stream) -> m.Holding | None:
-        """Return a stream's holding in the summary."""
-        return self._announcement.holdings.get(stream)
-
-    def stated_of(self, robot: str) -> m.Statements | None:
-        """Return the summary of the statements about a robot."""
-        return self._announcement.statements.get(robot)
-
     @property
-    def _announcement(self) -> "_Announced":
+    def announcement(self) -> "Announcement":
+        """The contents of a summary, cached until a member arrives."""
         if self._announced is None:
             found = ((stream, self.holding(stream)) for stream in sorted(self.streams))
             holdings = {stream: each for stream, each in found if each is not None}
             statements = {
-                robot: self._statements_of(robot)
-                for robot, found in sorted(self.statements.items())
-                if found
+                robot: m.Statements(robot=robot, count=len(of), digest=_digest(0, of.values()))
+                for robot, of in sorted(self.statements.items())
+                if of
             }
-            whole = hashlib.blake2b(digest_size=8)
-            for digest in (h.digest for h in holdings.values()):
-                whole.update(digest)
-            for digest in (s.digest for s in statements.values()):
-                whole.update(digest)
-            self._announced = _Announced(whole.digest(), holdings, statements)
+            digests = [
+                *(h.digest for h in holdings.values()),
+                *(s.digest for s in statements.values()),
+            ]
+            whole = hashlib.blake2b(b"".join(digests), digest_size=8)
+            self._announced = Announcement(whole.digest(), holdings, statements)
         return self._announced
 
 
-class _Announced(NamedTuple):
-    """Contents of a summary, cached until a member arrives."""
+class Announcement(NamedTuple):
+    """Contents of a summary: digest of the set, holdings, and statements about each robot."""
 
     digest: bytes
     holdings: dict[Stream, m.Holding]
@@ -351,16 +315,13 @@ def _stated(message: m.Message) -> tuple[str, int]:
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
-    """Order two statements of one name: a later conclusion, else the smaller hash, is greater."""
+    """Rank a later conclusion, else the smaller hash, higher."""
     serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
     return serial, bytes(255 - byte for byte in member.hash)
 
 
-def intervals(sequences: set[int], count: int) -> tuple[int, ...]:
-    """Return first, last, first, last, … of the first MOST_INTERVALS intervals.
-
-    count: the sequences have no gap from 0 to count − 1.
-    """
+def intervals(sequences: Iterable[int], count: int) -> tuple[int, ...]:
+    """Return first, last, … of the first MOST_INTERVALS intervals of 0 … count − 1 and others."""
     found = IntervalSet()
     found.add(0, count - 1)
     for each in sorted(sequences):
