@@ -1,4 +1,4 @@
-"""The inputs of a fold by ticks of team time: submaps, initial poses and verdicts.
+"""The inputs of a fold: submaps in canonical order, initial poses and verdicts.
 
 They only grow, except for verdicts, and depend on no fold: a fold without some robots reads the
 same inputs. A contribution is several times as large as its message, so it is decoded on demand and
@@ -6,10 +6,11 @@ cached while some fold has it.
 """
 
 import math
-from bisect import insort
+from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import msgspec
@@ -17,7 +18,7 @@ import msgspec
 from teamslam.central.config import CentralConfig
 from teamslam.central.survey import station, survey_of
 from teamslam.team import translate
-from teamslam.team.config import GNSS
+from teamslam.team.config import GNSS, SURVEY
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
     NO_OWN,
@@ -41,29 +42,33 @@ from teamslam.team.wire.digest import Digest, digest_of
 from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap
 
 Key = tuple[int, str, int, int]
+"""(end [ns], robot, incarnation, sequence) of a submap; its order is the canonical one."""
 STORED_DIGESTS = 4
 
 
-class FoldInputs:
-    """The set of submaps by ticks, with their inter-robot measurements and the digests of both,
-    initial poses and an operator's verdicts.
-
-    Tick b has the submaps that end in (b·tick, (b + 1)·tick].
+class _Filed(NamedTuple):
+    """A submap, the inter-robot measurements from it, the digest of both, and the errors of single
+    robots in a saved map.
     """
 
+    submap: Submap
+    sightings: Sequence[InterRobotFactor]
+    digest: bytes
+    own: OwnBiases = NO_OWN
+
+
+class FoldInputs:
+    """The set of a fold. Tick b has the submaps that end in (b·tick, (b + 1)·tick]."""
+
     def __init__(self, config: CentralConfig) -> None:
-        self.robots: set[str] = set()
         self.tick_ns = round(config.tick_s * 1e9)
         self._config = config
         self._bounds_of_map = msgspec.structs.replace(
             config.bounds, submap_landmarks=MOST_SAVED, extent_m=config.bounds.coordinate_m
         )
         self._raised: set[Key] = set()
-        self._ticks: dict[int, dict[Key, Submap]] = {}
-        self._order: list[int] = []
-        self._sightings: dict[Key, tuple[InterRobotFactor, ...]] = {}
-        self._digests: dict[Key, bytes] = {}
-        self._own: dict[Key, OwnBiases] = {}
+        self._filed: dict[Key, _Filed] = {}
+        self._order: list[Key] = []
         self._made: WeakValueDictionary[Key, Contribution] = WeakValueDictionary()
         self._named: dict[tuple[bytes, ...], tuple[float, Digest]] = {}
         self._starts: dict[Stream, InitialPoseFactor] = {}
@@ -84,19 +89,12 @@ class FoldInputs:
         sightings: Sequence[SightingFactor],
         own: OwnBiases = NO_OWN,
     ) -> int:
-        """Add a submap with the inter-robot measurements from it; return the first tick that this
-        changes. own: the errors of single robots in a saved map.
+        """Add a submap; return the first tick that this changes.
 
         The first fix adds the station, before all of the team's time.
         """
-        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
-        tick = self._file(key, submap, digest)
-        if sightings:
-            self._sightings[key] = tuple(translate.sighting_of(each) for each in sightings)
-        if own.errors:
-            self._own[key] = own
-        self.robots.add(submap.robot)
-        self._tick_with[key[1:]] = tick
+        factors = [translate.sighting_of(each) for each in sightings]
+        tick = self._file(_Filed(submap, factors, digest, own))
         if not self._has_station and any(each.teammate == GNSS for each in sightings):
             self._has_station = True
             tick = min(tick, self._add_known(*station()))
@@ -104,23 +102,22 @@ class FoldInputs:
 
     def _add_known(self, submap: Submap, start: InitialPoseFactor) -> int:
         self.add_start(start)
-        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
-        return self._file(key, submap, digest_of(encoded(submap)))
+        return self._file(_Filed(submap, (), digest_of(encoded(submap))))
 
-    def _file(self, key: Key, submap: Submap, digest: bytes) -> int:
-        tick = self._tick_of(submap.stamp_ns)
-        if tick not in self._ticks:
-            self._ticks[tick] = {}
-            insort(self._order, tick)
-        self._ticks[tick][key] = submap
-        self._digests[key] = digest
+    def _file(self, filed: _Filed) -> int:
+        submap = filed.submap
+        key = (submap.stamp_ns, submap.robot, submap.incarnation, submap.sequence)
+        if key not in self._filed:
+            insort(self._order, key)
+        self._filed[key] = filed
         self._made.pop(key, None)
         self._raised.discard(key)
+        tick = self._tick_with[key[1:]] = self._tick_of(key)
         self._named = {at: each for at, each in self._named.items() if each[0] < tick}
         return tick
 
-    def _tick_of(self, end_ns: int) -> int:
-        return (end_ns - 1) // self.tick_ns
+    def _tick_of(self, key: Key) -> int:
+        return (key[0] - 1) // self.tick_ns
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> float:
         """Replace the verdicts; return the first tick that judges a changed one, else infinity."""
@@ -137,32 +134,37 @@ class FoldInputs:
 
     # Ticks.
 
-    def ticks_after(
-        self, after: float, without: Collection[str] = (), last: float = math.inf
-    ) -> list[int]:
-        """List the ticks in (after, last] with a submap of any other robot, ascending."""
-        found = []
-        for tick in reversed(self._order):
-            if tick <= after:
-                break
-            if tick <= last and any(key[1] not in without for key in self._ticks[tick]):
-                found.append(tick)
-        return found[::-1]
+    @property
+    def robots(self) -> set[str]:
+        """The robots and saved maps with a submap, but for the survey and the station."""
+        return {robot for _, robot, *_ in self._order} - {SURVEY, GNSS}
+
+    def keys(
+        self, after: float, last: float = math.inf, without: Collection[str] = ()
+    ) -> list[Key]:
+        """List the submaps in the ticks (after, last] without some robots, in canonical order."""
+        begin, end = (
+            len(self._order)
+            if tick == math.inf
+            else bisect_left(self._order, (tick + 1) * self.tick_ns + 1, key=_end_ns)
+            for tick in (after, last)
+        )
+        return [key for key in self._order[begin:end] if key[1] not in without]
+
+    def ticks_after(self, after: float, without: Collection[str]) -> list[int]:
+        """List the ticks after this one with a submap of any other robot, ascending."""
+        return list(dict.fromkeys(map(self._tick_of, self.keys(after, without=without))))
 
     def first_tick_of(self, robot: str) -> float:
         """Return the first tick with a submap or an inter-robot measurement of a robot, else
         infinity.
         """
-        for tick in self._order:
-            for key in self._ticks[tick]:
-                sightings = self._sightings.get(key, ())
-                if key[1] == robot or any(each.teammate == robot for each in sightings):
-                    return tick
+        for key in self._order:
+            if key[1] == robot or any(
+                each.teammate == robot for each in self._filed[key].sightings
+            ):
+                return self._tick_of(key)
         return math.inf
-
-    def keys(self, tick: int, without: Collection[str]) -> list[Key]:
-        """List the submaps of a tick without some robots, in canonical order."""
-        return sorted(key for key in self._ticks[tick] if key[1] not in without)
 
     def contribution(self, key: Key) -> Contribution:
         """Decode a submap, its covariance raised to the least; that of a saved map without the
@@ -170,10 +172,10 @@ class FoldInputs:
         """
         found = self._made.get(key)
         if found is None:
-            found = translate.contribution_of(self._ticks[self._tick_of(key[0])][key])
-            local = found.local
+            filed = self._filed[key]
+            found = translate.contribution_of(filed.submap)
+            local, own = found.local, filed.own
             if is_map(found.stream):
-                own = self._own.get(key, NO_OWN)
                 if own.errors:
                     local, by_own = own.given(local)
                     found = replace(found, own=own, by_own=by_own)
@@ -194,12 +196,9 @@ class FoldInputs:
     def chains(self, robot: str) -> Mapping[Stream, Sequence[Contribution]]:
         """Return the submaps of each of a robot's streams within the bounds."""
         found: dict[Stream, list[Contribution]] = {}
-        for tick in self._order:
-            for key in self.keys(tick, ()):
-                if key[1] == robot:
-                    each = self.contribution(key)
-                    if self._beyond(each) is None:
-                        found.setdefault(each.stream, []).append(each)
+        for key in self._order:
+            if key[1] == robot and self._beyond(each := self.contribution(key)) is None:
+                found.setdefault(each.stream, []).append(each)
         return found
 
     def _beyond(self, submap: Contribution) -> str | None:
@@ -210,7 +209,7 @@ class FoldInputs:
         """Return the members of a tick without some robots' submaps and measurements of these;
         refuse those beyond the bounds.
         """
-        order = self.keys(tick, without)
+        order = self.keys(tick - 1, tick, without)
         submaps = [self.contribution(key) for key in order]
         outside = {}
         for each in submaps:
@@ -238,7 +237,7 @@ class FoldInputs:
         self, order: Sequence[Key], without: Collection[str]
     ) -> tuple[list[InterRobotFactor], list[str]]:
         sightings, refused = [], []
-        for sighting in (each for key in order for each in self._sightings.get(key, ())):
+        for sighting in (each for key in order for each in self._filed[key].sightings):
             if sighting.teammate in without:
                 continue
             why = sighting_beyond(sighting, self._config.bounds)
@@ -253,8 +252,7 @@ class FoldInputs:
         """Restore the condensed submaps of a fold up to this tick."""
         if not fold.condensed_count:
             return fold
-        ticks = self.ticks_after(-math.inf, without, last)
-        order = [key for tick in ticks for key in self.keys(tick, without)]
+        order = self.keys(-math.inf, last, without)
         submaps = [self.contribution(key) for key in order]
         return restore_submaps(fold, submaps, self._sightings_of(order, without)[0])
 
@@ -278,7 +276,7 @@ class FoldInputs:
         judged = fold.landmarks.verdicts
         verdicts = sorted(f"{v.first} {v.second} {v.same}".encode() for v in judged)
         keys = [*(c.key for c in fold.contributions[-1:]), *fold.refused]
-        last = max((self._tick_of(key[0]) for key in keys), default=-math.inf)
+        last = max(map(self._tick_of, keys), default=-math.inf)
         before, closed = (*more, *gone, *starts, *verdicts), min(last, closed)
         until, digest = self._named.pop(before, (math.inf, Digest()))
         if until > closed:
@@ -293,5 +291,8 @@ class FoldInputs:
         return whole.value
 
     def _digests_between(self, after: float, last: float, without: Collection[str]) -> list[bytes]:
-        ticks = self.ticks_after(after, without, last)
-        return [self._digests[key] for tick in ticks for key in self.keys(tick, without)]
+        return [self._filed[key].digest for key in self.keys(after, last, without)]
+
+
+def _end_ns(key: Key) -> int:
+    return key[0]

@@ -287,8 +287,7 @@ class TickFold:
 
     def _size_until(self, tick: float) -> int:
         gone = self._gone.difference(self._conviction.suspended)
-        ticks = self._inputs.ticks_after(-math.inf, gone)
-        return sum(len(self._inputs.keys(each, gone)) for each in ticks if each <= tick)
+        return len(self._inputs.keys(-math.inf, tick, gone))
 
     def _convict(self, fold: Fold, at: float) -> bool:
         """Withdraw or suspend the robot that a trial of the fold finds; return whether there is
